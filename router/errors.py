@@ -90,7 +90,7 @@ class Code(enum.Enum):
     UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
     UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
-    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` that `listen` does not have.")
+    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that `listen` does not have.")
     UNUSED_LISTENER = ("unused-listener", "A listener that no endpoint which sends is believed by.")
     ADDRESS_CLASH = (
         "address-clash",

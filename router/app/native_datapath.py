@@ -153,11 +153,13 @@ class NativeDatapath:
         for commands in self._commands:
             commands.report_failures()
 
-    def open_listener(self, settings: model.Listener) -> Listener:
-        return Listener(settings, is_stamped=True)
+    def open_listener(self, settings: model.Listener, has_senders: bool) -> Listener:
+        return Listener(settings, is_stamped=True, has_senders=has_senders)
 
-    def open_sender(self, endpoint: model.Endpoint) -> NativeSender:
-        return NativeSender(self._library, endpoint)
+    def open_sender(
+        self, endpoint: model.Endpoint, source: Listener | None, listeners: Sequence[Listener]
+    ) -> NativeSender:
+        return NativeSender(self._library, endpoint, source, listeners)
 
     def states(self, earlier: Wiring | None) -> States:
         return States([*OF_PYTHON.values(), _ROS, _ENDPOINTS, _GATEWAYS], earlier.states if earlier else None)

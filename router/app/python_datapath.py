@@ -65,11 +65,11 @@ class PythonDatapath:
     def stalled(self) -> None:
         return None
 
-    def open_listener(self, settings: model.Listener) -> Listener:
-        return Listener(settings)
+    def open_listener(self, settings: model.Listener, has_senders: bool) -> Listener:
+        return Listener(settings, has_senders=has_senders)
 
-    def open_sender(self, endpoint: model.Endpoint) -> Sender:
-        return Sender(endpoint)
+    def open_sender(self, endpoint: model.Endpoint, source: Listener | None, listeners: Sequence[Listener]) -> Sender:
+        return Sender(endpoint, source, listeners)
 
     def states(self, earlier: Wiring | None) -> States:
         return States([_ALL], earlier.states if earlier else None)

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import socket
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
+from router.compiler.network import sent_from
 from router.compiler.program import Program
+from router.errors import StartError
+from router.log import logger
 from router.net.kernel import interface_is_up
-from router.net.udp import Listener, Sender
+from router.net.udp import Listener, Sender, why_unreachable
 from router.table import model
-from router.table.addresses import Address
+from router.table.addresses import Address, BadAddressError
 
 
 @dataclass(slots=True)
 class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
-    `opened` closes the sockets opened for it; `left`, once it is applied, those that it does not use.
+    `moves` are the sockets by which senders that stay are to send, with the listener whose port each has. `opened`
+    closes the sockets opened for it; `left`, once it is applied, those that it does not use.
     """
 
     program: Program
     listeners: dict[str, Listener]
     senders: dict[str, Sender]
+    moves: list[tuple[Sender, Listener | None, socket.socket]]
     opened: ExitStack
     left: ExitStack = field(default_factory=ExitStack)
 
@@ -30,6 +36,19 @@ class SocketChange:
 def is_replaceable(listener: Listener) -> bool:
     """Whether the network interface of a listener was replaced by another one of the same name."""
     return listener.has_lost_interface() and interface_is_up(listener.interface or "") is not None
+
+
+def _check_reachable(endpoint: model.Endpoint) -> None:
+    """Log why nothing can be sent to an endpoint now. Raises StartError for an address that is none of a machine."""
+    address = endpoint.address.value
+    try:
+        found = why_unreachable(address)
+    except BadAddressError as error:
+        raise StartError(f"{endpoint.address.span}: {error.what}", error.hint) from error
+    if found:
+        why, remedy = found
+        what = "nothing can be sent to this endpoint now; it is tried with every datagram"
+        logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 
 class KernelDrops:
@@ -60,14 +79,15 @@ class KernelDrops:
 class Sockets:
     """Open listeners by name, and senders by endpoint; none before the first change is applied.
 
-    `open_listener` and `open_sender` open a socket, or raise StartError.
+    `open_listener` opens a socket and raises StartError; it has to know whether senders are bound to the port.
+    `open_sender` opens one to an endpoint, to send from the port of a listener, or of none. It gets all that are open.
     """
 
     def __init__(
         self,
         drops: KernelDrops,
-        open_listener: Callable[[model.Listener], Listener],
-        open_sender: Callable[[model.Endpoint], Sender],
+        open_listener: Callable[[model.Listener, bool], Listener],
+        open_sender: Callable[[model.Endpoint, Listener | None, Sequence[Listener]], Sender],
     ) -> None:
         self._open_listener = open_listener
         self._open_sender = open_sender
@@ -77,23 +97,35 @@ class Sockets:
         self._drops = drops
 
     def prepare(self, program: Program) -> SocketChange:
-        """Open the sockets of `program` that are not open yet. Raises StartError, with nothing changed."""
+        """Open the sockets of `program` that are not open yet. Raises StartError or OSError, with nothing changed."""
         with ExitStack() as opening:
             listeners = {}
             for plan in program.listeners:
                 listener = self._bound.get(plan.bound_to)
                 if listener is None or is_replaceable(listener):
-                    listener = self._open_listener(plan)
+                    listener = self._open_listener(plan, plan.address.value.port in self._sending_ports())
                     opening.callback(listener.close)
                 listeners[plan.name] = listener
-            senders = {}
+            senders: dict[str, Sender] = {}
+            moves = []
+            every = [*self._bound.values(), *listeners.values()]
             for to in program.senders:
+                _check_reachable(to)
+                source = listeners.get(sent_from(program.table, to) or "")
                 address, sender = self._senders.get(to.name, (None, None))
                 if sender is None or address != to.address.value:
-                    sender = self._open_sender(to)
+                    sender = self._open_sender(to, source, every)
                     opening.callback(sender.close)
+                elif sender.source is not source:
+                    opened = sender.open_socket(source, every)
+                    opening.callback(opened.close)
+                    moves.append((sender, source, opened))
                 senders[to.name] = sender
-            return SocketChange(program, listeners, senders, opening.pop_all())
+            return SocketChange(program, listeners, senders, moves, opening.pop_all())
+
+    def _sending_ports(self) -> set[int]:
+        sources = [sender.source for _, sender in self._senders.values()]
+        return {source.address.port for source in sources if source is not None}
 
     def left(self, change: SocketChange) -> list[Listener]:
         """The listeners that the change does not use."""
@@ -106,6 +138,8 @@ class Sockets:
         for endpoint, (_, sender) in self._senders.items():
             if change.senders.get(endpoint) is not sender:
                 change.left.callback(sender.close)
+        for sender, source, opened in change.moves:
+            change.left.callback(sender.move(source, opened).close)
         self._follow_drops(change)
         plans = {plan.name: plan for plan in change.program.listeners}
         for name, listener in change.listeners.items():

@@ -200,11 +200,11 @@ class Datapath(Protocol):
     def stalled(self) -> tuple[str, float] | None:
         """The topic in whose publisher a native thread is now, and for how many seconds."""
 
-    def open_listener(self, settings: model.Listener) -> Listener:
+    def open_listener(self, settings: model.Listener, has_senders: bool) -> Listener:
         """Bind a socket. Raises StartError."""
 
-    def open_sender(self, endpoint: model.Endpoint) -> Sender:
-        """Open a socket to an endpoint. Raises StartError."""
+    def open_sender(self, endpoint: model.Endpoint, source: Listener | None, listeners: Sequence[Listener]) -> Sender:
+        """Open a socket to an endpoint, as `Sender`. Raises OSError."""
 
     def states(self, earlier: Wiring | None) -> States: ...
 

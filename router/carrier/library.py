@@ -77,7 +77,9 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "ring_written": (c_uint64, (c_void_p,)),
     "sender_close": (None, (c_void_p,)),
     "sender_end": (None, (c_void_p,)),
-    "sender_open": (c_void_p, (c_int, c_uint32, c_uint16)),
+    "sender_move": (None, (c_void_p, c_int, c_int)),
+    "sender_note_errors": (c_bool, (c_int,)),
+    "sender_open": (c_void_p, (c_int, c_int, c_uint32, c_uint16)),
     "sender_send": (c_int, (c_void_p, c_void_p, c_size_t)),
     "sender_send_checked": (c_int, (c_void_p, c_void_p, c_size_t)),
 }

@@ -5,30 +5,47 @@ from __future__ import annotations
 import ctypes
 import os
 import socket
+from collections.abc import Iterable
 
-from router.net.udp import Sender
+from router.net.udp import Listener, Sender
 from router.table.model import Endpoint
 
 
 class NativeSender(Sender):
-    """A socket that is connected to one destination. `address` is that of its `struct sender`."""
+    """See `Sender`. `address` is that of its `struct sender`."""
 
-    def __init__(self, library: ctypes.CDLL, endpoint: Endpoint) -> None:
-        """Raises StartError, and MemoryError."""
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        endpoint: Endpoint,
+        source: Listener | None = None,
+        listeners: Iterable[Listener] = (),
+    ) -> None:
+        """Raises OSError, and MemoryError."""
         self.address = 0
-        super().__init__(endpoint)
         self._library = library
+        super().__init__(endpoint, source, listeners)
         host, port = endpoint.address.value
         number = int.from_bytes(socket.inet_aton(host), "big")
-        self.address = int(library.sender_open(self.socket.fileno(), number, port) or 0)
+        self.address = int(library.sender_open(self.socket.fileno(), self.errors.fileno(), number, port) or 0)
         if not self.address:
-            self.socket.close()
+            super().close()
             raise MemoryError("a sender of the carrier cannot be opened")
-        self.send = self._send
 
-    def _send(self, data: bytes) -> int:
-        """Send a datagram and return its size, or raise OSError: then exactly one is lost."""
-        if error := self._library.sender_send(self.address, data, len(data)):
+    def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
+        left = super().move(source, opened)
+        if self.address:
+            self._library.sender_move(self.address, opened.fileno(), self.errors.fileno())
+        return left
+
+    def send(self, data: bytes) -> int:
+        return self._sent(self._library.sender_send(self.address, data, len(data)), data)
+
+    def send_checked(self, data: bytes) -> int:
+        return self._sent(self._library.sender_send_checked(self.address, data, len(data)), data)
+
+    def _sent(self, error: int, data: bytes) -> int:
+        if error:
             raise OSError(error, os.strerror(error))
         return len(data)
 

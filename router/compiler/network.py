@@ -9,7 +9,7 @@ from itertools import combinations
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
 from router.table.addresses import Address
-from router.table.model import ANY, Endpoint, EndpointKind, Gateway, RouteTable, Transport
+from router.table.model import ANY, EPHEMERAL, Endpoint, EndpointKind, Gateway, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -100,10 +100,13 @@ def _overlap(one: _Held, other: _Held) -> bool:
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Endpoints that name an unknown listener, and listeners that none of the sending endpoints may use."""
     for endpoint in table.endpoints.values():
-        named = endpoint.listener
-        if named and named.value not in table.listeners and not table.broken & {"listen", f"listen/{named.value}"}:
-            hint = did_you_mean(named.value, table.listeners)
-            yield Diagnostic(named.span, Code.UNKNOWN_LISTENER, f"there is no listener '{named.value}'", hint)
+        for named, known in (
+            (endpoint.listener, [*table.listeners]),
+            (endpoint.send_from, [*table.listeners, EPHEMERAL]),
+        ):
+            if named and named.value not in known and not table.broken & {"listen", f"listen/{named.value}"}:
+                hint = did_you_mean(named.value, known)
+                yield Diagnostic(named.span, Code.UNKNOWN_LISTENER, f"there is no listener '{named.value}'", hint)
     sources = {source.value for route in table.routes for source in route.sources}
     senders = [endpoint for endpoint in table.endpoints.values() if endpoint.name in sources]
     believed_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
@@ -153,6 +156,15 @@ def _reaches(address: Address, own: Address) -> bool:
     if address.port != own.port:
         return False
     return address.host in (own.host, WILDCARD) or (own.host == WILDCARD and address.host.startswith(LOOPBACK))
+
+
+def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
+    """The listener from whose address and port datagrams leave for an endpoint; None for a port of their own."""
+    if endpoint.send_from is not None:
+        return None if endpoint.send_from.value == EPHEMERAL else endpoint.send_from.value
+    if endpoint.listener is not None:
+        return endpoint.listener.value
+    return next(iter(table.listeners)) if len(table.listeners) == 1 else None
 
 
 def recognisers(

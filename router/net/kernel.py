@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import os
 import socket
@@ -11,9 +12,14 @@ from contextlib import suppress
 from pathlib import Path
 
 # Linux constants that the socket module does not name.
+SO_ATTACH_FILTER = 26
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_MEMINFO = 55
+IP_PKTINFO = 8
+IP_RECVERR = 11
+IP_FREEBIND = 15
+PKTINFO_SIZE = 12
 SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
 SIOCGIFADDR = 0x8915
@@ -23,6 +29,11 @@ _IFREQ = struct.Struct("16s24s")
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
+
+_EXTENDED_ERROR = struct.Struct("@IBBB")
+"""The beginning of struct sock_extended_err: errno, origin, ICMP type and code."""
+_OF_ICMP, _UNREACHABLE, _NET_OR_HOST = 2, 3, (0, 1)
+_MOST_ERRORS = 32
 
 _BOUND = {"udp": "07", "tcp": "0A"}
 """The state of a socket that receives from anybody, in /proc/net."""
@@ -76,6 +87,36 @@ def bound_interface(opened: socket.socket) -> str | None:
         return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
     except OSError:
         return None
+
+
+def report_sending_errors(opened: socket.socket) -> None:
+    """Have the kernel report ICMP errors about datagrams that were sent from the socket's port."""
+    opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
+
+
+def sending_errors(opened: socket.socket) -> Iterator[tuple[tuple[str, int], int]]:
+    """Yield the waiting errors, each with the destination of its datagram.
+
+    The errno is 0 if the receiver has not refused the datagram: routers report passing troubles too.
+    """
+    for _ in range(_MOST_ERRORS):
+        try:
+            _, found, _, destination = opened.recvmsg(0, 256, socket.MSG_ERRQUEUE | socket.MSG_DONTWAIT)
+        except OSError:
+            return
+        errors = [data for level, kind, data in found if (level, kind) == (socket.IPPROTO_IP, IP_RECVERR)]
+        number, origin, kind, code = _EXTENDED_ERROR.unpack_from(errors[0])
+        is_refusal = origin == _OF_ICMP and kind == _UNREACHABLE and code not in _NET_OR_HOST
+        yield destination, number if is_refusal else 0
+    for wanted in (0, 1):  # discards the others: what a flood leaves would keep datagrams out of the receive buffer
+        opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, wanted)
+
+
+def refuse_input(opened: socket.socket) -> None:
+    """Have the kernel drop whatever a socket would receive, by a filter of one instruction: return 0 bytes."""
+    instruction = ctypes.create_string_buffer(struct.pack("@HBBI", 6, 0, 0, 0))
+    program = struct.pack("@HP", 1, ctypes.addressof(instruction))
+    opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
 
 
 def interface_is_up(name: str) -> bool | None:

@@ -53,6 +53,8 @@ _TIMEVAL = struct.Struct("@ll")
 _TASK_INTERVAL = 0.25
 """Seconds for which the thread waits for a datagram before it looks for tasks."""
 
+_FAULT_PAUSE = 0.001
+
 _MOST_WAITING = 1 << 16
 """The most datagrams that are read when a listener ends: more than a receive buffer holds."""
 
@@ -104,6 +106,11 @@ class _Reader:
         timeout = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
 
+    def pass_on_error(self) -> None:
+        """Handle what a receive has raised. Errors about what was sent from the listener's port go to the senders."""
+        if not self.listener.note_errors():
+            time.sleep(_FAULT_PAUSE)  # the error is another one, and may come again
+
     def take(self, most: int) -> int:
         """Read what has arrived, and return how many datagrams: fewer than `most` if there are no more."""
         receive, receive_from, size, flags = self.receive, self.receive_from, self.size, _DONT_WAIT
@@ -112,6 +119,9 @@ class _Reader:
                 data, peer = receive_from(size, flags)
             except BlockingIOError:  # also for a datagram with a wrong checksum
                 return taken
+            except OSError:
+                self.pass_on_error()
+                continue
             receive(data, peer)
         return most
 
@@ -260,6 +270,9 @@ class ReceiveThread:
                 try:
                     data, peer = receive_from(size, _WAIT)
                 except BlockingIOError:
+                    break
+                except OSError:
+                    reader.pass_on_error()
                     break
                 if peer is None:  # input has ended
                     return

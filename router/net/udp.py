@@ -5,13 +5,16 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Callable, Iterable, MutableMapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, MutableMapping
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
 from router.errors import StartError
 from router.log import logger
 from router.net.kernel import (
+    IP_FREEBIND,
+    IP_PKTINFO,
+    PKTINFO_SIZE,
     SO_TIMESTAMPNS,
     arrivals,
     ask_for_receive_buffer,
@@ -19,14 +22,13 @@ from router.net.kernel import (
     drops,
     port_taken,
     receive_buffer,
+    refuse_input,
+    report_sending_errors,
+    sending_errors,
 )
 from router.table import model
-from router.table.addresses import Address
+from router.table.addresses import Address, not_one_machine
 from router.table.model import bound_to
-
-_NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
-"""Errors of sending if there was no network when the socket was connected, there is none now, or this computer has
-lost the address that the socket sends from."""
 
 FIRST_INHERITED = 3
 """The first descriptor that a service manager hands over; the others follow it."""
@@ -92,10 +94,11 @@ class Listener:
 
     Raises StartError with the position in the table and a remedy. Datagrams that are not received from an inherited
     socket wait for the next process, and its kernel drops may be older than this process. `is_stamped`: each datagram
-    comes with the time at which the kernel got it; else `arrived_at` returns that of the last one.
+    comes with the time at which the kernel got it; else `arrived_at` returns that of the last one. `has_senders`:
+    some that are bound to its port are open.
     """
 
-    def __init__(self, settings: model.Listener, *, is_stamped: bool = False) -> None:
+    def __init__(self, settings: model.Listener, *, is_stamped: bool = False, has_senders: bool = False) -> None:
         self._settings = settings
         handed_over = inherited().take(settings.bound_to)
         self.is_inherited = handed_over is not None
@@ -106,14 +109,19 @@ class Listener:
             if handed_over is None:
                 if settings.interface is not None:
                     self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, settings.interface.encode())
-                # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
-                self.socket.bind(settings.address.value)
+                # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second
+                # router would steal the port unnoticed.
+                with self.shared() if has_senders else nullcontext():
+                    self.socket.bind(settings.address.value)
+            report_sending_errors(self.socket)
             self._request_receive_buffer(settings)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
             raise _refused(settings, error) from error
         self.address = Address(*self.socket.getsockname())
+        self.senders: list[Sender] = []
+        """Those that send from its address and port."""
         self._drops_at_close = 0
 
     @property
@@ -146,6 +154,19 @@ class Listener:
     def kernel_drops(self) -> int:
         """Datagrams that the kernel dropped before they were received, since the socket was opened."""
         return self._drops_at_close if self.socket.fileno() < 0 else drops(self.socket)
+
+    @contextmanager
+    def shared(self) -> Iterator[None]:
+        """Let sockets with SO_REUSEADDR bind its address and port meanwhile."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            yield
+        finally:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+
+    def note_errors(self) -> bool:
+        """Tell its senders of ICMP errors about what they have sent. Return whether there were any."""
+        return note_errors(self.socket, self.senders)
 
     def end_input(self) -> None:
         """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
@@ -207,68 +228,189 @@ def nobody_listens(address: Address) -> str:
     return f"nobody listens at {address}"
 
 
-class Sender:
-    """A non-blocking socket, connected to one destination. Opening raises StartError.
+def why_unreachable(address: Address) -> tuple[str, str] | None:
+    """Why nothing can be sent to an address now, with a remedy; None if a route leads there.
 
-    A destination that is unreachable because the link is not up yet is logged, and tried again with every datagram.
+    Raises BadAddressError for a broadcast address, which only the computer's interfaces tell.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(address)  # sends nothing
+        except OSError as error:
+            if error.errno == errno.EACCES and _is_broadcast(address):
+                raise not_one_machine(address) from error
+            if error.errno == errno.ENETUNREACH:
+                return "no network leads there", "does `ip address` show an interface in its network? is the cable in?"
+            why = error.strerror.lower() if error.strerror else str(error)
+            return f"the kernel refuses it: {why}", f"`ip route get {address.host}` shows the route that does"
+    return None
+
+
+def _is_broadcast(address: Address) -> bool:
+    """Whether the kernel takes the address where broadcast is allowed; it also refuses what a route prohibits."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        return probe.connect_ex(address) == 0
+
+
+class Sender:
+    """A non-blocking socket for one destination, which it is not connected to.
+
+    It is bound to address and port of `source`, so that answers reach that listener; without one, the kernel chooses
+    the port. `listeners` are all that are open: they must allow it. The socket itself receives nothing. Opening raises
+    OSError if descriptors are short.
     """
 
-    def __init__(self, endpoint: model.Endpoint) -> None:
-        self.endpoint, address = endpoint.name, endpoint.address.value
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.setblocking(False)
+    def __init__(
+        self, endpoint: model.Endpoint, source: Listener | None = None, listeners: Iterable[Listener] = ()
+    ) -> None:
+        self.endpoint = endpoint.name
+        self.source: Listener | None = None
+        self._to = endpoint.address.value
+        self._refused = 0  # errno of an earlier datagram
+        self.socket = self.open_socket(source, listeners)
+        self.move(source, self.socket)
+
+    def open_socket(self, source: Listener | None, listeners: Iterable[Listener]) -> socket.socket:
+        """Open a socket to move to."""
+        if source is not None:
+            try:
+                return _open_beside(source, listeners)
+            except OSError as error:
+                logger.warning(
+                    "datagrams to this endpoint leave from another port than its listener's, and answers are lost",
+                    endpoint=self.endpoint,
+                    listener=source.name,
+                    why=error.strerror,
+                )
+        return _open_sending(socket.AF_INET)
+
+    def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
+        """Send by `opened` from now on. Return the earlier socket, for the caller to close when no thread uses it."""
+        left, self.socket = self.socket, opened
+        self._leave_source()
+        self.source = source
+        if self._is_bound:
+            self._listener.senders.append(self)
+        return left
+
+    @property
+    def _is_bound(self) -> bool:
+        """Whether it sends from the port of its listener."""
+        return self.socket.family == socket.AF_INET6
+
+    @property
+    def _listener(self) -> Listener:
+        assert self.source is not None  # noqa: S101 - it is bound
+        return self.source
+
+    @property
+    def errors(self) -> socket.socket:
+        """The socket that ICMP errors about its datagrams reach."""
+        return self._listener.socket if self._is_bound else self.socket
+
+    def send(self, data: bytes) -> int:
+        """Send a datagram and return its size, or raise OSError: then exactly one is lost.
+
+        The error may be about an earlier datagram, which was counted as sent and which its receiver has refused. Then
+        this one was sent, so the counters balance.
+        """
         try:
-            self.socket.connect(address)
+            sent = self._send_once(data)
         except OSError as error:
-            if error.errno != errno.ENETUNREACH:
-                self.socket.close()
-                what = f"cannot send to endpoint '{self.endpoint}' at {address}"
-                raise StartError(f"{endpoint.address.span}: {what}: {error.strerror}") from error
-            logger.warning("no network leads to this endpoint yet", endpoint=self.endpoint, address=str(address))
-        self.send = _sending(self.socket, address)
+            sent = self._send_again(data, error)
+        self._raise_refused()
+        return sent
 
     def send_checked(self, data: bytes) -> int:
         """As `send`, but raise errors of this datagram that are known at once: no process listens on a local port.
 
-        With `send`, the next datagram would raise that error, and it may be another user's of this socket.
+        With `send`, a later datagram would raise that error.
         """
+        self._note_errors()
         sent = self.send(data)
-        if error := self.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            raise OSError(error, os.strerror(error))
+        self._note_errors()
+        self._raise_refused()
         return sent
 
+    def note(self, destination: Address, error: int) -> bool:
+        """Return whether the error is about a datagram of this sender, and not the second one."""
+        if destination != self._to or self._refused:
+            return False
+        self._refused = error
+        return True
+
     def close(self) -> None:
+        self._leave_source()
         self.socket.close()
 
+    def _leave_source(self) -> None:
+        if self.source is not None and self in self.source.senders:
+            self.source.senders.remove(self)
 
-def _sending(connected: socket.socket, address: Address) -> Callable[[bytes], int]:
-    """Return a function that sends a datagram and returns its size, or raises OSError: then exactly one is lost.
+    def _send_once(self, data: bytes) -> int:
+        host, port = self._to
+        return self.socket.sendto(data, (f"::ffff:{host}" if self._is_bound else host, port))
 
-    "Connection refused" is about an earlier datagram, which was counted as sent. The kernel returns it instead of
-    sending this one; so this one is sent again, and the error raised for the earlier one: the counters balance.
+    def _send_again(self, data: bytes, error: OSError) -> int:
+        """Try again after an error, if it may be of an earlier datagram, or if this computer may have lost the address
+        that the socket is bound to: a brake has to leave from another one."""
+        if not self._is_bound and self._note_errors():
+            return self._send_once(data)
+        if self._is_bound and error.errno in (errno.EINVAL, errno.ENETUNREACH):
+            host, port = self._to
+            any_address = [(socket.IPPROTO_IP, IP_PKTINFO, bytes(PKTINFO_SIZE))]
+            return self.socket.sendmsg([data], any_address, 0, (f"::ffff:{host}", port))
+        raise error
 
-    If the network has changed, `connected` is connected again first.
+    def _note_errors(self) -> bool:
+        return self._listener.note_errors() if self._is_bound else note_errors(self.socket, [self])
+
+    def _raise_refused(self) -> None:
+        if self._refused:
+            refused, self._refused = self._refused, 0
+            raise OSError(refused, os.strerror(refused))
+
+
+def note_errors(opened: socket.socket, senders: Iterable[Sender]) -> bool:
+    """Read the ICMP errors that a socket has, and tell the senders whose datagrams they are about.
+
+    Return whether there were any.
     """
-    send = connected.send
-
-    def send_one(data: bytes) -> int:
-        try:
-            return send(data)
-        except ConnectionRefusedError:
-            send(data)
-            raise
-        except OSError as error:
-            if error.errno not in _NETWORK_CHANGED:
-                raise
-            _reconnect(connected, address)
-            return send(data)
-
-    return send_one
+    read = 0
+    for destination, error in sending_errors(opened):
+        read += 1
+        any(sender.note(Address(*destination), error) for sender in senders if error)
+    return read > 0
 
 
-def _reconnect(connected: socket.socket, address: Address) -> None:
-    """Replace the socket by a new one. `connect` alone would keep its local address, which may have gone."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as fresh:
-        fresh.setblocking(False)
-        fresh.connect(address)
-        os.dup2(fresh.fileno(), connected.fileno(), inheritable=False)
+def _open_sending(family: socket.AddressFamily) -> socket.socket:
+    """A socket that reports ICMP errors, and receives nothing."""
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    report_sending_errors(opened)
+    refuse_input(opened)
+    return opened
+
+
+def _open_beside(listener: Listener, listeners: Iterable[Listener]) -> socket.socket:
+    """A socket that sends from a listener's address and port, while the listener alone receives.
+
+    It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
+    one of the datagram's own family.
+    """
+    opened = _open_sending(socket.AF_INET6)
+    try:
+        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        host, port = listener.address
+        with ExitStack() as shared:
+            for each in listeners:
+                if each.address.port == port:
+                    shared.enter_context(each.shared())
+            opened.bind((f"::ffff:{host}", port))
+    except OSError:
+        opened.close()
+        raise
+    return opened

@@ -65,8 +65,12 @@ def parse_remote(text: str) -> Address:
     """The address of one machine, to send to. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) == 0 or _first(address) >= 224:
-        raise BadAddressError(f"{address.host} is not the address of one machine", _NO_MULTICAST)
+        raise not_one_machine(address)
     return address
+
+
+def not_one_machine(address: Address) -> BadAddressError:
+    return BadAddressError(f"{address.host} is not the address of one machine", _NO_MULTICAST)
 
 
 def parse_local(text: str) -> Address:

@@ -120,12 +120,17 @@ class Listener:
         return bound_to(self.address.value, self.interface)
 
 
+EPHEMERAL = "ephemeral"
+"""Where an endpoint's datagrams leave from if not from a listener's port: one that the kernel chooses."""
+
+
 @dataclass(frozen=True, slots=True)
 class Endpoint:
     """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
 
     Silent for longer than `stale_after` (ns) it is stale; None means that it never is. With a `listener`, only what
-    that one receives can be from it. `allow_non_finite`: a board gets NaN and infinities as well.
+    that one receives can be from it. `send_from` is a listener's name or EPHEMERAL, None where the table says nothing.
+    `allow_non_finite`: a board gets NaN and infinities as well.
     """
 
     name: str
@@ -138,6 +143,7 @@ class Endpoint:
     bandwidth: Annotated[int | None, DATA_RATE] = None
     stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
     listener: Located[str] | None = None
+    send_from: Located[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

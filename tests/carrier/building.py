@@ -21,7 +21,6 @@ _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_limit_passes": (c_bool, (c_void_p, c_int64)),
     "seam_lock": (None, (c_void_p,)),
     "seam_next_due": (c_int64, (c_void_p,)),
-    "seam_set_reconnected": (None, (c_void_p, c_int64)),
     "seam_timer": (c_int, (c_void_p,)),
     "seam_timer_set_for": (c_int64, (c_void_p,)),
     "seam_unlock": (None, (c_void_p,)),

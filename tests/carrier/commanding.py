@@ -94,10 +94,10 @@ class Board:
     """What an endpoint gets. `address` is that of a `struct sender`."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
-        self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._near.setblocking(False)
         self._far.setblocking(False)
-        self.address: int = library.sender_open(self._near.fileno(), 0, 0)
+        self.address: int = library.sender_open(self._near.fileno(), -1, 0, 0)
 
     def break_down(self) -> None:
         """Sending fails from now on."""

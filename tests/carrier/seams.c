@@ -7,5 +7,4 @@ int64_t seam_timer_set_for(struct deadmen *deadmen) { return deadmen->timer_set_
 int seam_timer(struct deadmen *deadmen) { return deadmen->timer; }
 void seam_lock(struct deadmen *deadmen) { pthread_mutex_lock(&deadmen->lock); }
 void seam_unlock(struct deadmen *deadmen) { pthread_mutex_unlock(&deadmen->lock); }
-void seam_set_reconnected(struct sender *sender, int64_t at) { atomic_store(&sender->reconnected_at, at); }
 bool seam_limit_passes(struct limit *limit, int64_t now) { return limit_passes(limit, now); }

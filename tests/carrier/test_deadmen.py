@@ -47,14 +47,14 @@ class Outlet:
     """An endpoint in memory, which has the address of its `struct sender` as a NativeSender has."""
 
     def __init__(self, library: ctypes.CDLL, stack: ExitStack) -> None:
-        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._near, self._far = [stack.enter_context(each) for each in pair]
         self._near.setblocking(False)
         self._far.setblocking(False)
         self._intact = stack.enter_context(self._near.dup())
         self._broken = os.open(os.devnull, os.O_WRONLY)
         stack.callback(os.close, self._broken)
-        self.address: int = library.sender_open(self._near.fileno(), 0, 0)
+        self.address: int = library.sender_open(self._near.fileno(), -1, 0, 0)
         stack.callback(library.sender_close, self.address)
 
     def breaks(self, *, is_broken: bool) -> None:

@@ -1,36 +1,39 @@
-"""The carrier's senders account for every datagram as those of Python do, and get over changes of the network."""
+"""Senders account for every datagram, get over changes of the network, and have their answers reach a listener."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
-import gc
 import os
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from functools import partial
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from router.carrier.sender import NativeSender
-from router.net.udp import Sender
-from router.table import model
+from router.net.udp import Listener, Sender
 from router.table.addresses import Address
 from tests.namespaces import cable, computers
-from tests.net.test_udp import endpoint
+from tests.net.test_udp import endpoint, plan
 
-LONG_AGO, IN_THE_FUTURE = -(1 << 62), 1 << 62
-
-
-Make = Callable[[model.Endpoint], NativeSender]
+Make = Callable[..., Sender]
+"""Called with an endpoint, the listener that it sends from, and all listeners."""
 
 
 @pytest.fixture(scope="session")
 def native(library: ctypes.CDLL) -> Make:
     return partial(NativeSender, library)
+
+
+@pytest.fixture(params=["carrier", "python"])
+def make(request: pytest.FixtureRequest, native: Make) -> Make:
+    return native if request.param == "carrier" else Sender
 
 
 @pytest.fixture
@@ -48,19 +51,26 @@ def board(stack: ExitStack) -> socket.socket:
 
 
 @pytest.fixture
-def sender(stack: ExitStack, native: Make, board: socket.socket) -> NativeSender:
-    """It sends to the board."""
-    return stack.enter_context(closing(native(endpoint("board", Address(*board.getsockname())))))
+def listener(stack: ExitStack) -> Listener:
+    return stack.enter_context(closing(Listener(plan())))
+
+
+@pytest.fixture
+def sender(stack: ExitStack, make: Make, board: socket.socket, listener: Listener) -> Sender:
+    """It sends to the board, from the listener's port."""
+    return stack.enter_context(closing(make(endpoint("board", Address(*board.getsockname())), listener, [listener])))
 
 
 class Link:
-    """A sender, and a board that comes and goes."""
+    """A sender, and a board that comes and goes. `is_bound`: it sends from a listener's port."""
 
-    def __init__(self, stack: ExitStack, make: Callable[[model.Endpoint], Sender]) -> None:
+    def __init__(self, stack: ExitStack, make: Make, *, is_bound: bool) -> None:
         self._boards = stack
         board = self._bound(("127.0.0.1", 0))
         self._address: tuple[str, int] = board.getsockname()
-        self._sender = stack.enter_context(closing(make(endpoint("board", Address(*self._address)))))
+        listener = stack.enter_context(closing(Listener(plan()))) if is_bound else None
+        made = make(endpoint("board", Address(*self._address)), listener, [listener] if listener else [])
+        self._sender = stack.enter_context(closing(made))
         self._board: socket.socket | None = board
 
     def _bound(self, address: tuple[str, int]) -> socket.socket:
@@ -94,99 +104,197 @@ class Link:
         return received
 
 
-@given(steps=st.lists(st.sampled_from(["send", "send", "send checked", "send too much", "toggle"]), max_size=30))
-def test_it_sends_and_fails_as_python_does(native: Make, steps: list[str]) -> None:
+@given(
+    steps=st.lists(st.sampled_from(["send", "send", "send checked", "send too much", "toggle"]), max_size=30),
+    is_bound=st.booleans(),
+)
+def test_it_sends_and_fails_as_python_does(native: Make, steps: list[str], is_bound: bool) -> None:
     with ExitStack() as stack:
-        links = [Link(stack, make) for make in (Sender, native)]
+        links = [Link(stack, make, is_bound=is_bound) for make in (Sender, native)]
         for step in steps:
             python, carrier = [link.step(step) for link in links]
             assert carrier == python
 
 
-def test_a_full_buffer_is_an_error_and_nobody_waits(stack: ExitStack, sender: NativeSender) -> None:
-    blocking, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    stack.enter_context(blocking)
-    stack.enter_context(other)
-    os.dup2(blocking.fileno(), sender.socket.fileno())
-    sent = 0
-    with suppress(BlockingIOError):
-        while True:
-            sent += sender.send(b"x")
-    other.setblocking(False)
-    assert [other.recv(10) for _ in range(sent)] == sent * [b"x"]
-    assert sender.send(b"again") == 5
-
-
-def disconnect(sender: Sender) -> None:
-    """Have it in the state of one that found no network when it was opened."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unconnected:
-        os.dup2(unconnected.fileno(), sender.socket.fileno())
-
-
-def test_it_connects_again_to_the_same_descriptor(sender: NativeSender, board: socket.socket) -> None:
-    number = sender.socket.fileno()
-    disconnect(sender)
-    assert sender.send(b"drive") == 5
-    assert board.recv(100) == b"drive"
-    assert sender.socket.fileno() == number
-    assert not os.get_inheritable(number)
-    assert not os.get_blocking(number)
-
-
-def test_it_connects_again_only_now_and_then(sender: NativeSender, board: socket.socket, seams: ctypes.CDLL) -> None:
-    disconnect(sender)
-    seams.seam_set_reconnected(sender.address, IN_THE_FUTURE)
-    for _ in range(3):
-        with pytest.raises(OSError, match=os.strerror(errno.EDESTADDRREQ)):
-            sender.send(b"lost")
-    seams.seam_set_reconnected(sender.address, LONG_AGO)
-    assert sender.send(b"drive") == 5
-    assert board.recv(100) == b"drive"
-
-
-def test_it_gets_over_the_loss_of_its_address_and_of_the_network(
-    stack: ExitStack, native: Make, seams: ctypes.CDLL
+def test_it_sends_from_its_listeners_port_and_answers_reach_the_listener(
+    sender: Sender, board: socket.socket, listener: Listener
 ) -> None:
+    sender.send(b"drive")
+    data, where_from = board.recvfrom(100)
+    assert (data, where_from) == (b"drive", listener.address)
+    board.sendto(b"obeyed", where_from)
+    assert listener.socket.recvfrom(100) == (b"obeyed", board.getsockname())
+
+
+def test_many_senders_share_a_port_with_a_listener_on_all_networks(
+    stack: ExitStack, make: Make, board: socket.socket
+) -> None:
+    listener = stack.enter_context(closing(Listener(plan(host="0.0.0.0"))))
+    for number in range(5):
+        to = endpoint(f"board_{number}", Address(*board.getsockname()))
+        stack.enter_context(closing(make(to, listener, [listener]))).send(b"%d" % number)
+        data, where_from = board.recvfrom(100)
+        assert (data, where_from) == (b"%d" % number, ("127.0.0.1", listener.address.port))
+        board.sendto(b"to %d" % number, where_from)
+        assert listener.socket.recv(100) == b"to %d" % number
+
+
+@pytest.mark.parametrize("shares", [0, 1])
+def test_nobody_else_can_have_the_port(listener: Listener, sender: Sender, shares: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, shares)
+        with pytest.raises(OSError, match="Address already in use"):
+            other.bind(listener.address)
+
+
+def test_a_sender_queues_nothing_that_its_listener_does_not_receive(stack: ExitStack, make: Make) -> None:
+    """The listener of an interface does not receive what comes in by another one; the sender is bound to none."""
     rover, station = stack.enter_context(computers("rover", "station"))
-    address = Address("10.78.1.2", 9000)
-    unconnected = rover.inside(lambda: native(endpoint("board", address)))  # no network leads there yet
-    sender = stack.enter_context(closing(unconnected))
-
-    def send(data: bytes) -> int | None:
-        """From within: what replaces the socket is opened where the sender is. Return an errno, or None."""
-        seams.seam_set_reconnected(sender.address, LONG_AGO)
-
-        def attempt() -> int | None:
-            try:
-                sender.send(data)
-            except OSError as error:
-                return error.errno
-            return None
-
-        return rover.inside(attempt)
-
-    assert send(b"too early") == errno.ENETUNREACH
     cable(rover, "lan", "10.78.1.1/24", station, "lan", "10.78.1.2/24")
+    board = stack.enter_context(rover.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+    board.bind(("127.0.0.1", 0))
+    board.settimeout(10)
+    settings = replace(plan(host="0.0.0.0", port=5000), interface="lan")
+    listener = stack.enter_context(closing(rover.inside(lambda: Listener(settings))))
+    to = endpoint("board", Address(*board.getsockname()))
+    sender = stack.enter_context(closing(rover.inside(lambda: make(to, listener, [listener]))))
+    sender.send(b"drive")
+    _, where_from = board.recvfrom(100)
+    board.sendto(b"by another interface", where_from)
+    for opened in (sender.socket, listener.socket):
+        with pytest.raises(BlockingIOError):
+            opened.recv(100, socket.MSG_DONTWAIT)
+
+
+def test_an_endpoint_without_a_listener_has_a_port_of_its_own_and_hears_no_answer(
+    stack: ExitStack, make: Make, board: socket.socket
+) -> None:
+    sender = stack.enter_context(closing(make(endpoint("board", Address(*board.getsockname())))))
+    ports = set()
+    for _ in range(2):
+        sender.send(b"drive")
+        _, where_from = board.recvfrom(100)
+        ports.add(where_from[1])
+        board.sendto(b"answer", where_from)
+    assert len(ports) == 1
+    with pytest.raises(BlockingIOError):
+        sender.socket.recv(100)
+
+
+def test_each_sender_hears_of_its_own_losses(
+    stack: ExitStack, library: ctypes.CDLL, make: Make, board: socket.socket, listener: Listener, sender: Sender
+) -> None:
+    """The kernel tells the listener, which passes it on, and receives on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        address = Address(*absent.getsockname())
+    lost = stack.enter_context(closing(make(endpoint("absent", address), listener, [listener])))
+    assert lost.send(b"lost") == 4
+    board.sendto(b"telemetry", listener.address)
+    with pytest.raises(ConnectionRefusedError):
+        listener.socket.recv(100)
+    if isinstance(lost, NativeSender):
+        assert library.sender_note_errors(listener.socket.fileno())
+    else:
+        assert listener.note_errors()
+    assert listener.socket.recv(100) == b"telemetry"
+    assert sender.send(b"drive") == 5
+    with pytest.raises(ConnectionRefusedError):
+        lost.send(b"lost too")
+    assert lost.send(b"the listener was not asked again") == 32
+
+
+def test_a_flood_of_errors_leaves_no_room_taken(
+    stack: ExitStack, library: ctypes.CDLL, make: Make, listener: Listener
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        address = Address(*absent.getsockname())
+    lost = stack.enter_context(closing(make(endpoint("absent", address), listener, [listener])))
+    for _ in range(100):
+        lost.send(b"lost")
+    if isinstance(lost, NativeSender):
+        assert library.sender_note_errors(listener.socket.fileno())
+        assert not library.sender_note_errors(listener.socket.fileno())
+    else:
+        assert listener.note_errors()
+        assert not listener.note_errors()
+
+
+def test_a_sender_moves_to_another_port_and_back(
+    stack: ExitStack, sender: Sender, board: socket.socket, listener: Listener
+) -> None:
+    other = stack.enter_context(closing(Listener(plan("other"))))
+    for source in (other, None, listener):
+        sender.move(source, sender.open_socket(source, [listener, other])).close()
+        sender.send(b"drive")
+        _, where_from = board.recvfrom(100)
+        assert where_from[1] == (source.address if source else sender.socket.getsockname())[1]
+        assert (where_from == listener.address) == (source is listener)
+
+
+def test_without_ipv6_it_sends_from_another_port_and_says_so(
+    stack: ExitStack, make: Make, board: socket.socket, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Old(socket.socket):
+        def __init__(self, family: int = socket.AF_INET, *others: int, **more: int) -> None:
+            if family == socket.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+            super().__init__(family, *others, **more)
+
+    monkeypatch.setattr(socket, "socket", Old)
+    with capture_logs() as logged:
+        sender = stack.enter_context(
+            closing(make(endpoint("board", Address(*board.getsockname())), listener, [listener]))
+        )
+    sender.send(b"drive")
+    assert board.recvfrom(100) == (b"drive", ("127.0.0.1", sender.socket.getsockname()[1]))
+    assert [(each["log_level"], each["listener"]) for each in logged] == [("warning", "rover")]
+
+
+def test_a_full_buffer_is_an_error_and_nobody_waits(stack: ExitStack, make: Make) -> None:
+    """The kernel keeps what it cannot send before it knows the receiver's hardware address."""
+    rover, station = stack.enter_context(computers("rover", "station"))
+    cable(rover, "lan", "10.78.1.1/24", station, "lan", "10.78.1.2/24")
+    sender = stack.enter_context(closing(rover.inside(lambda: make(endpoint("board", Address("10.78.1.9", 9000))))))
+    sender.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    with suppress(BlockingIOError):
+        for _ in range(100):
+            sender.send(b"x")
+        pytest.fail("the buffer has room for everything")
+
+
+def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStack, make: Make) -> None:
+    rover, station = stack.enter_context(computers("rover", "station"))
+    cable(rover, "lan", "10.78.1.1/24", station, "lan", "10.78.1.2/24")
+    address = Address("10.78.1.2", 9000)
     board = stack.enter_context(station.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
     board.bind(address)
     board.settimeout(10)
-    assert send(b"first") is None
-    assert board.recv(100) == b"first"
+    listener = stack.enter_context(closing(rover.inside(lambda: Listener(plan(host="10.78.1.1", port=5000)))))
+    sender = stack.enter_context(closing(rover.inside(lambda: make(endpoint("board", address), listener, [listener]))))
+
+    def source_of(data: bytes) -> tuple[str, int]:
+        sender.send(data)
+        received, where_from = board.recvfrom(100)
+        assert received == data
+        return Address(*where_from)
+
+    assert source_of(b"first") == ("10.78.1.1", 5000)
     rover.ip("address", "del", "10.78.1.1/24", "dev", "lan")
-    assert send(b"lost") == errno.ENETUNREACH
+    with pytest.raises(OSError, match="unreachable"):
+        sender.send(b"lost")
     rover.ip("address", "add", "10.78.1.3/24", "dev", "lan")
-    assert send(b"second") is None
-    assert board.recvfrom(100) == (b"second", ("10.78.1.3", sender.socket.getsockname()[1]))
+    assert source_of(b"from another address") == ("10.78.1.3", 5000)
+    rover.ip("address", "add", "10.78.1.1/24", "dev", "lan")
+    assert source_of(b"from its own again") == ("10.78.1.1", 5000)
 
 
 def test_nothing_is_sent_after_the_end(native: Make, board: socket.socket) -> None:
     sender = native(endpoint("board", Address(*board.getsockname())))
     send = sender.send
     sender.close()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # which usually gets the closed one's descriptor
-        other.connect(board.getsockname())
-        del sender
-        gc.collect()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM):  # which usually gets the closed one's descriptor
         for _ in range(2):
             with pytest.raises(OSError, match=os.strerror(errno.EBADF)):
                 send(b"to whom?")

@@ -133,12 +133,12 @@ class _Destination:
 
     def __init__(self, loaded: ctypes.CDLL, refuses: bool) -> None:
         self._library = loaded
-        self._socket, self._peer = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket, self._peer = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._peer.setblocking(False)
         self.refuses = refuses
         if refuses:
             self._peer.close()
-        self.address: int = loaded.sender_open(self._socket.fileno(), 0, 0)
+        self.address: int = loaded.sender_open(self._socket.fileno(), -1, 0, 0)
 
     def send(self, data: bytes) -> int:
         if error := self._library.sender_send(self.address, data, len(data)):

@@ -22,9 +22,9 @@ from router.errors import Located, SourceSpan, StartError
 from router.net import receiver, udp
 from router.net.kernel import SO_RCVBUFFORCE, SO_TIMESTAMPNS
 from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
-from router.net.udp import Inherited, Listener, Sender
+from router.net.udp import Inherited, Listener, Sender, why_unreachable
 from router.table import model
-from router.table.addresses import Address
+from router.table.addresses import Address, BadAddressError
 from router.table.model import EndpointKind, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
@@ -444,40 +444,14 @@ def test_losses_are_counted_one_for_one(stack: ExitStack) -> None:
     assert outcomes == [4] + 9 * [0]  # the loss of the tenth would be told by an eleventh
 
 
-class _Displaced(socket.socket):
-    """A socket whose computer has lost the address that it sends from, or the network that it sent to."""
-
-    old_address: tuple[str, int] | None = None
-    error = errno.EINVAL
-
-    def send(self, data: bytes, flags: int = 0) -> int:  # type: ignore[override]
-        if self.getsockname() == self.old_address:
-            raise OSError(self.error, os.strerror(self.error))
-        return super().send(data, flags)
-
-
-@pytest.mark.parametrize("error", [errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL])
-def test_a_sender_gets_over_a_change_of_the_network(
-    stack: ExitStack, peer: socket.socket, monkeypatch: pytest.MonkeyPatch, error: int
-) -> None:
-    monkeypatch.setattr(socket, "socket", _Displaced)
-    sender = send_to(stack, Address(*peer.getsockname()))
-    assert isinstance(sender.socket, _Displaced)
-    sender.socket.old_address, sender.socket.error = sender.socket.getsockname(), error
-    for datagram in (b"first", b"second"):
-        assert sender.send(datagram) == len(datagram)
-        assert peer.recv(LIMIT) == datagram
-    assert not os.get_blocking(sender.socket.fileno())
-
-
 def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, peer: socket.socket) -> None:
     with pytest.raises(OSError, match="too long"):
         send_to(stack, Address(*peer.getsockname())).send(bytes(70000))
 
 
-def test_a_broadcast_destination_is_refused_at_the_start() -> None:
-    with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 127.255.255.255:9"):
-        Sender(endpoint("basestation", Address("127.255.255.255", 9)))
+def test_a_broadcast_destination_is_no_machine() -> None:
+    with pytest.raises(BadAddressError, match=r"127.255.255.255 is not the address of one machine"):
+        why_unreachable(Address("127.255.255.255", 9))
 
 
 # sockets of a service manager

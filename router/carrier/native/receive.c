@@ -208,6 +208,19 @@ static int64_t arrival(struct msghdr *message) {
     return 0;
 }
 
+/* As recvmsg, but errors about datagrams that were sent from the listener's port go to their senders, and keep no datagram
+ * waiting. While more of them arrive, each attempt may fail. */
+static ssize_t receive(int fd, struct msghdr *message, int flags) {
+    enum { ATTEMPTS = 3 };
+    ssize_t length = recvmsg(fd, message, flags);
+    if (length >= 0 || errno == EAGAIN || errno == EINTR) return length;
+    bool is_about_sent = sender_note_errors(fd);
+    for (int left = ATTEMPTS; left && length < 0 && errno != EAGAIN; left--)
+        length = recvmsg(fd, message, flags | MSG_DONTWAIT);
+    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* a fault: it is not to keep us busy */
+    return length;
+}
+
 /* Receive and handle a datagram. Return whether there was one. */
 static bool receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
     struct sockaddr_in sender;
@@ -215,11 +228,8 @@ static bool receive_one(struct carrier *carrier, const struct listener *listener
     struct iovec into = {carrier->datagram, MAX_DATAGRAM + 1};
     struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
                              .msg_control = &control, .msg_controllen = sizeof control};
-    ssize_t length = recvmsg(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
-    if (length < 0) {
-        if (errno != EAGAIN && errno != EINTR) usleep(1000); /* an error of the network: it is not to keep us busy */
-        return false;
-    }
+    ssize_t length = receive(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
+    if (length < 0) return false;
     if (!message.msg_namelen) { /* input has ended; an empty datagram has a sender */
         if (!(flags & MSG_DONTWAIT)) usleep(1000);
         return false;
@@ -312,10 +322,13 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
     }
     do {
         struct epoll_event ready[LISTENERS_PER_WAIT];
-        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS), received = 0;
-        for (int index = 0; index < count; index++)
-            received += receive_one(carrier, &program->listeners[ready[index].data.u32], MSG_DONTWAIT);
-        if (count > 0 && !received) usleep(1000); /* input has ended, which epoll says again and again */
+        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS), served = 0;
+        for (int index = 0; index < count; index++) {
+            const struct listener *listener = &program->listeners[ready[index].data.u32];
+            if (ready[index].events & EPOLLERR) served += sender_note_errors(listener->fd);
+            served += receive_one(carrier, listener, MSG_DONTWAIT);
+        }
+        if (count > 0 && !served) usleep(1000); /* input has ended, which epoll says again and again */
     } while (goes_on(carrier));
     for (uint32_t index = 0; index < program->listener_count; index++)
         epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);

@@ -1,4 +1,7 @@
-/* A non-blocking UDP socket, connected to one destination. Any thread may send. */
+/* A non-blocking UDP socket for one destination. Any thread may send.
+ *
+ * It is not connected, so that it also receives nothing. It is bound to the address and port of a listener, or to a port
+ * that the kernel has chosen. ICMP errors about what it has sent reach the listener, else the socket itself. */
 #ifndef SENDER_H
 #define SENDER_H
 
@@ -9,26 +12,34 @@
 #include <stdint.h>
 
 struct sender {
-    _Atomic int fd; /* stays the same when the socket is replaced; -1 after `sender_end` */
+    struct sender *next; /* in the list of all */
     struct sockaddr_in address;
-    _Atomic int64_t reconnected_at; /* monotonic, ns */
+    _Atomic int fd;      /* -1 after `sender_end` */
+    _Atomic int errors;  /* the socket that ICMP errors reach: the listener's, or the same as `fd` */
+    _Atomic int refused; /* errno of an earlier datagram, not returned yet; 0 for none */
 };
 
-/* Return a sender for a socket that is connected to `address` (host byte order) and `port`, or NULL for lack of memory.
- * The caller closes the socket, after `sender_end`: sending fails with EBADF from then on. */
-struct sender *sender_open(int fd, uint32_t address, uint16_t port);
+/* Return a sender to `address` (host byte order) and `port`, or NULL for lack of memory. The caller closes the sockets,
+ * after `sender_end`: sending fails with EBADF from then on. */
+struct sender *sender_open(int fd, int errors, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
 void sender_close(struct sender *sender); /* when nothing refers to it any more */
 
+/* Send by another socket from now on. The caller closes the earlier one when no thread uses it any more. */
+void sender_move(struct sender *sender, int fd, int errors);
+
 /* Send a datagram. Return 0, or an errno: then exactly one datagram is lost.
  *
- * ECONNREFUSED is about an earlier datagram, which was counted as sent. The kernel returns it instead of sending this
- * one; so this one is sent again, and the error returned for the earlier one: the counters balance. If the network has
- * changed, the socket is replaced and connected again first, at most once per 100 ms. */
+ * An error may be about an earlier datagram, which was counted as sent and which its receiver has refused: nobody listens
+ * there (ECONNREFUSED), or its firewall says no. Then this datagram was sent, so the counters balance. */
 int sender_send(struct sender *sender, const void *data, size_t size);
 
 /* As `sender_send`, but also return errors of this datagram that are known at once: no process listens on a local port.
- * With `sender_send`, the next datagram would get that error. */
+ * With `sender_send`, a later datagram would get that error. */
 int sender_send_checked(struct sender *sender, const void *data, size_t size);
+
+/* Read the ICMP errors that a socket has, and tell the senders whose datagrams they are about. Return whether there were
+ * any. A flood of them is cut short. */
+bool sender_note_errors(int errors);
 
 #endif

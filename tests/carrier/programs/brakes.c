@@ -47,9 +47,8 @@ static struct board open_board(void) {
     int board = socket(AF_INET, SOCK_DGRAM, 0), from = socket(AF_INET, SOCK_DGRAM, 0);
     check(!bind(board, (struct sockaddr *)&address, sizeof address), "bind");
     getsockname(board, (struct sockaddr *)&address, &length);
-    check(!connect(from, (struct sockaddr *)&address, sizeof address), "connect");
     setsockopt(board, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
-    return (struct board){board, sender_open(from, INADDR_LOOPBACK, ntohs(address.sin_port))};
+    return (struct board){board, sender_open(from, from, INADDR_LOOPBACK, ntohs(address.sin_port))};
 }
 
 static void close_board(struct board board) {

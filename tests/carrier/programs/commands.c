@@ -47,7 +47,7 @@ int main(void) {
     static counter counters[COUNTERS], braked[COUNTERS];
     int pair[2];
     assert(!socketpair(AF_UNIX, SOCK_SEQPACKET, 0, pair));
-    struct sender *sender = sender_open(pair[0], 0, 0);
+    struct sender *sender = sender_open(pair[0], -1, 0, 0);
     struct ring *events = ring_open(1 << 12);
     struct deadmen *deadmen = deadmen_open(braked, NULL);
     struct deadman_destination braking = {.sender = sender, .datagram = MESSAGE, .size = 1, .sent = 2, .send_errors = 3};

@@ -1,0 +1,199 @@
+"""Where datagrams leave from, so that a board that answers there is heard, through firewalls too."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.acceptance.payloads import WIRE
+from tests.acceptance.site import RouterProcess, key, wait_until
+from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover, rover_with_networks
+from tests.namespaces import Computer
+
+TABLE = """\
+version: 1
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
+http: {{address: 127.0.0.1:9108}}
+listen: {{rover: {{address: 0.0.0.0:5000}}}}
+endpoints:
+  driving_board: {{address: 10.78.1.222:8, kind: board}}
+  basestation: {{address: 10.78.2.10:9000, kind: basestation}}
+routes:
+  manual_drive: {{source: basestation, destinations: driving_board, deadman: {{none: a test}}}}
+  drive_diag: {{source: driving_board, destinations: basestation}}
+"""
+SEVERAL = TABLE.replace(
+    "listen: {{rover: {{address: 0.0.0.0:5000}}}}",
+    """listen:
+  lan: {{address: 0.0.0.0:5000, interface: lan0}}
+  radio: {{address: 0.0.0.0:5000, interface: radio0}}""",
+)
+DIAG = WIRE.encode(WIRE.case("drive_diag"), WIRE.case("drive_diag").message_class())
+
+
+@pytest.fixture(params=["native", "python"])
+def plane(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Rover]:
+    with rover_with_networks(tmp_path) as found:
+        yield found
+
+
+@contextmanager
+def running(site: Rover, plane: str, text: str = TABLE) -> Iterator[RouterProcess]:
+    path = site.table(text)
+    with site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane)) as router:
+        yield router
+
+
+def exchange(site: Rover, to: tuple[str, int] = RADIO) -> tuple[str, int]:
+    """The basestation drives, the board answers where that came from, and the basestation gets the answer."""
+    site.basestation.sendto(DRIVE, to)
+    data, where_from = site.board.recvfrom(1000)
+    assert data == DRIVE
+    site.board.sendto(DIAG, where_from)
+    assert site.basestation.recv(1000) == DIAG
+    return str(where_from[0]), int(where_from[1])
+
+
+def test_an_answer_to_where_a_command_came_from_is_routed_and_counted(site: Rover, plane: str) -> None:
+    """The listener is on all networks of a computer that has several."""
+    with running(site, plane):
+        assert exchange(site) == LAN
+        assert site.count("messages_received_total", route="drive_diag", source="driving_board") == 1
+        assert site.count("datagrams_received_total", listener="rover") == 2
+        assert site.seen("driving_board")
+
+
+def test_datagrams_leave_from_the_address_of_the_listener(site: Rover, plane: str) -> None:
+    """The computer has two in the boards' network, and would choose the other one."""
+    site.rover.ip("address", "flush", "dev", "lan0")
+    for address in ("10.78.1.7/24", "10.78.1.1/24"):
+        site.rover.ip("address", "add", address, "dev", "lan0")
+    with running(site, plane, TABLE.replace("0.0.0.0:5000", "10.78.1.1:5000")):
+        site.radio.ip("route", "add", "10.78.1.0/24", "via", RADIO[0])
+        assert exchange(site, LAN) == LAN
+
+
+def test_a_firewall_that_lets_only_answers_in_lets_them_in(site: Rover, plane: str) -> None:
+    """It is the rover's own: what the board sends is part of the exchange that the command has begun."""
+    only_answers(site.rover)
+    with running(site, plane):
+        exchange(site)
+
+
+def only_answers(rover: Computer) -> None:
+    rules = """
+table inet filter {
+  chain input {
+    type filter hook input priority 0; policy drop;
+    iifname { "lo", "radio0" } accept
+    ct state established accept
+  }
+}
+"""
+    rover.run("nft", rules)
+
+
+@pytest.mark.parametrize(
+    ("keys", "leaves_from"),
+    [("listener: lan", LAN), ("send_from: lan", LAN), ("listener: lan, send_from: ephemeral", None), ("", None)],
+    ids=["its own listener", "a named one", "asked for a port of its own", "none of several is named"],
+)
+def test_of_several_listeners_the_table_chooses(
+    site: Rover, plane: str, keys: str, leaves_from: tuple[str, int] | None
+) -> None:
+    with running(site, plane, SEVERAL.replace("kind: board", f"kind: board, {keys}".rstrip(", "))):
+        site.basestation.sendto(DRIVE, RADIO)
+        _, where_from = site.board.recvfrom(1000)
+        assert where_from[0] == LAN[0]
+        assert (where_from == LAN) is (leaves_from is not None)
+
+
+def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
+    with running(site, plane) as router:
+        for number, table in enumerate(
+            (TABLE.replace("kind: board", "kind: board, send_from: ephemeral"), TABLE.replace(":5000", ":5001"), TABLE),
+            start=1,
+        ):
+            site.table(table)
+            router.process.send_signal(signal.SIGHUP)
+            wait_until(lambda count=number: len(router.events("table reloaded")) == count, "the reload")
+            site.basestation.sendto(DRIVE, (RADIO[0], 5001 if ":5001" in table else 5000))
+            _, where_from = site.board.recvfrom(1000)
+            assert (where_from[1] in (5000, 5001)) is (number > 1)
+        exchange(site)
+
+
+def test_nobody_else_gets_the_port(site: Rover, plane: str) -> None:
+    with running(site, plane):
+        with pytest.raises(OSError, match="Address already in use") as caught:
+            site.rover.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).bind(("0.0.0.0", 5000)))
+        assert caught.value.errno == errno.EADDRINUSE
+        folder = site.folder / "second"
+        folder.mkdir()
+        second = site.rover.inside(lambda: RouterProcess(folder, site.folder / "table.yaml", ROUTER_CARRIER=plane))
+        assert second.wait() == 78
+        assert "has the port" in second.text()
+
+
+def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane: str) -> None:
+    """Each datagram is refused by the board's computer; the next one reports it, and the last one has no next."""
+    site.board.close()
+    labels = {"route": "manual_drive"}
+    with running(site, plane) as router:
+
+        def counted() -> tuple[float, float]:
+            found = site.samples()
+            dropped = {"target": "driving_board", "reason": "send_error"}
+            return (
+                found.get(key("datagrams_sent_total", destination="driving_board", **labels), 0),
+                found.get(key("messages_dropped_total", **dropped, **labels), 0),
+            )
+
+        for number in range(1, 6):
+            site.basestation.sendto(DRIVE, RADIO)
+            wait_until(lambda count=number: sum(counted()) == count, "the command")
+        assert counted() == (1, 4)
+        assert "nobody listens at 10.78.1.222:8" in router.text()
+
+
+def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover, plane: str) -> None:
+    """ICMP messages that say that nobody listens, about datagrams that the listener's port has never sent."""
+    with running(site, plane), site.radio.inside(raw_icmp) as forging:
+        for _ in range(20):
+            for _ in range(500):
+                forging.sendto(REFUSAL, (RADIO[0], 0))
+            site.basestation.sendto(DRIVE, RADIO)
+            assert site.board.recv(1000) == DRIVE
+        assert site.count("kernel_drops_total", listener="rover") == 0
+        site.board.sendto(DIAG, LAN)
+        assert site.basestation.recv(1000) == DIAG
+        refused = {"route": "drive_diag", "target": "basestation", "reason": "send_error"}
+        wait_until(lambda: site.count("messages_dropped_total", **refused) == 1, "the report of what they say")
+
+
+def raw_icmp() -> socket.socket:
+    return socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP)
+
+
+def _checksum(data: bytes) -> bytes:
+    total = sum(int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2))
+    total = (total & 0xFFFF) + (total >> 16)
+    return (0xFFFF - ((total & 0xFFFF) + (total >> 16))).to_bytes(2, "big")
+
+
+_ADDRESSES = socket.inet_aton(RADIO[0]) + socket.inet_aton("10.78.2.10")
+_QUOTED = bytes.fromhex("45000021000040004011 0000") + _ADDRESSES + bytes.fromhex("1388 2328 000d 0000 0000000000")
+_REFUSAL = bytes.fromhex("0303 0000 00000000") + _QUOTED + bytes(1)
+REFUSAL = _REFUSAL[:2] + _checksum(_REFUSAL) + _REFUSAL[4:]
+"""Port unreachable, about a datagram from the rover's port 5000 to the basestation's port 9000."""
