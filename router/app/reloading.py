@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from router.app.process import beside_traffic, reloading
 from router.app.runtime import Runtime
-from router.app.sockets import is_replaceable
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
 from router.app.wiring import ThreadCounts
 from router.clock import monotonic_ns, wall_ns
@@ -69,18 +68,19 @@ class Reloader:
         return result
 
     def reopen(self) -> None:
-        """Reopen the listeners whose network interface was replaced, if there are any."""
+        """Reopen the listeners whose address or network interface is there now, if there are any."""
         with self._one_at_a_time:
             wiring = self._runtime.wiring
-            replaceable = [each for each in self._runtime.sockets.listeners.values() if is_replaceable(each)]
+            replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
             if not self._is_open or wiring is None or not replaceable:
                 return
             try:
                 self._runtime.take_over(self._runtime.prepare(wiring.program))
             except (StartError, StuckError, OSError) as error:  # the watcher calls again
-                logger.warning("a listener cannot be opened on its network interface", why=str(error))
+                logger.warning("a listener cannot be opened on its network", why=str(error))
             else:
-                logger.info("network interfaces are back", listeners=[each.name for each in replaceable])
+                names = [each.name for each in replaceable]
+                logger.info("listeners receive: their networks are there", listeners=names)
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""

@@ -178,7 +178,8 @@ class Router:
 
     def _watch(self) -> None:
         """Watch the table's files if it says so, and the network interfaces that it names."""
-        if self._interfaces is None and any(plan.interface for plan in self.program.listeners):
+        may_change = any(each.interface or each.is_waiting for each in self.listeners.values())
+        if self._interfaces is None and may_change:
             self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:
             self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)
@@ -205,6 +206,7 @@ class Router:
             "mirror_dropped": lambda: [((), self.mirror.lost + self.total("mirror_dropped"))],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
+            "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),

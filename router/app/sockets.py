@@ -11,8 +11,7 @@ from router.compiler.network import sent_from
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.kernel import interface_is_up
-from router.net.udp import Listener, Sender, why_unreachable
+from router.net.udp import Listener, Sender, absence, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 
@@ -33,18 +32,22 @@ class SocketChange:
     left: ExitStack = field(default_factory=ExitStack)
 
 
-def is_replaceable(listener: Listener) -> bool:
-    """Whether the network interface of a listener was replaced by another one of the same name."""
-    return listener.has_lost_interface() and interface_is_up(listener.interface or "") is not None
+def _log_absence(listener: model.Listener) -> None:
+    host = listener.address.value._replace(port=0)  # the port may be taken, by an inherited socket
+    why, remedy = absence(host, listener.interface) or ("its network has gone", "")
+    what = "this listener receives nothing before its network is there; the others do"
+    logger.warning(what, listener=listener.name, address=listener.bound_to, why=why, remedy=remedy)
 
 
-def _check_reachable(endpoint: model.Endpoint) -> None:
-    """Log why nothing can be sent to an endpoint now. Raises StartError for an address that is none of a machine."""
+def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
+    """Log why nothing can be sent to an endpoint now. Raises StartError if it is new, and a broadcast address."""
     address = endpoint.address.value
     try:
         found = why_unreachable(address)
     except BadAddressError as error:
-        raise StartError(f"{endpoint.address.span}: {error.what}", error.hint) from error
+        if is_new:
+            raise StartError(f"{endpoint.address.span}: {error.what}", error.hint) from error
+        found = error.what, error.hint
     if found:
         why, remedy = found
         what = "nothing can be sent to this endpoint now; it is tried with every datagram"
@@ -102,18 +105,21 @@ class Sockets:
             listeners = {}
             for plan in program.listeners:
                 listener = self._bound.get(plan.bound_to)
-                if listener is None or is_replaceable(listener):
+                if listener is None or listener.is_replaceable():
                     listener = self._open_listener(plan, plan.address.value.port in self._sending_ports())
                     opening.callback(listener.close)
+                if listener.lacks_network():
+                    _log_absence(plan)
                 listeners[plan.name] = listener
             senders: dict[str, Sender] = {}
             moves = []
             every = [*self._bound.values(), *listeners.values()]
             for to in program.senders:
-                _check_reachable(to)
                 source = listeners.get(sent_from(program.table, to) or "")
                 address, sender = self._senders.get(to.name, (None, None))
-                if sender is None or address != to.address.value:
+                is_new = sender is None or address != to.address.value
+                _check_reachable(to, is_new)
+                if sender is None or is_new:
                     sender = self._open_sender(to, source, every)
                     opening.callback(sender.close)
                 elif sender.source is not source:
@@ -124,8 +130,9 @@ class Sockets:
             return SocketChange(program, listeners, senders, moves, opening.pop_all())
 
     def _sending_ports(self) -> set[int]:
-        sources = [sender.source for _, sender in self._senders.values()]
-        return {source.address.port for source in sources if source is not None}
+        """The ports of listeners that senders are bound to as well."""
+        senders = [sender for _, sender in self._senders.values()]
+        return {sender.source.address.port for sender in senders if sender.source is not None and sender.is_bound}
 
     def left(self, change: SocketChange) -> list[Listener]:
         """The listeners that the change does not use."""

@@ -68,10 +68,11 @@ class Watcher:
 
 
 class InterfaceWatcher:
-    """Checks once a second whether `listeners` still have their network interfaces.
+    """Checks once a second whether `listeners` have their addresses and network interfaces.
 
     A socket stays bound to the old interface when a tunnel is set up again or an adapter plugged in again, and receives
-    nothing. Then `reopen` is called in the watcher's thread until it does. `close` does not wait.
+    nothing; one that is waiting was never bound. Then `reopen` is called in the watcher's thread until it does. `close`
+    does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
@@ -86,9 +87,9 @@ class InterfaceWatcher:
     def _run(self) -> None:
         reported: list[Listener] = []
         while not self._stopped.wait(INTERFACE_PERIOD):
-            lost = [each for each in self._listeners() if each.has_lost_interface()]
+            lost = [each for each in self._listeners() if each.is_waiting or each.has_lost_interface()]
             for each in lost:
-                if each not in reported:
+                if each not in reported and not each.is_waiting:
                     logger.error("a network interface has gone: nothing comes in by it", listener=each.name)
             if lost:
                 self._reopen()

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 DEGRADED = 3
 
 _DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it: a stuck receive
-thread, a reload that failed, boards that are silent, deadmen that send in place of commands, publishers that are
-stuck.
+thread, a reload that failed, listeners without their network, boards that are silent, deadmen that send in place of
+commands, publishers that are stuck.
 
 Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
 {BAD_USAGE} wrong usage, {BAD_TABLE} a wrong table. 'router doctor' says what to do about it."""
@@ -60,6 +60,8 @@ def _problems(found: Snapshot) -> Iterator[str]:
 
     if found.counts("config_last_reload_successful").get(()) == 0:
         yield "its last reload failed"
+    for name in sorted(name for (name,), is_waiting in found.counts("listener_waiting").items() if is_waiting):
+        yield f"listener {name} waits for its address or network interface"
     sources = {source for _, source in found.counts("messages_received")}
     limits = found.counts("endpoint_stale_after_seconds")
     for (name,), seen in found.counts("endpoint_last_seen_timestamp_seconds").items():

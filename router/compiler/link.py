@@ -144,7 +144,11 @@ def _open_each(counters: Counters, metric: str, *labels: str, last: Iterable[str
 
 def _open_counters(counters: Counters, table: RouteTable, envelope: Envelope) -> None:
     for listener in table.listeners:
-        _open(counters, ("datagrams_received", "received_bytes", "kernel_drops", "datagrams_padded"), listener)
+        _open(
+            counters,
+            ("datagrams_received", "received_bytes", "kernel_drops", "listener_waiting", "datagrams_padded"),
+            listener,
+        )
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
     _open_each(counters, "unhandled", last=(*envelope.cases, UNKNOWN_CASE))
     _open_each(counters, "endpoint_last_seen_timestamp_seconds", last=table.endpoints)

@@ -27,6 +27,7 @@ METRICS = (
     Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
     Metric("received_bytes", "counter", ("listener",), "Bytes in those datagrams."),
     Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
+    Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is not there."),
     Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were put back or taken off."),
     Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route took, by reason."),
     Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),

@@ -89,10 +89,40 @@ def _bound_to(held: socket.socket) -> str:
     return f"{held.getsockname()}, which is no IPv4 UDP socket"
 
 
+_ABSENT = {
+    errno.ENODEV: ("there is no such network interface now", "`ip link` lists those that there are"),
+    errno.EADDRNOTAVAIL: ("no network interface of this computer has that address", "0.0.0.0 listens on all of them"),
+    errno.ENETDOWN: ("the network is down", "`ip link` shows which interface is"),
+}
+"""Errors of binding that pass when the network comes up, each with a remedy for one that does not."""
+
+
+def absence(address: Address, interface: str | None) -> tuple[str, str] | None:
+    """Why a listener cannot have that address and interface before the network comes up, with a remedy, or None."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            _bind(probe, address, interface)
+        except OSError as error:
+            return _ABSENT.get(error.errno or 0)
+    return None
+
+
+def _is_absent(host: str) -> bool:
+    return absence(Address(host, 0), None) is not None
+
+
+def _bind(opened: socket.socket, address: Address, interface: str | None) -> None:
+    if interface is not None:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
+    opened.bind(address)
+
+
 class Listener:
     """A bound socket: the inherited one with this address and interface if there is one, else a new one.
 
-    Raises StartError with the position in the table and a remedy. Datagrams that are not received from an inherited
+    While its address or interface is not there, as that of a tunnel that comes up later, it is waiting: the socket is
+    not bound and receives nothing, and another Listener has to replace it. Any other failure raises StartError with the
+    position in the table and a remedy. Datagrams that are not received from an inherited
     socket wait for the next process, and its kernel drops may be older than this process. `is_stamped`: each datagram
     comes with the time at which the kernel got it; else `arrived_at` returns that of the last one. `has_senders`:
     some that are bound to its port are open.
@@ -106,20 +136,17 @@ class Listener:
         try:
             if is_stamped:
                 self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-            if handed_over is None:
-                if settings.interface is not None:
-                    self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, settings.interface.encode())
-                # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second
-                # router would steal the port unnoticed.
-                with self.shared() if has_senders else nullcontext():
-                    self.socket.bind(settings.address.value)
+            # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
+            # would steal the port unnoticed.
+            with self.shared() if has_senders else nullcontext():
+                self.is_waiting = handed_over is None and not self._try_to_bind()
             report_sending_errors(self.socket)
             self._request_receive_buffer(settings)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
             raise _refused(settings, error) from error
-        self.address = Address(*self.socket.getsockname())
+        self.address = settings.address.value if self.is_waiting else Address(*self.socket.getsockname())
         self.senders: list[Sender] = []
         """Those that send from its address and port."""
         self._drops_at_close = 0
@@ -141,9 +168,28 @@ class Listener:
     def interface(self) -> str | None:
         return self._settings.interface
 
+    def _try_to_bind(self) -> bool:
+        """Bind the socket. Return False if its address or interface is not there, and raise other errors."""
+        try:
+            _bind(self.socket, self._settings.address.value, self._settings.interface)
+        except OSError as error:
+            if error.errno not in _ABSENT:
+                raise
+            return False
+        return True
+
     def has_lost_interface(self) -> bool:
         """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
         return self._settings.interface is not None and bound_interface(self.socket) is None
+
+    def lacks_network(self) -> bool:
+        """Whether its address or network interface is not there. It receives nothing then."""
+        return self.is_waiting or self.has_lost_interface() or _is_absent(self.address.host)
+
+    def is_replaceable(self) -> bool:
+        """Whether it will receive nothing any more, and another Listener would."""
+        has_ended = self.is_waiting or self.has_lost_interface()
+        return has_ended and absence(self._settings.address.value, self._settings.interface) is None
 
     def follow(self, settings: model.Listener) -> None:
         """Adopt name and settings of another table's listener with the same address and interface."""
@@ -181,8 +227,9 @@ class Listener:
         host, port = self.address
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # required for a broadcast address
         # If the interface has lost the address, connecting fails, but nothing comes in and shutting down still wakes.
-        with suppress(OSError):
-            self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
+        if not self.is_waiting:
+            with suppress(OSError):
+                self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RD)
 
@@ -207,12 +254,7 @@ class Listener:
 
 def _refused(settings: model.Listener, error: OSError) -> StartError:
     known = {
-        errno.ENODEV: ("there is no such network interface now", "`ip link` lists those that there are"),
         errno.EPERM: ("before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"),
-        errno.EADDRNOTAVAIL: (
-            "no network interface of this computer has that address",
-            "0.0.0.0 listens on all of them",
-        ),
         errno.EACCES: ("ports below 1024 need a privilege", "choose a higher port, or grant CAP_NET_BIND_SERVICE"),
     }
     if error.errno == errno.EADDRINUSE:
@@ -256,9 +298,9 @@ def _is_broadcast(address: Address) -> bool:
 class Sender:
     """A non-blocking socket for one destination, which it is not connected to.
 
-    It is bound to address and port of `source`, so that answers reach that listener; without one, the kernel chooses
-    the port. `listeners` are all that are open: they must allow it. The socket itself receives nothing. Opening raises
-    OSError if descriptors are short.
+    It is bound to address and port of `source`, so that answers reach that listener; without one, or while that one is
+    waiting, the kernel chooses the port. `listeners` are all that are open: they must allow it. The socket itself
+    receives nothing. Opening raises OSError if descriptors are short.
     """
 
     def __init__(
@@ -273,7 +315,7 @@ class Sender:
 
     def open_socket(self, source: Listener | None, listeners: Iterable[Listener]) -> socket.socket:
         """Open a socket to move to."""
-        if source is not None:
+        if source is not None and not source.is_waiting:
             try:
                 return _open_beside(source, listeners)
             except OSError as error:
@@ -290,12 +332,12 @@ class Sender:
         left, self.socket = self.socket, opened
         self._leave_source()
         self.source = source
-        if self._is_bound:
+        if self.is_bound:
             self._listener.senders.append(self)
         return left
 
     @property
-    def _is_bound(self) -> bool:
+    def is_bound(self) -> bool:
         """Whether it sends from the port of its listener."""
         return self.socket.family == socket.AF_INET6
 
@@ -307,7 +349,7 @@ class Sender:
     @property
     def errors(self) -> socket.socket:
         """The socket that ICMP errors about its datagrams reach."""
-        return self._listener.socket if self._is_bound else self.socket
+        return self._listener.socket if self.is_bound else self.socket
 
     def send(self, data: bytes) -> int:
         """Send a datagram and return its size, or raise OSError: then exactly one is lost.
@@ -350,21 +392,21 @@ class Sender:
 
     def _send_once(self, data: bytes) -> int:
         host, port = self._to
-        return self.socket.sendto(data, (f"::ffff:{host}" if self._is_bound else host, port))
+        return self.socket.sendto(data, (f"::ffff:{host}" if self.is_bound else host, port))
 
     def _send_again(self, data: bytes, error: OSError) -> int:
         """Try again after an error, if it may be of an earlier datagram, or if this computer may have lost the address
         that the socket is bound to: a brake has to leave from another one."""
-        if not self._is_bound and self._note_errors():
+        if not self.is_bound and self._note_errors():
             return self._send_once(data)
-        if self._is_bound and error.errno in (errno.EINVAL, errno.ENETUNREACH):
+        if self.is_bound and error.errno in (errno.EINVAL, errno.ENETUNREACH):
             host, port = self._to
             any_address = [(socket.IPPROTO_IP, IP_PKTINFO, bytes(PKTINFO_SIZE))]
             return self.socket.sendmsg([data], any_address, 0, (f"::ffff:{host}", port))
         raise error
 
     def _note_errors(self) -> bool:
-        return self._listener.note_errors() if self._is_bound else note_errors(self.socket, [self])
+        return self._listener.note_errors() if self.is_bound else note_errors(self.socket, [self])
 
     def _raise_refused(self) -> None:
         if self._refused:

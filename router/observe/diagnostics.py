@@ -39,6 +39,7 @@ METRICS = frozenset(
         "deadman_send_errors",
         LAST_SEEN,
         "gateway_clients",
+        "listener_waiting",
         "gateway_topics",
         "kernel_drops",
         "messages_dropped",
@@ -211,6 +212,8 @@ class Report:
 
     def _listener(self, name: str) -> Status:
         problems = [_warning(f"the kernel dropped {n}") for _, n in self._grown("kernel_drops", name)]
+        if self.now.total("listener_waiting", name):
+            problems.insert(0, Problem(Level.ERROR, "its address or network interface is not there: nothing comes in"))
         problems += self._rejections(name)
         values = [
             ("address", self.program.table.listeners[name].bound_to),

@@ -15,7 +15,7 @@ import pytest
 
 from router.net.udp import Inherited
 from tests.acceptance.payloads import WIRE
-from tests.acceptance.site import ROOT, RouterProcess, wait_until
+from tests.acceptance.site import ROOT, wait_until
 from tests.acceptance.two_networks import (
     BASESTATION,
     BOARD,
@@ -151,14 +151,6 @@ def mac(computer: Computer) -> str:
     return computer.ip("-br", "link", "show", "eth0").split()[2]
 
 
-def test_an_interface_that_is_not_there_ends_the_start_with_what_to_do(site: Rover) -> None:
-    path = site.table(TABLE.replace("interface: radio0", "interface: gone0"))
-    process = site.rover.inside(lambda: RouterProcess(site.folder, path))
-    assert process.wait() == 78
-    assert "gone0: there is no such network interface now" in process.text()
-    assert "table.yaml:" in process.text()
-
-
 @pytest.mark.slow
 def test_a_listener_on_another_interface_is_another_listener(site: Rover) -> None:
     """Reloaded, the two change places."""
@@ -199,7 +191,7 @@ def test_an_interface_that_goes_and_comes_back_is_heard_again(site: Rover) -> No
         site.rover.ip("link", "del", "radio0")
         wait_until(lambda: bool(router.events("a network interface has gone: nothing comes in by it")), "the loss")
         cable(site.rover, "radio0", "10.78.2.1/24", site.radio, "eth0", "10.78.2.10/24")
-        wait_until(lambda: bool(router.events("network interfaces are back")), "the return")
+        wait_until(lambda: bool(router.events("listeners receive: their networks are there")), "the return")
         site.basestation.sendto(DRIVE, RADIO)
         wait_until(lambda: site.board_gets() == [DRIVE], "the command")
         site.board.sendto(DIAG, LAN)

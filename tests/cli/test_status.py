@@ -26,16 +26,19 @@ router_endpoint_stale_after_seconds{{endpoint="laptop"}} 5
 router_deadman_active{{route="drive"}} 0
 router_publish_stalled_seconds{{topic="imu_data"}} 0.9
 router_config_last_reload_successful 1
+router_listener_waiting{{listener="tunnel"}} 0
 """
 ILL = (
     WELL.replace(str(COLLECTED_AT - 1), str(COLLECTED_AT - 8))
     .replace('route="drive"} 0', 'route="drive"} 1')
     .replace("successful 1", "successful 0")
+    .replace('"tunnel"} 0', '"tunnel"} 1')
     .replace('"imu_data"} 0.9', '"imu_data"} 7')
 )
 
 TROUBLES = (
-    "its last reload failed; sensor_board is silent for 8 s; the deadman of drive sends; "
+    "its last reload failed; listener tunnel waits for its address or network interface; "
+    "sensor_board is silent for 8 s; the deadman of drive sends; "
     "publishing on imu_data is stuck in the ROS middleware, for 7 s"
 )
 

@@ -22,7 +22,7 @@ from router.errors import Located, SourceSpan, StartError
 from router.net import receiver, udp
 from router.net.kernel import SO_RCVBUFFORCE, SO_TIMESTAMPNS
 from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
-from router.net.udp import Inherited, Listener, Sender, why_unreachable
+from router.net.udp import Inherited, Listener, Sender, absence, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 from router.table.model import EndpointKind, Framing
@@ -371,9 +371,28 @@ def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
     )
 
 
-def test_an_address_of_another_computer_is_refused() -> None:
-    with pytest.raises(StartError, match=r"rover.yaml:12:20: .*192\.0\.2\.77.*no network interface of this computer"):
-        Listener(plan(host="192.0.2.77"))
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (plan(host="192.0.2.77", port=5000), "no network interface of this computer has that address"),
+        (replace(plan(), interface="nowhere0"), "there is no such network interface now"),
+    ],
+)
+def test_an_address_or_interface_that_is_not_there_is_waited_for(
+    stack: ExitStack, settings: model.Listener, why: str
+) -> None:
+    listener = stack.enter_context(closing(Listener(settings)))
+    assert (listener.is_waiting, listener.lacks_network(), listener.is_replaceable()) == (True, True, False)
+    assert listener.bound_to == settings.bound_to
+    assert (absence(settings.address.value, settings.interface) or pytest.fail("it is there"))[0] == why
+    receiving = Receiving([listener])
+    receiving.thread.start()
+    receiving.thread.stop()
+
+
+def test_a_listener_that_is_there_lacks_nothing(stack: ExitStack) -> None:
+    listener = listen(stack)
+    assert (listener.is_waiting, listener.lacks_network(), listener.is_replaceable()) == (False, False, False)
 
 
 def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, peer: socket.socket) -> None:
@@ -382,11 +401,6 @@ def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, pee
     assert listener.socket.recv(100) == b"hello"
     assert listener.bound_to == f"0.0.0.0:{listener.address.port} on lo"
     assert not listener.has_lost_interface()
-
-
-def test_an_interface_that_is_not_there_is_refused() -> None:
-    with pytest.raises(StartError, match=r"rover.yaml:12:20: listener 'rover' cannot use .* on nowhere0: there is no"):
-        Listener(replace(plan(), interface="nowhere0"))
 
 
 def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack) -> None:

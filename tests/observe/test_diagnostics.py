@@ -50,6 +50,7 @@ class Counting:
     program: Program
     counts: list[int]
     kernel_drops: int = 0
+    is_waiting: bool = False
     stalled: dict[str, float] = field(default_factory=lambda: {"imu_data": 0.0})
     now: int = 0
     shift: int = 0
@@ -58,6 +59,7 @@ class Counting:
     def __post_init__(self) -> None:
         asked: dict[str, Asked] = {
             "kernel_drops": lambda: [(["rover"], self.kernel_drops)],
+            "listener_waiting": lambda: [(["rover"], self.is_waiting)],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self.stalled.items()],
         }
         self._collector = CountersCollector(self.program.counters, lambda: [self.counts], asked, {})
@@ -255,6 +257,13 @@ def test_kernel_drops_and_a_failed_reload_are_told(router: Counting) -> None:
     assert reported["listener/rover"].message == "the kernel dropped 2"
     assert reported["router"].message == "the last reload failed, and the table from before it goes on"
     assert reported["listener/rover"].level == reported["router"].level == Level.WARN
+
+
+def test_a_listener_without_its_network_is_an_error(router: Counting) -> None:
+    router.is_waiting = True
+    listener = router.after(1)["listener/rover"]
+    assert listener.level == Level.ERROR
+    assert listener.message == "its address or network interface is not there: nothing comes in"
 
 
 def test_rates_are_of_the_last_seconds(router: Counting) -> None:

@@ -248,6 +248,16 @@ def test_what_matters_most_is_said_in_the_banner_and_the_rest_beside_it(running:
     assert "imu_data: a peer gets nothing Its QoS does not fit (reliability)" in said
 
 
+def test_a_listener_without_its_network_is_said_before_what_follows_from_it(running: FakeRunning, page: Page) -> None:
+    until_compared(page)
+    running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
+    running.count("listener_waiting", "rover", to=1)
+    until_said(page, "rover receives nothing", "bad")
+    assert page.text("#todo").startswith("Its address or network interface (127.0.0.5:25000) is not there")
+    running.count("listener_waiting", "rover", to=0)
+    until_said(page, "arm_board silent", "bad")
+
+
 def test_much_that_is_wrong_is_folded(running: FakeRunning, page: Page) -> None:
     until_compared(page)
     for case in ("load_cell_info", "pump_info", "imu_info", "gps_info", "ph_info", "pressure_info"):

@@ -1,0 +1,242 @@
+"""Networks that are not there, or that routes forbid: the router starts, serves the others, and gets over it."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.acceptance.site import ROOT, RouterProcess, wait_until
+from tests.acceptance.two_networks import BRAKE, DRIVE, LAN, RADIO, Rover, rover_with_networks, udp
+from tests.namespaces import cable
+
+TABLE = """\
+version: 1
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
+http: {{address: 127.0.0.1:9108}}
+listen: {{rover: {{address: 0.0.0.0:5000}}}}
+endpoints:
+  driving_board: {{address: 10.78.1.222:8, kind: board}}
+  basestation: {{address: 10.78.2.10:9000, kind: basestation}}
+  other: {{address: 10.79.9.9:9000, kind: basestation}}
+routes:
+  manual_drive:
+    source: basestation
+    destinations: [driving_board, other]
+    deadman: {{timeout: 1200ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], repeat: 10s}}
+"""
+TUNNEL = TABLE.replace(
+    "listen: {{rover: {{address: 0.0.0.0:5000}}}}",
+    """listen:
+  rover: {{address: 10.78.1.1:5000}}
+  tunnel: {tunnel}""",
+).replace("10.78.2.10:9000, kind: basestation", "10.78.2.10:9000, kind: basestation, listener: tunnel")
+UNREACHABLE = "nothing can be sent to this endpoint now; it is tried with every datagram"
+WAITS = "this listener receives nothing before its network is there; the others do"
+THERE = "listeners receive: their networks are there"
+
+
+@pytest.fixture(params=["native", "python"])
+def plane(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Rover]:
+    with rover_with_networks(tmp_path) as found:
+        yield found
+
+
+@contextmanager
+def running(site: Rover, plane: str, text: str) -> Iterator[RouterProcess]:
+    path = site.table(text)
+    with site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane)) as router:
+        yield router
+
+
+def reload(site: Rover, router: RouterProcess, text: str) -> str:
+    """Have the router read another table. Return its log since then."""
+    before, size = len(results(router)), len(router.text())
+    site.table(text)
+    router.process.send_signal(signal.SIGHUP)
+    wait_until(lambda: len(results(router)) > before, "the reload")
+    return router.text()[size:]
+
+
+def results(router: RouterProcess) -> list[dict[str, object]]:
+    refused = router.events("the table was not taken over, and nothing has changed")
+    return [*router.events("table reloaded"), *refused]
+
+
+def drives(site: Rover) -> None:
+    site.basestation.sendto(DRIVE, RADIO)
+    wait_until(lambda: site.board_gets() == [DRIVE], "the command")
+
+
+FORBIDDEN = {
+    "no route": ((), "no network leads there"),
+    "unreachable": (("unreachable", "10.79.0.0/16"), "the kernel refuses it: no route to host"),
+    "prohibit": (("prohibit", "10.79.0.0/16"), "the kernel refuses it: permission denied"),
+    "blackhole": (("blackhole", "10.79.0.0/16"), "the kernel refuses it: invalid argument"),
+}
+
+
+@pytest.mark.parametrize(("route", "why"), FORBIDDEN.values(), ids=FORBIDDEN)
+def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
+    site: Rover, plane: str, route: tuple[str, ...], why: str
+) -> None:
+    if route:
+        site.rover.ip("route", "add", *route)
+    with running(site, plane, TABLE) as router:
+        [warning] = router.events(UNREACHABLE)
+        assert (warning["endpoint"], warning["address"], warning["why"]) == ("other", "10.79.9.9:9000", why)
+        assert warning["remedy"]
+        assert site.board.recv(100) == BRAKE
+        drives(site)
+        if route:
+            site.rover.ip("route", "del", *route)
+        site.radio.ip("address", "add", "10.79.9.9/32", "dev", "eth0")
+        site.rover.ip("route", "add", "10.79.0.0/16", "dev", "radio0")
+        with udp(site.radio, ("10.79.9.9", 9000)) as other:
+            drives(site)
+            assert other.recv(100) == DRIVE
+
+
+@pytest.mark.parametrize(("route", "why"), FORBIDDEN.values(), ids=FORBIDDEN)
+def test_nor_does_one_that_a_reload_brings(site: Rover, plane: str, route: tuple[str, ...], why: str) -> None:
+    if route:
+        site.rover.ip("route", "add", *route)
+    with running(site, plane, TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
+        log = reload(site, router, TABLE)
+        assert "table reloaded" in log
+        assert [each["why"] for each in router.events(UNREACHABLE)] == [why]
+        drives(site)
+
+
+def test_the_broadcast_address_of_an_interface_is_refused(site: Rover, plane: str) -> None:
+    said = "10.78.1.255 is not the address of one machine"
+    wrong = TABLE.replace("10.79.9.9", "10.78.1.255")
+    path = site.table(wrong)
+    refused = site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane))
+    assert refused.wait() == 78
+    assert f"{path}:8:20: {said}" in refused.text()
+    assert "broadcast and multicast are not supported" in refused.text()
+    with running(site, plane, TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
+        assert said in reload(site, router, wrong)
+        assert not router.events("table reloaded")
+        drives(site)
+
+
+def gone_interface(site: Rover) -> None:
+    site.rover.ip("link", "del", "radio0")
+
+
+def gone_address(site: Rover) -> None:
+    site.rover.ip("address", "flush", "dev", "radio0")
+
+
+def new_interface(site: Rover) -> None:
+    cable(site.rover, "radio0", "10.78.2.1/24", site.radio, "eth0", "10.78.2.10/24")
+
+
+def new_address(site: Rover) -> None:
+    site.rover.ip("address", "add", "10.78.2.1/24", "dev", "radio0")
+
+
+ABSENT = {
+    "interface": (
+        "{{address: 0.0.0.0:5001, interface: radio0}}",
+        gone_interface,
+        "there is no such network interface now",
+        new_interface,
+    ),
+    "address": (
+        "{{address: 10.78.2.1:5001}}",
+        gone_address,
+        "no network interface of this computer has that address",
+        new_address,
+    ),
+    "interface and port of another one": (
+        "{{address: 10.78.2.1:5000, interface: radio0}}",
+        gone_interface,
+        "there is no such network interface now",
+        new_interface,
+    ),
+}
+Act = Callable[[Rover], None]
+
+
+@pytest.mark.parametrize(("tunnel", "goes", "why", "comes"), ABSENT.values(), ids=ABSENT)
+@pytest.mark.parametrize("is_reloaded", [False, True], ids=["at the start", "at a reload"])
+def test_a_listener_waits_for_its_network_and_the_others_serve(
+    site: Rover, plane: str, is_reloaded: bool, tunnel: str, goes: Act, why: str, comes: Act
+) -> None:
+    goes(site)
+    text = TUNNEL.replace("{tunnel}", tunnel)
+    with running(site, plane, TABLE.replace("0.0.0.0", LAN[0]) if is_reloaded else text) as router:
+        assert site.board.recv(100) == BRAKE
+        if is_reloaded:
+            reload(site, router, text)
+            assert router.events("table reloaded")
+        [warning] = router.events(WAITS)
+        assert (warning["listener"], warning["why"]) == ("tunnel", why)
+        assert (
+            site.count("listener_waiting", listener="tunnel"),
+            site.count("listener_waiting", listener="rover"),
+        ) == (
+            1,
+            0,
+        )
+        assert "listener tunnel waits for its address or network interface" in status(site)
+        site.board.sendto(b"", LAN)
+        wait_until(lambda: site.count("datagrams_received_total", listener="rover") == 1, "the other listener's input")
+        comes(site)
+        wait_until(lambda: bool(router.events(THERE)), "the binding")
+        assert site.count("listener_waiting", listener="tunnel") == 0
+        assert "waits" not in status(site)
+        to = RADIO[0], 5000 if ":5000" in tunnel else 5001
+        site.basestation.sendto(DRIVE, to)
+        wait_until(lambda: site.board_gets() == [DRIVE], "the command")
+        refused = router.events("the table was not taken over, and nothing has changed")
+        assert not refused
+
+
+def status(site: Rover) -> str:
+    return site.rover.run(
+        ROOT / ".venv/bin/python", "-m", "router", "status", "-t", site.folder / "table.yaml", check=False
+    )
+
+
+def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rover, plane: str) -> None:
+    gone_address(site)
+    text = TUNNEL.replace("{tunnel}", ABSENT["address"][0]).replace("kind: board", "kind: board, send_from: tunnel")
+    with running(site, plane, text) as router:
+        assert site.board.recvfrom(100)[1][1] != 5001  # the brake of the start leaves all the same
+        new_address(site)
+        wait_until(lambda: bool(router.events(THERE)), "the binding")
+        site.lan.ip("route", "add", "10.78.2.0/24", "via", LAN[0])
+        site.basestation.sendto(DRIVE, (RADIO[0], 5001))
+        assert site.board.recvfrom(100) == (DRIVE, (RADIO[0], 5001))
+
+
+def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane: str) -> None:
+    """The only listener is at the address of a tunnel, by which commands come; the board is in another network."""
+    text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
+    site.lan.ip("route", "add", "10.78.2.0/24", "via", LAN[0])
+    with running(site, plane, text):
+        assert site.board.recvfrom(100) == (BRAKE, RADIO)
+        drives(site)
+        gone_address(site)
+        assert site.board.recvfrom(100) == (BRAKE, LAN)
+        assert site.count("listener_waiting", listener="rover") == 1
+
+
+def test_a_port_that_is_taken_still_ends_the_start(site: Rover, plane: str) -> None:
+    with udp(site.rover, LAN):
+        path = site.table(TABLE)
+        refused = site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane))
+        assert refused.wait() == 78
+        assert "has the port" in refused.text()
