@@ -28,7 +28,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "doctor", _DESCRIPTION, "router doctor", "router doctor -t routes/sim.yaml")
     add_table(parser)
     parser.add_argument(
-        "--pre-start", action="store_true", help="only what would make a start fail, and nothing if all is well"
+        "--pre-start",
+        action="store_true",
+        help="only what would make a start fail, and networks that are not there; nothing if all is well",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object per line and result")
 
@@ -40,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
     grades: Counter[Grade] = Counter()
     for result in (before_start if args.pre_start else examine)(path, os.environ):
         grades[result.grade] += 1
-        if result.grade is Grade.PROBLEM or not args.pre_start:
-            print(_json(result) if args.json else shown(result, coloured=is_coloured(sys.stdout)), flush=True)
+        print(_json(result) if args.json else shown(result, coloured=is_coloured(sys.stdout)), flush=True)
     if not args.pre_start and not args.json:
         print(_summary(grades))
     if not os.access(path, os.R_OK):

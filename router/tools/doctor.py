@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from router.compiler import Checked, check_table
@@ -20,11 +21,12 @@ from router.table.model import RouteTable
 from router.table.units import duration
 from router.tools.doctor_checks import (
     CheckResult,
+    Grade,
     carrier,
     clock,
     endpoints,
     fine,
-    interfaces,
+    listeners,
     open_domain,
     ports,
     problem,
@@ -33,6 +35,7 @@ from router.tools.doctor_checks import (
     ros,
     shared_memory,
     warning,
+    ways,
 )
 from router.tools.running_router import metrics, url_of
 
@@ -47,7 +50,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     running = health(program)
     yield from carrier(variables)
     yield from ros(program)
-    yield from interfaces(program)
+    yield from listeners(program)
     yield from ports(program, running=running is not None)
     yield from receive_buffers(program)
     if running is None:
@@ -60,15 +63,20 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
 
 
 def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Only what would make the start fail, without the ports of listeners: systemd may hold them for the router."""
+    """Only what would make the start fail, and warnings of networks that the table needs and that are not there.
+
+    Without the ports of listeners: systemd may hold them for the router.
+    """
     checked = check_table(path, variables)
-    yield from _table(checked)
-    if checked.program is not None:
-        yield from carrier(variables)
-        yield from ros(checked.program)
-        yield from interfaces(checked.program)
-        yield from ports(checked.program, running=False, with_listeners=False)
-        yield from recordings(checked.program)
+    needed = [_table(checked)]
+    program = checked.program
+    if program is not None:
+        needed += [carrier(variables), ros(program), ports(program, running=False, with_listeners=False)]
+        needed += [recordings(program)]
+    yield from (result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM)
+    if program is not None:
+        yield from (result for result in listeners(program) if result.grade is not Grade.FINE)
+        yield from ways(program, warning)
 
 
 def _table(checked: Checked) -> Iterator[CheckResult]:
@@ -112,7 +120,7 @@ class Health:
     snapshot: Snapshot
 
     def findings(self) -> Iterator[CheckResult]:
-        found = [*self._table(), *self._silent(), *self._lost(), *self._kept_away(), *self._deadmen()]
+        found = [*self._table(), *self._waiting(), *self._silent(), *self._lost(), *self._kept_away(), *self._deadmen()]
         yield from found or [fine("router", "it runs, hears every endpoint that sends, and loses nothing")]
 
     def _table(self) -> Iterator[CheckResult]:
@@ -121,6 +129,12 @@ class Health:
             yield problem("router", what, "`router reload` says why")
         elif self.snapshot.table_sha256 != self.table.sha256:
             yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
+
+    def _waiting(self) -> Iterator[CheckResult]:
+        for (name,), is_waiting in self.snapshot.counts("listener_waiting").items():
+            if is_waiting:
+                what = f"listener '{name}' waits for its address or network interface: nothing comes in by it"
+                yield warning("router", what, "`ip address` shows those there are")
 
     def _silent(self) -> Iterator[CheckResult]:
         sources = {source.value for route in self.table.routes for source in route.sources}

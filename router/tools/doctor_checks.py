@@ -10,7 +10,7 @@ import pwd
 import shutil
 import socket
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,10 +21,11 @@ from router.carrier.library import NATIVE, PYTHON, VARIABLE, LibraryError, load
 from router.compiler.program import Program
 from router.errors import Located, StartError, plural
 from router.net.kernel import interface_is_up, port_holder
+from router.net.udp import absence, why_unreachable
 from router.recording.writer import recording_sizes
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy
 from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
-from router.table.model import Transport, bound_to
+from router.table.model import Endpoint, Listener, Transport, bound_to
 
 
 class Grade(enum.Enum):
@@ -186,27 +187,30 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
     wanted += [("tcp", found.value, None, what) for found, what in _pages(program) if found is not None]
     gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
     wanted += gateways
-    if with_listeners:
-        wanted += [("udp", each.address.value, each.interface, f"listener '{each.name}'") for each in program.listeners]
+    there = [each for each in program.listeners if _absence(each) is None] if with_listeners else []
+    wanted += [("udp", each.address.value, each.interface, f"listener '{each.name}'") for each in there]
     refused = [finding for each in wanted for finding in _port(*each, waits=each in gateways)]
     free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
 
-def interfaces(program: Program) -> Iterator[CheckResult]:
-    """Check that the network interfaces of listeners exist and are up."""
+def listeners(program: Program) -> Iterator[CheckResult]:
+    """Check that the addresses of listeners, and the network interfaces that they name, are there and up."""
     for listener in program.listeners:
-        if listener.interface is None:
-            continue
-        is_up = interface_is_up(listener.interface)
-        about = f"listener '{listener.name}': network interface {listener.interface}"
-        if is_up is None:
-            remedy = "`ip link` lists those there are; a tunnel has to be up before the router starts"
-            yield problem("interfaces", f"{about} does not exist", remedy)
-        elif is_up:
-            yield fine("interfaces", f"{about} is up")
-        else:
-            yield problem("interfaces", f"{about} is down: nothing comes in", f"ip link set {listener.interface} up")
+        about = f"listener '{listener.name}'"
+        if (found := _absence(listener)) is not None:
+            why, remedy = found
+            remedy += "; what comes up after the start, as a tunnel does, is waited for"
+            yield warning("listeners", f"{about} cannot have {listener.bound_to} now: {why}", remedy)
+        elif listener.interface is not None and interface_is_up(listener.interface):
+            yield fine("listeners", f"{about}: network interface {listener.interface} is up")
+        elif listener.interface is not None:
+            what = f"{about}: network interface {listener.interface} is down: nothing comes in"
+            yield warning("listeners", what, f"ip link set {listener.interface} up")
+
+
+def _absence(listener: Listener) -> tuple[str, str] | None:
+    return absence(listener.address.value._replace(port=0), listener.interface)  # whoever has the port
 
 
 def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
@@ -237,8 +241,6 @@ def _port(protocol: str, address: Address, interface: str | None, what: str, wai
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
             probe.bind(address)
         except OSError as error:
-            if error.errno == errno.ENODEV:  # `interfaces` reports it
-                return
             yield from _refused(protocol, address, what, error, waits)
 
 
@@ -264,16 +266,24 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
     )
 
 
-def endpoints(program: Program) -> Iterator[CheckResult]:
-    """Check that each endpoint has a route and answers a ping."""
-    reachable = {}
+def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Iterator[CheckResult]:
+    """Check that a route leads to each endpoint. `grade` makes the result where none does."""
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
-        if (why := _no_way(address)) is not None:
-            remedy = "does `ip address` show an interface in its network? is the cable in?"
-            yield problem("endpoints", f"{endpoint.name}: no network leads to {address.host} ({why})", remedy)
-        else:
-            reachable[endpoint.name] = address.host
+        try:
+            found = why_unreachable(address)
+        except BadAddressError as error:
+            yield problem("endpoints", f"{endpoint.name}: {error.what}", error.hint)
+            continue
+        if found:
+            why, remedy = found
+            yield grade("endpoints", f"{endpoint.name}: nothing can be sent to {address.host}: {why}", remedy)
+
+
+def endpoints(program: Program) -> Iterator[CheckResult]:
+    """Check that a route leads to each endpoint, and that it answers a ping."""
+    yield from ways(program, problem)
+    reachable = {each.name: each.address.value.host for each in program.table.endpoints.values() if _has_way(each)}
     try:
         answered = answering(set(reachable.values()))
     except PermissionError:
@@ -288,13 +298,11 @@ def endpoints(program: Program) -> Iterator[CheckResult]:
             yield warning("endpoints", f"{name}: {host} does not answer a ping", remedy)
 
 
-def _no_way(address: Address) -> str | None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(address)  # sends nothing
-        except OSError as error:
-            return error.strerror
-    return None
+def _has_way(endpoint: Endpoint) -> bool:
+    try:
+        return why_unreachable(endpoint.address.value) is None
+    except BadAddressError:
+        return False
 
 
 def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:

@@ -16,6 +16,7 @@ import pytest
 from router.carrier.library import LibraryError
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.table.addresses import Address
 from router.tools import doctor_checks
 from router.tools.doctor import before_start, examine, health
 from router.tools.doctor_checks import (
@@ -24,7 +25,7 @@ from router.tools.doctor_checks import (
     carrier,
     clock,
     endpoints,
-    interfaces,
+    listeners,
     open_domain,
     ports,
     receive_buffers,
@@ -184,15 +185,12 @@ def test_a_port_of_a_gateway_that_somebody_has_is_told(
     assert gist(ports(program, running=False)) == [(Grade.FINE, True)]
 
 
-def test_an_address_that_no_interface_has_is_told(table: Path, tmp_path: Path) -> None:
-    """Gateways wait for theirs, so that it is a warning."""
+def test_an_address_of_a_gateway_that_no_interface_has_is_told(tmp_path: Path) -> None:
     path = tmp_path / "gateway.yaml"
     gateway = "{transport: {udp: 127.0.0.9:8502}, receive: 192.0.2.1:8500}"
     path.write_text(f"version: 1\ngateways: {{headset: {gateway}}}\n")
     missing = "no interface of this computer has 192.0.2.1"
     assert gist(ports(compiled(path), running=False), missing) == [(Grade.WARNING, True)]
-    program = rewritten(table, 'address: "127.0.0.1:', 'address: "192.0.2.1:')
-    assert gist(ports(program, running=False), missing) == [(Grade.PROBLEM, True)]
 
 
 @pytest.mark.parametrize(
@@ -225,22 +223,33 @@ def on_interface(table: Path, name: str) -> Program:
 
 def test_the_interface_of_a_listener_is_looked_at(table: Path) -> None:
     program = on_interface(table, "lo")
-    assert texts(list(interfaces(program)), Grade.FINE) == ["listener 'rover': network interface lo is up"]
+    assert texts(list(listeners(program)), Grade.FINE) == ["listener 'rover': network interface lo is up"]
     assert gist(ports(program, running=False)) == [(Grade.FINE, True)]
 
 
 @pytest.mark.parametrize("look", [examine, before_start])
-def test_an_interface_that_is_not_there_is_a_problem(table: Path, look: type) -> None:
-    on_interface(table, "nowhere0")
-    found = [finding for finding in look(table, {}) if finding.grade is Grade.PROBLEM]
-    assert [finding.text for finding in found] == ["listener 'rover': network interface nowhere0 does not exist"]
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("receive_buffer:", "interface: nowhere0, receive_buffer:", "there is no such network interface now"),
+        ('address: "127.0.0.1:', 'address: "192.0.2.1:', "no network interface of this computer has that address"),
+    ],
+)
+def test_what_a_listener_waits_for_is_a_warning(table: Path, look: type, old: str, new: str, why: str) -> None:
+    """It may be a tunnel that comes up later, or a mistake."""
+    [listener] = rewritten(table, old, new).listeners
+    found = [finding for finding in look(table, {}) if finding.about in ("listeners", "ports")]
+    assert [(each.grade, each.text) for each in found if each.about == "listeners"] == [
+        (Grade.WARNING, f"listener 'rover' cannot have {listener.bound_to} now: {why}")
+    ]
+    assert all(listener.bound_to not in each.text for each in found if each.about == "ports")
 
 
-def test_an_interface_that_is_down_is_a_problem(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = on_interface(table, "dummy0")
+def test_an_interface_that_is_down_is_a_warning(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = on_interface(table, "lo")
     monkeypatch.setattr(doctor_checks, "interface_is_up", lambda _: False)
-    [found] = interfaces(program)
-    assert (found.grade, found.remedy) == (Grade.PROBLEM, "ip link set dummy0 up")
+    [found] = listeners(program)
+    assert (found.grade, found.remedy) == (Grade.WARNING, "ip link set lo up")
 
 
 def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
@@ -338,12 +347,25 @@ def test_nodes_of_two_users_that_share_memory_are_a_warning(tmp_path: Path) -> N
     assert (found.grade, "user 12345" in found.text) == (Grade.WARNING, True)
 
 
-def test_a_network_that_is_not_there_is_a_problem(table: Path) -> None:
-    """As the broadcast address, to which this kind of socket finds no way either."""
-    [first, *others] = endpoints(rewritten(table, "127.0.0.30:8", "127.255.255.255:8"))
-    assert (first.grade, bool(first.remedy)) == (Grade.PROBLEM, True)
-    assert first.text.startswith("sensor_board: no network leads to 127.255.255.255")
+def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_warning(
+    table: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_way(address: Address) -> tuple[str, str] | None:
+        return ("no network leads there", "plug it in") if address.host == "127.0.0.30" else None
+
+    monkeypatch.setattr(doctor_checks, "why_unreachable", no_way)
+    text = "sensor_board: nothing can be sent to 127.0.0.30: no network leads there"
+    [first, *others] = endpoints(compiled(table))
+    assert first == (Grade.PROBLEM, "endpoints", text, "plug it in")
     assert "sensor_board" not in " ".join(finding.text for finding in others)
+    assert list(before_start(table, {})) == [(Grade.WARNING, "endpoints", text, "plug it in")]
+
+
+def test_a_broadcast_address_is_a_problem(table: Path) -> None:
+    rewritten(table, "127.0.0.30:8", "127.255.255.255:8")
+    [found] = before_start(table, {})
+    text = "sensor_board: 127.255.255.255 is not the address of one machine"
+    assert found == (Grade.PROBLEM, "endpoints", text, "broadcast and multicast are not supported")
 
 
 def test_who_answers_a_ping() -> None:
@@ -405,6 +427,7 @@ def test_who_was_never_heard_may_not_have_been_switched_on_yet(table: Path) -> N
 @pytest.mark.parametrize(
     ("sample", "grade", "text"),
     [
+        ('router_listener_waiting{listener="rover"} 1', Grade.WARNING, "listener 'rover' waits for its address"),
         ('router_kernel_drops_total{listener="rover"} 3', Grade.WARNING, "the kernel has dropped 3 datagrams"),
         (
             'router_messages_dropped_total{reason="stale",route="ph_info",target="basestation"} 2',
