@@ -27,7 +27,7 @@ class NativeSender(Sender):
         super().__init__(endpoint, source, listeners)
         host, port = endpoint.address.value
         number = int.from_bytes(socket.inet_aton(host), "big")
-        self.address = int(library.sender_open(self.socket.fileno(), self.errors.fileno(), number, port) or 0)
+        self.address = int(library.sender_open(self.socket.fileno(), self._listening, number, port) or 0)
         if not self.address:
             super().close()
             raise MemoryError("a sender of the carrier cannot be opened")
@@ -35,8 +35,13 @@ class NativeSender(Sender):
     def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
         left = super().move(source, opened)
         if self.address:
-            self._library.sender_move(self.address, opened.fileno(), self.errors.fileno())
+            self._library.sender_move(self.address, opened.fileno(), self._listening)
         return left
+
+    @property
+    def _listening(self) -> int:
+        """The descriptor of the listener from whose port it sends; -1 for none."""
+        return self.source.socket.fileno() if self.source is not None and self.is_bound else -1
 
     def send(self, data: bytes) -> int:
         return self._sent(self._library.sender_send(self.address, data, len(data)), data)

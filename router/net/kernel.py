@@ -19,6 +19,7 @@ SO_MEMINFO = 55
 IP_PKTINFO = 8
 IP_RECVERR = 11
 IP_FREEBIND = 15
+IPV6_RECVERR = 25
 PKTINFO_SIZE = 12
 SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
@@ -95,7 +96,7 @@ def report_sending_errors(opened: socket.socket) -> None:
 
 
 def sending_errors(opened: socket.socket) -> Iterator[tuple[tuple[str, int], int]]:
-    """Yield the waiting errors, each with the destination of its datagram.
+    """Yield the waiting errors, each with the destination of its datagram as the socket's family writes it.
 
     The errno is 0 if the receiver has not refused the datagram: routers report passing troubles too.
     """
@@ -104,7 +105,8 @@ def sending_errors(opened: socket.socket) -> Iterator[tuple[tuple[str, int], int
             _, found, _, destination = opened.recvmsg(0, 256, socket.MSG_ERRQUEUE | socket.MSG_DONTWAIT)
         except OSError:
             return
-        errors = [data for level, kind, data in found if (level, kind) == (socket.IPPROTO_IP, IP_RECVERR)]
+        kinds = (socket.IPPROTO_IP, IP_RECVERR), (socket.IPPROTO_IPV6, IPV6_RECVERR)
+        errors = [data for level, kind, data in found if (level, kind) in kinds]
         number, origin, kind, code = _EXTENDED_ERROR.unpack_from(errors[0])
         is_refusal = origin == _OF_ICMP and kind == _UNREACHABLE and code not in _NET_OR_HOST
         yield destination, number if is_refusal else 0

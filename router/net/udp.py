@@ -212,7 +212,10 @@ class Listener:
 
     def note_errors(self) -> bool:
         """Tell its senders of ICMP errors about what they have sent. Return whether there were any."""
-        return note_errors(self.socket, self.senders)
+        errors = list(sending_errors(self.socket))
+        for destination, refused in errors:
+            any(sender.note(refused, Address(*destination)) for sender in self.senders if refused)
+        return bool(errors)
 
     def end_input(self) -> None:
         """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
@@ -332,24 +335,14 @@ class Sender:
         left, self.socket = self.socket, opened
         self._leave_source()
         self.source = source
-        if self.is_bound:
-            self._listener.senders.append(self)
+        if source is not None and self.is_bound:
+            source.senders.append(self)
         return left
 
     @property
     def is_bound(self) -> bool:
         """Whether it sends from the port of its listener."""
         return self.socket.family == socket.AF_INET6
-
-    @property
-    def _listener(self) -> Listener:
-        assert self.source is not None  # noqa: S101 - it is bound
-        return self.source
-
-    @property
-    def errors(self) -> socket.socket:
-        """The socket that ICMP errors about its datagrams reach."""
-        return self._listener.socket if self.is_bound else self.socket
 
     def send(self, data: bytes) -> int:
         """Send a datagram and return its size, or raise OSError: then exactly one is lost.
@@ -375,12 +368,12 @@ class Sender:
         self._raise_refused()
         return sent
 
-    def note(self, destination: Address, error: int) -> bool:
-        """Return whether the error is about a datagram of this sender, and not the second one."""
-        if destination != self._to or self._refused:
-            return False
-        self._refused = error
-        return True
+    def note(self, refused: int, destination: Address) -> bool:
+        """Return whether the sender has taken the error: it has to be its own, and it holds one at a time."""
+        if destination == self._to and not self._refused:
+            self._refused = refused
+            return True
+        return False
 
     def close(self) -> None:
         self._leave_source()
@@ -395,9 +388,9 @@ class Sender:
         return self.socket.sendto(data, (f"::ffff:{host}" if self.is_bound else host, port))
 
     def _send_again(self, data: bytes, error: OSError) -> int:
-        """Try again after an error, if it may be of an earlier datagram, or if this computer may have lost the address
-        that the socket is bound to: a brake has to leave from another one."""
-        if not self.is_bound and self._note_errors():
+        """Try again after an error, if it is of an earlier datagram, or if this computer may have lost the address that
+        the socket is bound to: a brake has to leave from another one."""
+        if self._note_own_errors():
             return self._send_once(data)
         if self.is_bound and error.errno in (errno.EINVAL, errno.ENETUNREACH):
             host, port = self._to
@@ -405,25 +398,21 @@ class Sender:
             return self.socket.sendmsg([data], any_address, 0, (f"::ffff:{host}", port))
         raise error
 
-    def _note_errors(self) -> bool:
-        return self._listener.note_errors() if self.is_bound else note_errors(self.socket, [self])
+    def _note_errors(self) -> None:
+        """They reach the listener; without one, or if they come by another interface than its, the socket itself."""
+        self._note_own_errors()
+        if self.source is not None and self.is_bound:
+            self.source.note_errors()
+
+    def _note_own_errors(self) -> bool:
+        refused = [error for _, error in sending_errors(self.socket)]
+        self._refused = self._refused or next(filter(None, refused), 0)
+        return bool(refused)
 
     def _raise_refused(self) -> None:
         if self._refused:
             refused, self._refused = self._refused, 0
             raise OSError(refused, os.strerror(refused))
-
-
-def note_errors(opened: socket.socket, senders: Iterable[Sender]) -> bool:
-    """Read the ICMP errors that a socket has, and tell the senders whose datagrams they are about.
-
-    Return whether there were any.
-    """
-    read = 0
-    for destination, error in sending_errors(opened):
-        read += 1
-        any(sender.note(Address(*destination), error) for sender in senders if error)
-    return read > 0
 
 
 def _open_sending(family: socket.AddressFamily) -> socket.socket:

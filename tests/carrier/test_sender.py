@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
@@ -22,6 +23,7 @@ from router.table.addresses import Address
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
 
+PATIENCE = 10.0
 Make = Callable[..., Sender]
 """Called with an endpoint, the listener that it sends from, and all listeners."""
 
@@ -202,6 +204,28 @@ def test_each_sender_hears_of_its_own_losses(
     with pytest.raises(ConnectionRefusedError):
         lost.send(b"lost too")
     assert lost.send(b"the listener was not asked again") == 32
+
+
+def test_errors_that_come_by_another_interface_than_the_listeners_cost_no_datagram(
+    stack: ExitStack, make: Make
+) -> None:
+    rover, lan, radio = stack.enter_context(computers("rover", "lan", "radio"))
+    cable(rover, "lan", "10.78.1.1/24", lan, "eth0", "10.78.1.2/24")
+    cable(rover, "radio", "10.78.2.1/24", radio, "eth0", "10.78.2.2/24")
+    settings = replace(plan(host="0.0.0.0", port=5000), interface="radio")
+    listener = stack.enter_context(closing(rover.inside(lambda: Listener(settings))))
+    address = Address("10.78.1.2", 9000)
+    sender = stack.enter_context(closing(rover.inside(lambda: make(endpoint("board", address), listener, [listener]))))
+    assert sender.send(b"lost") == 4
+    select.select([], [], [sender.socket], PATIENCE)  # the refusal
+    with stack.enter_context(lan.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))) as board:
+        board.bind(address)
+        board.settimeout(10)
+        with pytest.raises(ConnectionRefusedError):
+            sender.send(b"drive")
+        assert board.recv(100) == b"drive"
+        assert sender.send_checked(b"brake") == 5
+        assert board.recv(100) == b"brake"
 
 
 def test_a_flood_of_errors_leaves_no_room_taken(

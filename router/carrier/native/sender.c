@@ -13,12 +13,12 @@ enum { MOST_ERRORS = 32 }; /* that are read at once */
 static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held for some steps only */
 static struct sender *first;
 
-struct sender *sender_open(int fd, int errors, uint32_t address, uint16_t port) {
+struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port) {
     struct sender *sender = calloc(1, sizeof *sender);
     if (!sender) return NULL;
     sender->address = (struct sockaddr_in){
         .sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(address)};
-    sender_move(sender, fd, errors);
+    sender_move(sender, fd, listener);
     pthread_mutex_lock(&list_lock);
     sender->next = first;
     first = sender;
@@ -26,9 +26,9 @@ struct sender *sender_open(int fd, int errors, uint32_t address, uint16_t port) 
     return sender;
 }
 
-void sender_move(struct sender *sender, int fd, int errors) {
+void sender_move(struct sender *sender, int fd, int listener) {
     atomic_store(&sender->fd, fd);
-    atomic_store(&sender->errors, errors);
+    atomic_store(&sender->listener, listener);
 }
 
 void sender_end(struct sender *sender) { sender_move(sender, -1, -1); }
@@ -51,44 +51,61 @@ static bool is_refusal(const struct sock_extended_err *error) {
     return error->ee_code != ICMP_NET_UNREACH && error->ee_code != ICMP_HOST_UNREACH;
 }
 
-/* Of several senders to one address, the first that has no error yet is told. */
-static void note(int errors, const struct sockaddr_in *address, int error) {
-    pthread_mutex_lock(&list_lock);
-    for (struct sender *each = first; each; each = each->next) {
-        int none = 0;
-        if (atomic_load(&each->errors) == errors && each->address.sin_port == address->sin_port &&
-            each->address.sin_addr.s_addr == address->sin_addr.s_addr &&
-            atomic_compare_exchange_strong(&each->refused, &none, error))
-            break;
-    }
-    pthread_mutex_unlock(&list_lock);
-}
-
-/* Read one error. Return whether there was one. */
-static bool note_next(int errors) {
-    struct sockaddr_in address; /* that the datagram was sent to */
+/* Read one error that a socket has. Return whether there was one. `refused` becomes its errno, or 0 if it is no refusal;
+ * `address` that of the datagram, if the socket is an IPv4 one. */
+static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
     union { struct cmsghdr aligned; char bytes[256]; } control;
-    struct msghdr message = {.msg_name = &address, .msg_namelen = sizeof address, .msg_control = &control,
+    struct msghdr message = {.msg_name = address, .msg_namelen = sizeof *address, .msg_control = &control,
                              .msg_controllen = sizeof control};
-    if (recvmsg(errors, &message, MSG_ERRQUEUE | MSG_DONTWAIT) < 0) return false;
+    if (recvmsg(fd, &message, MSG_ERRQUEUE | MSG_DONTWAIT) < 0) return false;
+    *refused = 0;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(&message); each; each = CMSG_NXTHDR(&message, each)) {
-        if (each->cmsg_level != IPPROTO_IP || each->cmsg_type != IP_RECVERR) continue;
+        bool is_v4 = each->cmsg_level == IPPROTO_IP && each->cmsg_type == IP_RECVERR;
+        if (!is_v4 && (each->cmsg_level != IPPROTO_IPV6 || each->cmsg_type != IPV6_RECVERR)) continue;
         struct sock_extended_err error;
         memcpy(&error, CMSG_DATA(each), sizeof error);
-        if (is_refusal(&error)) note(errors, &address, (int)error.ee_errno);
+        if (is_refusal(&error)) *refused = (int)error.ee_errno;
     }
     return true;
 }
 
 /* Errors share the memory of the receive buffer: what a flood has left there would keep datagrams out. */
-static void discard_errors(int errors) {
-    for (int wanted = 0; wanted <= 1; wanted++) setsockopt(errors, IPPROTO_IP, IP_RECVERR, &wanted, sizeof wanted);
+static void discard_errors(int fd) {
+    for (int wanted = 0; wanted <= 1; wanted++) setsockopt(fd, IPPROTO_IP, IP_RECVERR, &wanted, sizeof wanted);
 }
 
-bool sender_note_errors(int errors) {
-    int read = 0;
-    while (read < MOST_ERRORS && note_next(errors)) read++;
-    if (read == MOST_ERRORS) discard_errors(errors);
+/* Return whether the sender has taken the error: it holds one at a time. */
+static bool note(struct sender *sender, int refused) {
+    int none = 0;
+    return atomic_compare_exchange_strong(&sender->refused, &none, refused);
+}
+
+/* Of several senders to one address, the first that has no error yet is told. */
+static void note_by_address(int listener, const struct sockaddr_in *address, int refused) {
+    pthread_mutex_lock(&list_lock);
+    for (struct sender *each = first; each; each = each->next)
+        if (atomic_load(&each->listener) == listener && each->address.sin_port == address->sin_port &&
+            each->address.sin_addr.s_addr == address->sin_addr.s_addr && note(each, refused))
+            break;
+    pthread_mutex_unlock(&list_lock);
+}
+
+bool sender_note_errors(int listener) {
+    struct sockaddr_in address;
+    int refused, read = 0;
+    for (; read < MOST_ERRORS && read_error(listener, &address, &refused); read++)
+        if (refused) note_by_address(listener, &address, refused);
+    if (read == MOST_ERRORS) discard_errors(listener);
+    return read;
+}
+
+/* As `sender_note_errors`, for the errors that have reached the sender's own socket. */
+static bool note_own_errors(struct sender *sender) {
+    struct sockaddr_in address;
+    int fd = atomic_load(&sender->fd), refused, read = 0;
+    for (; read < MOST_ERRORS && read_error(fd, &address, &refused); read++)
+        if (refused) note(sender, refused);
+    if (read == MOST_ERRORS) discard_errors(fd);
     return read;
 }
 
@@ -118,13 +135,12 @@ static int send_from_any_address(struct sender *sender, const void *data, size_t
     return sendmsg(atomic_load(&sender->fd), &message, MSG_DONTWAIT) < 0 ? errno : 0;
 }
 
-/* Try again after an error, if it may be of an earlier datagram, or if this computer may have lost the address that the
- * socket is bound to: a brake has to leave from another one. Return 0 or an errno. */
+/* Try again after an error, if it is of an earlier datagram, or if this computer may have lost the address that the socket
+ * is bound to: a brake has to leave from another one. Return 0 or an errno. */
 static int send_again(struct sender *sender, const void *data, size_t size, int error) {
-    int errors = atomic_load(&sender->errors);
-    if (errors == atomic_load(&sender->fd)) return sender_note_errors(errors) ? send_once(sender, data, size) : error;
-    if (error == EINVAL || error == ENETUNREACH) return send_from_any_address(sender, data, size);
-    return error;
+    if (note_own_errors(sender)) error = send_once(sender, data, size);
+    bool may_lack_address = (error == EINVAL || error == ENETUNREACH) && atomic_load(&sender->listener) >= 0;
+    return may_lack_address ? send_from_any_address(sender, data, size) : error;
 }
 
 int sender_send(struct sender *sender, const void *data, size_t size) {
@@ -133,10 +149,16 @@ int sender_send(struct sender *sender, const void *data, size_t size) {
     return error ? error : take_refused(sender);
 }
 
+static void note_errors_of(struct sender *sender) {
+    note_own_errors(sender);
+    int listener = atomic_load(&sender->listener);
+    if (listener >= 0) sender_note_errors(listener);
+}
+
 int sender_send_checked(struct sender *sender, const void *data, size_t size) {
-    sender_note_errors(atomic_load(&sender->errors)); /* of earlier datagrams: they are not taken for this one's */
+    note_errors_of(sender); /* of earlier datagrams: they are not taken for this one's */
     int error = sender_send(sender, data, size);
     if (error) return error;
-    sender_note_errors(atomic_load(&sender->errors));
+    note_errors_of(sender);
     return take_refused(sender);
 }

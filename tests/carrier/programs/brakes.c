@@ -48,7 +48,7 @@ static struct board open_board(void) {
     check(!bind(board, (struct sockaddr *)&address, sizeof address), "bind");
     getsockname(board, (struct sockaddr *)&address, &length);
     setsockopt(board, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
-    return (struct board){board, sender_open(from, from, INADDR_LOOPBACK, ntohs(address.sin_port))};
+    return (struct board){board, sender_open(from, -1, INADDR_LOOPBACK, ntohs(address.sin_port))};
 }
 
 static void close_board(struct board board) {

@@ -94,7 +94,7 @@ static struct sockaddr_in address_of(int fd) {
 
 static void open_sender(int index, struct sockaddr_in to) {
     sending[index] = bound(1);
-    senders[index] = sender_open(sending[index], sending[index], INADDR_LOOPBACK, ntohs(to.sin_port));
+    senders[index] = sender_open(sending[index], -1, INADDR_LOOPBACK, ntohs(to.sin_port));
 }
 
 /* ---- programs ---- */
