@@ -93,7 +93,9 @@ static struct sockaddr_in address_of(int fd) {
 }
 
 static void open_sender(int index, struct sockaddr_in to) {
+    int on = 1;
     sending[index] = bound(1);
+    setsockopt(sending[index], IPPROTO_IP, IP_RECVERR, &on, sizeof on);
     senders[index] = sender_open(sending[index], -1, INADDR_LOOPBACK, ntohs(to.sin_port));
 }
 
