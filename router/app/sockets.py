@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -52,6 +52,14 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         why, remedy = found
         what = "nothing can be sent to this endpoint now; it is tried with every datagram"
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
+
+
+def _source(name: str | None, listeners: Mapping[str, Listener]) -> Listener | None:
+    """The listener of that name, or while it is waiting another one with the same address and port."""
+    named = listeners.get(name) if name is not None else None
+    if named is None or not named.is_waiting:
+        return named
+    return next((each for each in listeners.values() if each.address == named.address and not each.is_waiting), named)
 
 
 class KernelDrops:
@@ -115,7 +123,7 @@ class Sockets:
             moves = []
             every = [*self._bound.values(), *listeners.values()]
             for to in program.senders:
-                source = listeners.get(sent_from(program.table, to) or "")
+                source = _source(sent_from(program.table, to), listeners)
                 address, sender = self._senders.get(to.name, (None, None))
                 is_new = sender is None or address != to.address.value
                 _check_reachable(to, is_new)

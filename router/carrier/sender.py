@@ -34,8 +34,7 @@ class NativeSender(Sender):
 
     def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
         left = super().move(source, opened)
-        if self.address:
-            self._library.sender_move(self.address, opened.fileno(), self._listening)
+        self._library.sender_move(self.address, opened.fileno(), self._listening)
         return left
 
     @property

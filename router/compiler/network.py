@@ -159,12 +159,16 @@ def _reaches(address: Address, own: Address) -> bool:
 
 
 def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
-    """The listener from whose address and port datagrams leave for an endpoint; None for a port of their own."""
+    """The listener from whose address and port datagrams leave for an endpoint; None for a port of their own.
+
+    Listeners that differ in their interfaces have one address and port.
+    """
     if endpoint.send_from is not None:
         return None if endpoint.send_from.value == EPHEMERAL else endpoint.send_from.value
     if endpoint.listener is not None:
         return endpoint.listener.value
-    return next(iter(table.listeners)) if len(table.listeners) == 1 else None
+    places = {listener.address.value for listener in table.listeners.values()}
+    return next(iter(table.listeners)) if len(places) == 1 else None
 
 
 def recognisers(

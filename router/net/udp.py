@@ -147,8 +147,6 @@ class Listener:
             self.socket.close()
             raise _refused(settings, error) from error
         self.address = settings.address.value if self.is_waiting else Address(*self.socket.getsockname())
-        self.senders: list[Sender] = []
-        """Those that send from its address and port."""
         self._drops_at_close = 0
 
     @property
@@ -211,10 +209,10 @@ class Listener:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
 
     def note_errors(self) -> bool:
-        """Tell its senders of ICMP errors about what they have sent. Return whether there were any."""
+        """Tell senders of ICMP errors about what they have sent from its port. Return whether there were any."""
         errors = list(sending_errors(self.socket))
         for destination, refused in errors:
-            any(sender.note(refused, Address(*destination)) for sender in self.senders if refused)
+            any(sender.note(refused, Address(*destination)) for sender in list(_open_senders) if refused)
         return bool(errors)
 
     def end_input(self) -> None:
@@ -298,6 +296,9 @@ def _is_broadcast(address: Address) -> bool:
         return probe.connect_ex(address) == 0
 
 
+_open_senders: set[Sender] = set()
+
+
 class Sender:
     """A non-blocking socket for one destination, which it is not connected to.
 
@@ -310,11 +311,11 @@ class Sender:
         self, endpoint: model.Endpoint, source: Listener | None = None, listeners: Iterable[Listener] = ()
     ) -> None:
         self.endpoint = endpoint.name
-        self.source: Listener | None = None
         self._to = endpoint.address.value
         self._refused = 0  # errno of an earlier datagram
+        self.source = source
         self.socket = self.open_socket(source, listeners)
-        self.move(source, self.socket)
+        _open_senders.add(self)
 
     def open_socket(self, source: Listener | None, listeners: Iterable[Listener]) -> socket.socket:
         """Open a socket to move to."""
@@ -332,11 +333,7 @@ class Sender:
 
     def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
         """Send by `opened` from now on. Return the earlier socket, for the caller to close when no thread uses it."""
-        left, self.socket = self.socket, opened
-        self._leave_source()
-        self.source = source
-        if source is not None and self.is_bound:
-            source.senders.append(self)
+        left, self.socket, self.source = self.socket, opened, source
         return left
 
     @property
@@ -376,12 +373,8 @@ class Sender:
         return False
 
     def close(self) -> None:
-        self._leave_source()
+        _open_senders.discard(self)
         self.socket.close()
-
-    def _leave_source(self) -> None:
-        if self.source is not None and self in self.source.senders:
-            self.source.senders.remove(self)
 
     def _send_once(self, data: bytes) -> int:
         host, port = self._to

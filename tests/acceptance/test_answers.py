@@ -106,18 +106,31 @@ table inet filter {
 
 
 @pytest.mark.parametrize(
-    ("keys", "leaves_from"),
-    [("listener: lan", LAN), ("send_from: lan", LAN), ("listener: lan, send_from: ephemeral", None), ("", None)],
-    ids=["its own listener", "a named one", "asked for a port of its own", "none of several is named"],
+    ("keys", "lan", "leaves_from"),
+    [
+        ("listener: lan", 5001, 5001),
+        ("send_from: radio", 5001, 5000),
+        ("listener: lan, send_from: ephemeral", 5001, None),
+        ("", 5001, None),
+        ("", 5000, 5000),
+    ],
+    ids=[
+        "its own listener",
+        "a named one",
+        "asked for a port of its own",
+        "none of several is named",
+        "several on one port",
+    ],
 )
 def test_of_several_listeners_the_table_chooses(
-    site: Rover, plane: str, keys: str, leaves_from: tuple[str, int] | None
+    site: Rover, plane: str, keys: str, lan: int, leaves_from: int | None
 ) -> None:
-    with running(site, plane, SEVERAL.replace("kind: board", f"kind: board, {keys}".rstrip(", "))):
+    text = SEVERAL.replace("0.0.0.0:5000, interface: lan0", f"0.0.0.0:{lan}, interface: lan0")
+    with running(site, plane, text.replace("kind: board", f"kind: board, {keys}".rstrip(", "))):
         site.basestation.sendto(DRIVE, RADIO)
         _, where_from = site.board.recvfrom(1000)
         assert where_from[0] == LAN[0]
-        assert (where_from == LAN) is (leaves_from is not None)
+        assert where_from[1] == leaves_from or (leaves_from is None and where_from[1] not in (5000, 5001))
 
 
 def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
@@ -149,11 +162,12 @@ def test_nobody_else_gets_the_port(site: Rover, plane: str) -> None:
         assert "has the port" in second.text()
 
 
-def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane: str) -> None:
+@pytest.mark.parametrize("table", [TABLE, SEVERAL], ids=["one listener", "one for each interface"])
+def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane: str, table: str) -> None:
     """Each datagram is refused by the board's computer; the next one reports it, and the last one has no next."""
     site.board.close()
     labels = {"route": "manual_drive"}
-    with running(site, plane) as router:
+    with running(site, plane, table) as router:
 
         def counted() -> tuple[float, float]:
             found = site.samples()

@@ -222,6 +222,14 @@ def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rov
         assert site.board.recvfrom(100) == (DRIVE, (RADIO[0], 5001))
 
 
+def test_of_listeners_on_one_port_one_that_is_there_serves_for_those_that_wait(site: Rover, plane: str) -> None:
+    gone_interface(site)
+    text = TUNNEL.replace("{tunnel}", "{{address: 0.0.0.0:5000, interface: radio0}}")
+    text = text.replace("10.78.1.1:5000", "0.0.0.0:5000, interface: lan0")
+    with running(site, plane, text.replace("kind: board", "kind: board, send_from: tunnel")):
+        assert site.board.recvfrom(100) == (BRAKE, LAN)
+
+
 def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane: str) -> None:
     """The only listener is at the address of a tunnel, by which commands come; the board is in another network."""
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")

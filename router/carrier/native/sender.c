@@ -81,11 +81,11 @@ static bool note(struct sender *sender, int refused) {
 }
 
 /* Of several senders to one address, the first that has no error yet is told. */
-static void note_by_address(int listener, const struct sockaddr_in *address, int refused) {
+static void note_by_address(const struct sockaddr_in *address, int refused) {
     pthread_mutex_lock(&list_lock);
     for (struct sender *each = first; each; each = each->next)
-        if (atomic_load(&each->listener) == listener && each->address.sin_port == address->sin_port &&
-            each->address.sin_addr.s_addr == address->sin_addr.s_addr && note(each, refused))
+        if (each->address.sin_port == address->sin_port && each->address.sin_addr.s_addr == address->sin_addr.s_addr &&
+            note(each, refused))
             break;
     pthread_mutex_unlock(&list_lock);
 }
@@ -94,7 +94,7 @@ bool sender_note_errors(int listener) {
     struct sockaddr_in address;
     int refused, read = 0;
     for (; read < MOST_ERRORS && read_error(listener, &address, &refused); read++)
-        if (refused) note_by_address(listener, &address, refused);
+        if (refused) note_by_address(&address, refused);
     if (read == MOST_ERRORS) discard_errors(listener);
     return read;
 }
