@@ -18,7 +18,9 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from router.carrier.sender import NativeSender
-from router.net.udp import Listener, Sender
+from router.net import udp
+from router.net.kernel import IP_FREEBIND
+from router.net.udp import Inherited, Listener, Sender
 from router.table.addresses import Address
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
@@ -139,6 +141,37 @@ def test_many_senders_share_a_port_with_a_listener_on_all_networks(
         assert (data, where_from) == (b"%d" % number, ("127.0.0.1", listener.address.port))
         board.sendto(b"to %d" % number, where_from)
         assert listener.socket.recv(100) == b"to %d" % number
+
+
+def test_it_shares_the_port_of_an_inherited_listener_also_while_the_address_is_not_there(
+    stack: ExitStack, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd binds it, with FreeBind=yes."""
+    rover, station = stack.enter_context(computers("rover", "station"))
+    cable(rover, "lan", "10.78.1.1/24", station, "lan", "10.78.1.2/24")
+    held = stack.enter_context(rover.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    held.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
+    held.bind(("10.78.1.3", 5000))
+    ours = Inherited([held.dup()])
+    monkeypatch.setattr(udp, "inherited", lambda: ours)
+    listener = stack.enter_context(closing(rover.inside(lambda: Listener(plan(host="10.78.1.3", port=5000)))))
+    assert (listener.is_inherited, listener.is_waiting) == (True, False)
+    assert rover.inside(listener.lacks_network)
+    board = stack.enter_context(station.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+    board.bind(("10.78.1.2", 9000))
+    board.settimeout(10)
+    to = endpoint("board", Address("10.78.1.2", 9000))
+    sender = stack.enter_context(closing(rover.inside(lambda: make(to, listener, [listener]))))
+    sender.send(b"brake")
+    assert board.recvfrom(100) == (b"brake", ("10.78.1.1", 5000))
+    rover.ip("address", "add", "10.78.1.3/24", "dev", "lan")
+    sender.send(b"drive")
+    data, where_from = board.recvfrom(100)
+    assert (data, where_from) == (b"drive", ("10.78.1.3", 5000))
+    board.sendto(b"obeyed", where_from)
+    listener.socket.settimeout(10)
+    assert listener.socket.recv(100) == b"obeyed"
 
 
 @pytest.mark.parametrize("shares", [0, 1])
