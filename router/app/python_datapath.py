@@ -19,7 +19,7 @@ from router.app.wiring import (
     open_pacers,
     python_deadman,
 )
-from router.clock import monotonic_ns
+from router.clock import boottime_ns
 from router.compiler.program import DeadmanPlan, Program
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import State
@@ -93,7 +93,7 @@ class PythonDatapath:
         deadmen = {plan.route: self._deadman(plan, program, sockets, state) for plan in program.deadmen}
         behind_gateways = gateway_deadmen(program, self._context, ros, state)
         pacers = open_pacers(program, timers.pacing, send, state)
-        command = commander(send, deadmen, timers.deadman.locked, monotonic_ns)
+        command = commander(send, deadmen, timers.deadman.locked, boottime_ns)
         errors = ros.publish_errors if ros else ()
         context = replace(engine_context(program, self._context, topics, errors, send, command, pacers), state=state)
         arrived_at = {name: each.arrived_at for name, each in sockets.listeners.items()}

@@ -29,7 +29,7 @@ Take = Callable[[bytes, int], None]
 
 ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
 """Called with the payload, or None where it is not the envelope's only field; the restored envelope; the
-wall clock and the monotonic clock at its receipt; the sender's name in expressions; and the monotonic time of its
+wall clock and the boot clock at its receipt; the sender's name in expressions; and the time (boot clock) of its
 arrival in the kernel. Times in ns."""
 
 _Addresses = Sequence[tuple[object, str]]

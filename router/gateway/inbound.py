@@ -34,7 +34,7 @@ class RefusedError(Exception):
 @dataclass(frozen=True, slots=True)
 class InboundOutputs:
     """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
-    the deadman's route, each called with the monotonic time before a message is published. Clocks in ns.
+    the deadman's route, each called with the time (boot clock) before a message is published. Clocks in ns.
     """
 
     publish: Mapping[str, Callable[[bytes], None]]

@@ -171,7 +171,7 @@ class Whole:
     ) -> None:
         self._library, self._program = loaded, made
         self._names = Names()
-        self._clock, self._wall = (c_int64.in_dll(loaded, name) for name in ("seam_monotonic", "seam_wall"))
+        self._clock, self._wall = (c_int64.in_dll(loaded, name) for name in ("seam_boottime", "seam_wall"))
         self._rig = Rig(made, unwanted)  # for its timers and topics
         size = len(made.counters.fresh_counts())
         self._counts, self._publish_counts = (c_int64 * size)(), (c_int64 * size)()

@@ -39,12 +39,12 @@ struct commands {
     uint8_t datagram[MOST_CONVERTED];
 };
 
-/* A message that is served: monotonic times but for `received_at`. */
+/* A message that is served. */
 struct command {
     const uint8_t *data;
     size_t size;
     int64_t sent_at, received_at; /* wall clock */
-    int64_t now;
+    int64_t now;                  /* boot clock */
 };
 
 /* ---- messages ---- */
@@ -99,14 +99,14 @@ static void serve_targets(struct commands *commands, const struct command_route 
 
 static void serve_message(struct commands *commands, const struct command_topic *topic, int64_t sent_at) {
     struct command command = {.data = commands->message.buffer, .size = commands->message.length};
-    command.now = monotonic_ns();
+    command.now = boottime_ns();
     command.received_at = wall_ns();
     command.sent_at = sent_at ? sent_at : command.received_at;
     for (uint32_t index = 0; index < topic->route_count; index++) {
         const struct command_route *route = &topic->routes[index];
         serve_targets(commands, route, &command);
         counter_set(commands->counters, route->last_message, command.received_at);
-        count_duration(commands->counters, route->duration, monotonic_ns() - command.now);
+        count_duration(commands->counters, route->duration, boottime_ns() - command.now);
     }
 }
 

@@ -126,7 +126,7 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
         counter_add(counters, target->filtered, 1);
         return false;
     }
-    if (outcome == COMPOSED && served->expires != NEVER && monotonic_ns() > served->expires) outcome = LOSS_STALE;
+    if (outcome == COMPOSED && served->expires != NEVER && boottime_ns() > served->expires) outcome = LOSS_STALE;
     if (outcome == COMPOSED && target->limit && !limit_passes(target->limit, served->record->now)) {
         counter_add(counters, target->rate_limited, 1);
         return false;

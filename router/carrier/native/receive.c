@@ -169,14 +169,14 @@ static int route(struct carrier *carrier, const struct payload_case *found, cons
     forward(carrier, chosen, received);
     for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
     counter_set(carrier->counters, chosen->last_message, received->received_at);
-    count_duration(carrier->counters, chosen->duration, monotonic_ns() - received->now);
+    count_duration(carrier->counters, chosen->duration, boottime_ns() - received->now);
     return ROUTED;
 }
 
 static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
     const struct listener *listener = received->listener;
     counter *counters = carrier->counters;
-    received->now = monotonic_ns();
+    received->now = boottime_ns();
     received->received_at = wall_ns();
     received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
                                     received->received_at, received->now);
@@ -236,7 +236,7 @@ static bool receive_one(struct carrier *carrier, const struct listener *listener
 static void brake(struct carrier *carrier) {
     int64_t due = atomic_load_explicit(&carrier->deadmen->next_due, memory_order_relaxed);
     if (due == NEVER) return;
-    int64_t now = monotonic_ns();
+    int64_t now = boottime_ns();
     if (due <= now) deadmen_serve(carrier->deadmen, now);
 }
 

@@ -32,7 +32,7 @@ static bool has_network_changed(int error) {
 
 /* Whether the socket may be replaced now; if so, the caller has to. */
 static bool may_reconnect(struct sender *sender) {
-    int64_t now = monotonic_ns(), last = atomic_load(&sender->reconnected_at);
+    int64_t now = boottime_ns(), last = atomic_load(&sender->reconnected_at);
     if (now - last < RECONNECT_INTERVAL) return false;
     return atomic_compare_exchange_strong(&sender->reconnected_at, &last, now);
 }

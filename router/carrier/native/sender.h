@@ -11,7 +11,7 @@
 struct sender {
     _Atomic int fd; /* stays the same when the socket is replaced; -1 after `sender_end` */
     struct sockaddr_in address;
-    _Atomic int64_t reconnected_at; /* monotonic, ns */
+    _Atomic int64_t reconnected_at; /* boot clock, ns */
 };
 
 /* Return a sender for a socket that is connected to `address` (host byte order) and `port`, or NULL for lack of memory.
