@@ -25,6 +25,7 @@ from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import State
 from router.engine.deadman import Deadman, commander, feeder
 from router.engine.dispatch import Receive
+from router.engine.freshness import Freshness
 from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Classifier, Mirror
@@ -97,8 +98,8 @@ class PythonDatapath:
         errors = ros.publish_errors if ros else ()
         context = replace(engine_context(program, self._context, topics, errors, send, command, pacers), state=state)
         arrived_at = {name: each.arrived_at for name, each in sockets.listeners.items()}
-        inbound = InboundEngine(program, context, arrived_at)
-        outbound = OutboundEngine(program, replace(context, counts=counts.ros))
+        inbound = InboundEngine(program, context, arrived_at, self._receiving.freshness)
+        outbound = OutboundEngine(program, replace(context, counts=counts.ros), ros.freshness if ros else Freshness())
         return PythonWiring(
             program=program,
             take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},

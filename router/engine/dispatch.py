@@ -16,7 +16,7 @@ from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine.binding import EngineContext, Handle, bind, unbind
 from router.engine.delivery import Outcome, Report
-from router.engine.freshness import Freshness
+from router.engine.freshness import Born, Freshness
 from router.engine.slow_path import Rejected, SlowPath
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
@@ -27,10 +27,9 @@ Receive = Callable[[bytes, Peer], str]
 
 Take = Callable[[bytes, int], None]
 
-ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
-"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the
-wall clock and the boot clock at its receipt; the sender's name in expressions; and the time (boot clock) of its
-arrival in the kernel. Times in ns."""
+ServePart = Callable[[bytes | None, bytes, int, int, str, Born], None]
+"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the wall clock and
+the boot clock at its receipt; the sender's name in expressions; and when it arrived in the kernel. Times in ns."""
 
 _Addresses = Sequence[tuple[object, str]]
 """Keys by which endpoints are recognised (IP address, or IP address and port), each with the endpoint's name."""
@@ -62,14 +61,21 @@ class InboundEngine:
     """A program's routes from UDP.
 
     `arrived_at`, by listener, returns when the kernel got the datagram that was last received (wall clock, ns).
+    `freshness` belongs to the thread that receives, and outlives programs.
     """
 
-    def __init__(self, program: Program, context: EngineContext, arrived_at: Mapping[str, Callable[[], int]]) -> None:
+    def __init__(
+        self,
+        program: Program,
+        context: EngineContext,
+        arrived_at: Mapping[str, Callable[[], int]],
+        freshness: Freshness,
+    ) -> None:
         self._program = program
         self._context = context
         self._counts = context.counts
         self._arrived_at = arrived_at
-        self._freshness = context.state.keep("freshness of datagrams", Freshness)
+        self._freshness = freshness
         self._handles = {
             handler.route: bind(handler, program.counters, context, self._freshness)
             for handlers in program.inbound.values()
@@ -229,7 +235,7 @@ class PartEngine:
         parse, parse_envelope = part.case.message_class.FromString, self._program.envelope.message_class.FromString
         name, is_aged = part.case.name, part.ttl is not None
 
-        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: int) -> None:
+        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: Born) -> None:
             try:
                 message = parse(payload) if payload is not None else getattr(parse_envelope(data), name)
             except ProtobufError as error:
@@ -253,13 +259,13 @@ class _OutboundRoute:
 
 
 class OutboundEngine:
-    """A program's routes from ROS."""
+    """A program's routes from ROS. `freshness` belongs to the thread that takes messages, and outlives programs."""
 
-    def __init__(self, program: Program, context: EngineContext) -> None:
+    def __init__(self, program: Program, context: EngineContext, freshness: Freshness) -> None:
         self._program = program
         self._context = context
         self._handles: list[FunctionType] = []
-        self._freshness = context.state.keep("freshness of ROS messages", Freshness)
+        self._freshness = freshness
 
     def close(self) -> None:
         """Free the handlers. No taker may be called afterwards."""

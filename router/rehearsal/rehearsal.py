@@ -16,6 +16,7 @@ from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import Report
 from router.engine.dispatch import Peer
+from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import P, R, Timer
 
@@ -133,9 +134,9 @@ class Rehearsal:
         self._arrived_at: int | None = None
         self._data = b""
         context = self._context(program)
-        inbound = InboundEngine(program, context, {plan.name: self._arrival for plan in program.listeners})
+        inbound = InboundEngine(program, context, {plan.name: self._arrival for plan in program.listeners}, Freshness())
         self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
-        outbound = OutboundEngine(program, context)
+        outbound = OutboundEngine(program, context, Freshness())
         self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:

@@ -17,7 +17,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 
-from router.clock import wall_ns
+from router.clock import boottime_ns, wall_ns
+from router.engine.freshness import Freshness
 from router.ros.rcl import RCL, address
 from router.threads import join_or_leave, paused
 
@@ -39,6 +40,9 @@ _ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of what a native thread calls to take messages, and to forget why it could not."""
+
+_LOOK_S = 0.25
+"""The longest time between two looks at the clocks, in seconds."""
 
 
 class RawSubscription:
@@ -174,11 +178,13 @@ class Arrivals:
 class MessageThread:
     """Passes the messages of subscriptions to the functions set by `serve`. It starts once and stops once.
 
-    `failed` is called with what they raise. Stopping serves what has arrived by then.
+    `failed` is called with what they raise. `freshness` is that of the messages. Stopping serves what has arrived by
+    then.
     """
 
-    def __init__(self, failed: Callable[[Exception], None]) -> None:
+    def __init__(self, failed: Callable[[Exception], None], freshness: Freshness) -> None:
         """Raises one of `RCL_ERRORS`."""
+        self._freshness = freshness
         self._receive: dict[RawSubscription, Receive] = {}
         self._failed = failed
         self._arrivals = Arrivals([])
@@ -187,9 +193,11 @@ class MessageThread:
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     @classmethod
-    def serving(cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None]) -> MessageThread:
+    def serving(
+        cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None], freshness: Freshness
+    ) -> MessageThread:
         """Return a started thread that serves these. Raises one of `RCL_ERRORS`."""
-        thread = cls(failed)
+        thread = cls(failed, freshness)
         with ExitStack() as opening:
             opening.callback(thread._arrivals.close)
             thread.serve(receive)  # announces at once what has arrived by now
@@ -240,7 +248,10 @@ class MessageThread:
 
     def _run(self) -> None:
         while not self._stopping:
-            for subscription in self._arrivals.wait():
+            arrived = self._arrivals.wait(_LOOK_S)
+            now = boottime_ns()
+            self._freshness.look(wall_ns(), now)
+            for subscription in arrived:
                 self._do_tasks()
                 if subscription in self._receive:
                     self._serve(subscription)

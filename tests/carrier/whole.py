@@ -26,6 +26,7 @@ from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import PartEngine
 from router.engine.binding import State
+from router.engine.freshness import Born
 from router.engine.pacing import RateLimit
 from router.types.framing import MAX_DATAGRAM
 from tests.carrier.building import sanitizing
@@ -322,7 +323,7 @@ class Whole:
             payload = bytes(records[first : first + record.payload_length]) if record.is_single else None
             function, waiting = self._functions[part][self._native.handlers[record.handler].route]
             source = self._native.sources[record.column]
-            function(payload, datagram, record.received_at, record.now, source, record.born)
+            function(payload, datagram, record.received_at, record.now, source, Born(record.oldest, record.youngest))
             for index in waiting:
                 self._rig.counts[index] -= 1
             position += record.size

@@ -18,6 +18,7 @@ from router.engine import InboundEngine, OutboundEngine, Report
 from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import FrameOutcome, Outcome
+from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import Timer
 from tests.tables import PROTOS
@@ -169,9 +170,9 @@ class Rig:
         )
         self.arrived_before = 0
         arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}
-        engine = InboundEngine(made, self.context, arrived_at)
+        engine = InboundEngine(made, self.context, arrived_at, Freshness())
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
-        outbound = OutboundEngine(made, self.context)
+        outbound = OutboundEngine(made, self.context, Freshness())
         self.takers = {plan.label: outbound.taker(plan.label) for plan in made.subscriptions}
         self.changes: list[tuple[str, bool]] = []
 

@@ -144,7 +144,7 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
 static bool serve(struct publishing *publishing, const struct message_record *record) {
     const struct publish_route *route = record->part->publishes;
     struct served served = {.record = record, .route = route};
-    served.expires = route->ttl ? record->born + route->ttl : NEVER;
+    served.expires = route->ttl ? record->youngest + route->ttl : NEVER;
     for (uint32_t index = 0; index < route->target_count; index++) {
         const struct publish_target *target = &route->targets[index];
         if (!__atomic_load_n(target->topic->wanted, __ATOMIC_RELAXED))
