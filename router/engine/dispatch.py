@@ -101,6 +101,7 @@ class InboundEngine:
         # Cases whose tag is at most two bytes long.
         by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._context.clock_ns, self._context.wall_ns, HISTOGRAM_BOUNDS_NS
+        look = self._freshness.look
         received, received_bytes = (
             counters.index("datagrams_received", listener),
             counters.index("received_bytes", listener),
@@ -111,6 +112,7 @@ class InboundEngine:
         def receive(data: bytes, peer: Peer) -> str:
             now = clock_ns()
             received_at = wall_ns()
+            look(received_at, now)
             size = len(data)
             counts[received] += 1
             counts[received_bytes] += size

@@ -235,7 +235,7 @@ class Whole:
     def receive(self, data: bytes, peer: tuple[str, int], listener: str, arrived_before: int) -> None:
         """`arrived_before` in ns. Then Python serves what it is handed."""
         address = int.from_bytes(socket.inet_aton(peer[0]), "big")
-        arrived_at = Rig.WALL + self._rig.now - arrived_before
+        arrived_at = self._rig.wall(self._rig.now - arrived_before)
         number = self._numbers[listener]
         self._library.seam_handle(self._carrier, number, data, len(data), address, peer[1], arrived_at)
         self._events.take()
@@ -259,13 +259,17 @@ class Whole:
         self._set_clocks()
         self._collect()
 
+    def set_clock(self, by: int) -> None:
+        self._rig.set_clock(by)
+        self._set_clocks()
+
     def counts(self) -> list[int]:
         """Those of all threads."""
         of_threads = zip(self._counts, self._publish_counts, self._rig.counts, strict=True)
         return [sum(counts) for counts in of_threads]
 
     def _set_clocks(self) -> None:
-        self._clock.value, self._wall.value = self._rig.now, Rig.WALL + self._rig.now
+        self._clock.value, self._wall.value = self._rig.now, self._rig.wall(self._rig.now)
 
     def _collect(self) -> None:
         for name, destination in self._destinations.items():
@@ -381,6 +385,10 @@ class Comparison:
         )
         for each in (python, carrier):
             each.pass_time(passes)
+        if noise.random() < 0.03:
+            by = noise.choice((-1, 1)) * noise.choice((3 * MS, 50 * MS, noise.randrange(600 * MS), 3600 * 1000 * MS))
+            for each in (python, carrier):
+                each.set_clock(by)
         data, peer, listener = self.datagram(), noise.choice(PEERS), noise.choice(("trimmed", "exact"))
         python.arrived_before = noise.choice((0, noise.randrange(250 * MS)))
         python.receive(data, peer, listener)

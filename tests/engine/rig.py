@@ -125,9 +125,9 @@ class Ledger:
 class Rig:
     """An engine and everything that came out of it.
 
-    `failures` makes an outlet raise, by endpoint or topic. `now` is the monotonic clock in ns, the wall
-    clock is `WALL` ahead of it; every call of an outlet takes `work_ns`. `unwanted` topics have no subscriber.
-    `changes` has what deadmen said. One thread does everything here, so one list has all counts.
+    `failures` makes an outlet raise, by endpoint or topic. `now` is the boot clock in ns, the wall
+    clock is `WALL` ahead of it until it is set; every call of an outlet takes `work_ns`. `unwanted` topics have no
+    subscriber. `changes` has what deadmen said. One thread does everything here, so one list has all counts.
     """
 
     WALL = 1_700_000_000_000_000_000
@@ -138,6 +138,7 @@ class Rig:
         self.ledger = Ledger(made, self.counts)
         self.now = 0
         self.work_ns = 0
+        self._settings = [(0, self.WALL)]  # since when the wall clock is by how much ahead
         self.sent: list[tuple[str, bytes]] = []
         self.published: list[tuple[str, bytes]] = []
         self.reports: list[Report] = []
@@ -159,7 +160,7 @@ class Rig:
             wanted=self.wanted,
             report=self.reports.append,
             clock_ns=lambda: self.now,
-            wall_ns=lambda: self.WALL + self.now,
+            wall_ns=lambda: self.wall(self.now),
             pacing=group,
             holding=group,
             collecting=group,
@@ -169,7 +170,7 @@ class Rig:
             boards=made.boards,
         )
         self.arrived_before = 0
-        arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}
+        arrived_at = {plan.name: lambda: self.wall(self.now - self.arrived_before) for plan in made.listeners}
         engine = InboundEngine(made, self.context, arrived_at, Freshness())
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
         outbound = OutboundEngine(made, self.context, Freshness())
@@ -181,7 +182,15 @@ class Rig:
 
     def take(self, topic: str, cdr: bytes) -> None:
         """A ROS message, which the middleware got `arrived_before` ns ago."""
-        self.takers[topic](cdr, self.WALL + self.now - self.arrived_before)
+        self.takers[topic](cdr, self.wall(self.now - self.arrived_before))
+
+    def wall(self, time: int) -> int:
+        """What the wall clock showed at `time`."""
+        return time + next(ahead for since, ahead in reversed(self._settings) if since <= time or not since)
+
+    def set_clock(self, by: int) -> None:
+        """Sets the wall clock forward, or back."""
+        self._settings.append((self.now, self._settings[-1][1] + by))
 
     def pass_time(self, ns: int) -> None:
         """Moves the clocks, and serves timers when they are due."""
