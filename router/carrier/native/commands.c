@@ -53,8 +53,9 @@ struct commands {
 struct command {
     const uint8_t *data;
     size_t size;
-    int64_t sent_at, received_at; /* wall clock */
-    int64_t now;                  /* boot clock */
+    int64_t published_at, arrived_at; /* wall clock of the sender, and of this computer; 0 if it is not known */
+    int64_t received_at;              /* wall clock */
+    int64_t now;                      /* boot clock */
     struct publisher *publisher;
 };
 
@@ -83,6 +84,26 @@ static void serve_target(struct commands *commands, const struct command_route *
     if (error && error != COMMAND_STALE) report_send_error(&commands->reporter, command->now, route->id, to, error);
 }
 
+static struct born earlier_of(struct born one, struct born other) {
+    if (other.oldest < one.oldest) one.oldest = other.oldest;
+    if (other.youngest < one.youngest) one.youngest = other.youngest;
+    return one;
+}
+
+/* When a message was sent by the sender's clock, or arrived if that is earlier: then the sender's clock is ahead. Its
+ * arrival is not known to be in order, so of that the youngest reading counts. */
+static struct born sent(struct commands *commands, const struct command *command) {
+    int64_t stamp = command->published_at ? command->published_at : command->arrived_at;
+    if (!stamp) stamp = command->received_at;
+    struct born sent = freshness_born(&commands->freshness, stamp, command->received_at, command->now,
+                                      command->publisher->sent);
+    command->publisher->sent = sent.oldest;
+    if (!command->published_at || !command->arrived_at) return sent;
+    int64_t arrived = freshness_born(&commands->freshness, command->arrived_at, command->received_at, command->now,
+                                     INT64_MIN).youngest;
+    return earlier_of(sent, (struct born){arrived, arrived});
+}
+
 /* When the message was born: when it was sent, or when it was stamped, if that is earlier. */
 static struct born born(struct commands *commands, const struct command_route *route, const struct command *command,
                         struct born sent) {
@@ -94,18 +115,12 @@ static struct born born(struct commands *commands, const struct command_route *r
     struct born stamped = freshness_born(&commands->freshness, stamp, command->received_at, command->now,
                                          command->publisher->stamped);
     command->publisher->stamped = stamped.oldest;
-    if (stamped.oldest < sent.oldest) sent.oldest = stamped.oldest;
-    if (stamped.youngest < sent.youngest) sent.youngest = stamped.youngest;
-    return sent;
+    return earlier_of(sent, stamped);
 }
 
 static void serve_targets(struct commands *commands, const struct command_route *route, const struct command *command) {
     struct born when = {0, 0};
-    if (route->ttl) {
-        when = freshness_born(&commands->freshness, command->sent_at, command->received_at, command->now,
-                              command->publisher->sent);
-        command->publisher->sent = when.oldest;
-    }
+    if (route->ttl) when = sent(commands, command);
     counter_add(commands->counters, route->received, 1);
     bool is_valid = message_read(route->reads, route->read_count, command->data, command->size, commands->slots);
     if (is_valid && route->ttl) when = born(commands, route, command, when);
@@ -113,13 +128,6 @@ static void serve_targets(struct commands *commands, const struct command_route 
         if (is_valid) serve_target(commands, route, &route->targets[index], command, when);
         else lose_invalid(commands, route, &route->targets[index], command->now);
     }
-}
-
-/* When a message was sent by the sender's clock, or received by ours if that is earlier; 0 if it is not known. */
-static int64_t sent_at(const struct message_info *info) {
-    int64_t sent = info->source_timestamp, received = info->received_timestamp;
-    if (!sent || !received) return sent ? sent : received;
-    return sent < received ? sent : received;
 }
 
 /* Return what is known of a publisher. One with the same hash is forgotten. */
@@ -138,8 +146,8 @@ static void serve_message(struct commands *commands, const struct command_topic 
     struct command command = {.data = commands->message.buffer, .size = commands->message.length};
     command.now = boottime_ns();
     command.received_at = wall_ns();
-    command.sent_at = sent_at(info);
-    if (!command.sent_at) command.sent_at = command.received_at;
+    command.published_at = info->source_timestamp;
+    command.arrived_at = info->received_timestamp;
     command.publisher = find_publisher(commands, info->publisher);
     for (uint32_t index = 0; index < topic->route_count; index++) {
         const struct command_route *route = &topic->routes[index];
