@@ -25,7 +25,7 @@ Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], str]
 """Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
 
-Take = Callable[[bytes, int], None]
+Take = Callable[[bytes, int, bool], None]
 
 ServePart = Callable[[bytes | None, bytes, int, int, str, Born], None]
 """Called with the payload, or None where it is not the envelope's only field; the restored envelope; the wall clock and
@@ -277,18 +277,25 @@ class OutboundEngine:
     def taker(self, topic: str) -> Take:
         """Return the function that takes one topic's messages. It never raises for what was received.
 
-        Its arguments are CDR bytes, and when the middleware got them (wall clock, ns).
+        Its arguments are CDR bytes, when the message set out (wall clock, ns), and whether it is known to come after
+        the topic's last one.
         """
         routes = [self._route(handler) for handler in self._program.outbound[topic]]
         counts, bounds, total = self._context.counts, HISTOGRAM_BOUNDS_NS, _SUM
         clock_ns, wall_ns, born = self._context.clock_ns, self._context.wall_ns, self._freshness.born
 
-        def take(cdr: bytes, arrived_at: int) -> None:
+        is_aged = any(route.is_aged for route in routes)
+        last = Born(0, 0)
+
+        def take(cdr: bytes, sent_at: int, follows: bool) -> None:
+            nonlocal last
             now = clock_ns()
             received_at = wall_ns()
+            if is_aged:
+                last = born(sent_at, received_at, now, last.oldest if follows else None)
             for route in routes:
                 if route.is_aged:
-                    route.handle(cdr, received_at, now, topic, born(arrived_at, received_at, now))
+                    route.handle(cdr, received_at, now, topic, last)
                 else:
                     route.handle(cdr, received_at, now, topic)
                 counts[route.last_message] = received_at

@@ -146,7 +146,7 @@ class Rehearsal:
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
         """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        self._take[topic](cdr, self.now if sent_ns is None else sent_ns)
+        self._take[topic](cdr, self.now if sent_ns is None else sent_ns, False)
 
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns` and serve the timers that are due by then. Never goes back."""

@@ -22,8 +22,12 @@ from router.engine.freshness import Freshness
 from router.ros.rcl import RCL, address
 from router.threads import join_or_leave, paused
 
-Receive = Callable[[bytes, int], None]
-"""Called with CDR bytes, and the time at which the message set out, in ns of the wall clock."""
+Receive = Callable[[bytes, int, bool], None]
+"""Called with CDR bytes, the time at which the message set out, in ns of the wall clock, and whether it is known to
+come after the topic's last one, as that is of the same publisher."""
+
+_MOST_LOST = 100
+"""A number that is higher by more is rather another publisher's."""
 
 MOST_KEPT = 5000
 """Messages that a subscription without a depth holds: the default of Fast DDS."""
@@ -70,6 +74,9 @@ class RawSubscription:
         self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
         self._node = node
         self._subscription = subscription
+        self._number = 0
+        self.follows = False
+        """Whether the message that was last taken comes after the one before, as both are of the same publisher."""
         self.handle = subscription.handle
         self._message_class = message_class
 
@@ -89,6 +96,8 @@ class RawSubscription:
         if taken is None:
             return None
         cdr, info = taken
+        before, self._number = self._number, info["publication_sequence_number"]  # each publisher counts its messages
+        self.follows = 0 < self._number - before <= _MOST_LOST
         sent, received = info["source_timestamp"], info["received_timestamp"]  # 0 if unknown to the middleware
         return cdr, min(sent or received, received or sent) or wall_ns()
 
@@ -269,13 +278,13 @@ class MessageThread:
             try:
                 if (message := subscription.take()) is None:
                     return
-                receive(*message)
+                receive(*message, subscription.follows)
             except Exception as error:  # noqa: BLE001 a bug of the router is reported, and receiving goes on
                 self._failed(error)
         self._arrivals.again(subscription)
 
     def _pass_on(self, receive: Receive, message: tuple[bytes, int]) -> None:
         try:
-            receive(*message)
+            receive(*message, False)
         except Exception as error:  # noqa: BLE001 as above
             self._failed(error)

@@ -151,7 +151,7 @@ class RouterNode:
         self._receive(change.subscriptions, receive)
         self._use(change)
         for topic, cdr, sent_at in more:
-            receive[topic](cdr, sent_at)
+            receive[topic](cdr, sent_at, False)
 
     def watch(self, change: RosChange) -> None:
         """Wait for events of the endpoints in use: `wanted` follows new subscribers from now on."""

@@ -180,9 +180,9 @@ class Rig:
     def receive(self, data: bytes, peer: tuple[str, int] = SENSOR_BOARD, listener: str = "trimmed") -> None:
         self.receivers[listener](data, peer)
 
-    def take(self, topic: str, cdr: bytes) -> None:
-        """A ROS message, which the middleware got `arrived_before` ns ago."""
-        self.takers[topic](cdr, self.wall(self.now - self.arrived_before))
+    def take(self, topic: str, cdr: bytes, *, follows: bool = False) -> None:
+        """A ROS message, which set out `arrived_before` ns ago, perhaps after the last one."""
+        self.takers[topic](cdr, self.wall(self.now - self.arrived_before), follows)
 
     def wall(self, time: int) -> int:
         """What the wall clock showed at `time`."""

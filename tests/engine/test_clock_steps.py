@@ -97,3 +97,13 @@ def test_old_messages_of_ros_reach_no_board_either(tmp_path: Path, routes: str, 
         rig.pass_time(MS)
     rig.pass_time(SECOND)
     assert not reached(rig) & {*BOARDS}
+
+
+def test_a_publisher_that_goes_on_is_obeyed_at_once_after_its_clock_was_set_back(tmp_path: Path) -> None:
+    rig = Rig(program(tmp_path, PLAIN, HEAD_MORE))
+    for number in range(200):
+        if number == 100:
+            rig.set_clock(-3 * SECOND)
+        rig.take("drive", drive(1), follows=number > 0)
+        rig.pass_time(20 * MS)
+    assert rig.count("datagrams_sent", "drive_motor", "driving_board") == 200
