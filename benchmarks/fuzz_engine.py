@@ -22,6 +22,7 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import InboundEngine, Report
+from router.engine.freshness import Freshness
 from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Ledger, Rig
 from tests.tables import ROUTES
@@ -185,7 +186,7 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
         wall_ns=time.time_ns,
     )
     listener = program.listeners[0].name
-    return InboundEngine(program, timed, {listener: time.time_ns}).receiver(listener)
+    return InboundEngine(program, timed, {listener: time.time_ns}, Freshness()).receiver(listener)
 
 
 def _forget(report: Report) -> None:

@@ -118,9 +118,11 @@ def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program
         deadman, ttl = routes[name].deadman, routes[name].ttl
         assert deadman is not None
         assert (deadman.case.value, tuple(endpoint.value for endpoint in deadman.to)) == (case, to)
-        assert [other.value for other in deadman.disarmed_by] == others
+        assert [other.value for other in deadman.disarmed_by or ()] == others
         assert ttl is not None
         assert ttl.value < deadman.timeout.value
+    moving = {*stops, "arm_ctrl", "arm_target"}
+    assert {name for name, route in routes.items() if route.ttl} == moving
 
 
 def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: Program) -> None:

@@ -50,6 +50,7 @@ from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import OutboundEngine, PartEngine
 from router.engine.binding import State
 from router.engine.deadman import feeder
+from router.engine.freshness import Freshness
 from router.engine.pacing import RateLimit
 from router.engine.slow_path import Rejected, SlowPath
 from router.errors import StartError
@@ -193,7 +194,8 @@ class NativeDatapath:
 
         errors = ros.publish_errors if ros else ()
         shared = engine_context(program, context, topics, errors, send, command, pacers)
-        outbound = OutboundEngine(program, replace(shared, counts=context.counts.ros, state=states[_ROS]))
+        of_ros = replace(shared, counts=context.counts.ros, state=states[_ROS])
+        outbound = OutboundEngine(program, of_ros, ros.freshness if ros else Freshness())
         parts = divided(program, publishes=self._publishing.open(has_topics=bool(program.lowered)))
         engines = {
             part: PartEngine(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from router.app.timers import TimerThread
-from router.clock import monotonic_ns
+from router.clock import boottime_ns, monotonic_ns
 from router.engine.timers import Timer
 from router.log import logger
 from router.net.udp import inherited
@@ -49,7 +49,7 @@ def supervised(progress: Callable[[], int], feed: Callable[[int, int], bool] = l
             notifying = _notify_socket()
             if notifying is None or not feed(ending.enter_context(notifying).fileno(), limit // _CHECKS):
                 thread = TimerThread("watchdog", _log_fault)
-                thread.add(Watchdog(progress, limit // _CHECKS, monotonic_ns()))
+                thread.add(Watchdog(progress, limit // _CHECKS, boottime_ns()))
                 thread.start()
                 ending.callback(thread.stop)
             else:

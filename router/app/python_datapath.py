@@ -19,12 +19,13 @@ from router.app.wiring import (
     open_pacers,
     python_deadman,
 )
-from router.clock import monotonic_ns
+from router.clock import boottime_ns
 from router.compiler.program import DeadmanPlan, Program
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import State
 from router.engine.deadman import Deadman, commander, feeder
 from router.engine.dispatch import Receive
+from router.engine.freshness import Freshness
 from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Classifier, Mirror
@@ -93,12 +94,12 @@ class PythonDatapath:
         deadmen = {plan.route: self._deadman(plan, program, sockets, state) for plan in program.deadmen}
         behind_gateways = gateway_deadmen(program, self._context, ros, state)
         pacers = open_pacers(program, timers.pacing, send, state)
-        command = commander(send, deadmen, timers.deadman.locked, monotonic_ns)
+        command = commander(send, deadmen, timers.deadman.locked, boottime_ns)
         errors = ros.publish_errors if ros else ()
         context = replace(engine_context(program, self._context, topics, errors, send, command, pacers), state=state)
         arrived_at = {name: each.arrived_at for name, each in sockets.listeners.items()}
-        inbound = InboundEngine(program, context, arrived_at)
-        outbound = OutboundEngine(program, replace(context, counts=counts.ros))
+        inbound = InboundEngine(program, context, arrived_at, self._receiving.freshness)
+        outbound = OutboundEngine(program, replace(context, counts=counts.ros), ros.freshness if ros else Freshness())
         return PythonWiring(
             program=program,
             take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},

@@ -20,7 +20,7 @@ from router.app.wiring import Datapath, RouterContext, ThreadCounts
 from router.carrier.boards import NativeBoards
 from router.carrier.library import chosen_library
 from router.carrier.schema import CannotCarry, wire_schema
-from router.clock import monotonic_ns
+from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.log import logger
@@ -208,7 +208,7 @@ class Router:
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
-            "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
+            "gateway_client_lag_seconds": of_clients(lambda client: client.lag(boottime_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }

@@ -6,10 +6,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from router.clock import monotonic_ns
+from router.clock import boottime_ns
 from router.engine.timers import P, R, Timer
 from router.log import logger
-from router.threads import LEAVING_S, StuckError, WakeEvent, join_or_leave
+from router.threads import LEAVING_S, Alarm, StuckError, join_or_leave
 
 _NEVER = 1 << 63
 _RETRY = 100_000_000
@@ -30,7 +30,7 @@ class TimerThread:
         self._failed = failed
         self._timers: list[Timer] = []
         self._lock = threading.Lock()
-        self._wake = WakeEvent()
+        self._alarm = Alarm()
         self._waits_until = 0  # while the thread does not wait
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -58,7 +58,7 @@ class TimerThread:
                         due = each.next_due
                         if due is not None and due < self._waits_until:
                             self._waits_until = due
-                            self._wake.set()
+                            self._alarm.set_for(due)
 
         return with_lock
 
@@ -75,14 +75,14 @@ class TimerThread:
             if not is_locked:
                 return
             if not self._stopping:
-                self._wake.set()
+                self._alarm.set_for(0)
             self._stopping, self._waits_until = True, 0
         if self._thread.ident is not None and not join_or_leave(self._thread):
             return
         with self._lock:
             for timer in reversed(self._timers):
                 self._end(timer)
-        self._wake.close()
+        self._alarm.close()
 
     @contextmanager
     def _locked_unless_stuck(self) -> Iterator[bool]:
@@ -116,7 +116,7 @@ class TimerThread:
 
     def _end(self, timer: Timer) -> None:
         try:
-            timer.end(monotonic_ns())
+            timer.end(boottime_ns())
         except Exception as error:  # noqa: BLE001 the other timers have to be ended as well
             self._failed(error)
 
@@ -127,11 +127,12 @@ class TimerThread:
                     return
                 # In reverse order, as those added later may pass on to earlier ones.
                 self._waits_until = min(map(self._serve, reversed(self._timers)), default=_NEVER)
-            self._wake.wait(self._waits_until - monotonic_ns())
+                self._alarm.set_for(self._waits_until)
+            self._alarm.wait()
 
     def _serve(self, timer: Timer) -> int:
         """Call the timer if it is due. Return the time of its next call."""
-        now = monotonic_ns()
+        now = boottime_ns()
         earliest = now
         if timer.next_due is not None and timer.next_due <= now:
             try:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from router.app.sockets import SocketChange
 from router.app.timers import Timers, TimerThread
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan, Program
 from router.engine.binding import EngineContext, State, TimerGroup
@@ -149,13 +149,13 @@ class Wiring:
     def start(self, timers: Timers) -> None:
         """Have deadmen behind gateways publish to each subscriber that is discovered shortly after the start."""
         for deadman in self.gateway_deadmen.values():
-            timers.inbound_deadman.locked(deadman, deadman.await_subscribers)(monotonic_ns())
+            timers.inbound_deadman.locked(deadman, deadman.await_subscribers)(boottime_ns())
 
     def subscriber_joined(self, topic: str, timers: Timers) -> None:
         for plan in inbound_deadmen(self.program):
             if topic in dict(plan.datagrams):
                 deadman = self.gateway_deadmen[plan.route]
-                log_start(plan.route, timers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
+                log_start(plan.route, timers.inbound_deadman.locked(deadman, deadman.greet)(boottime_ns()))
 
     def free(self) -> None:
         """Free the functions, which are in reference cycles. None may be called afterwards."""
@@ -166,7 +166,7 @@ class Wiring:
         """Send what waits in pacers for targets that the program does not have."""
         places = {(each.route, target.label) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
-            timers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
+            timers.pacing.locked(pacer, pacer.keep_only)(boottime_ns(), places)
 
     def check_gateways(self, earlier: Wiring | None, timers: Timers) -> None:
         """Raise StuckError if `succeed_gateways` would wait for the middleware."""
@@ -277,7 +277,7 @@ def engine_context(
         publish={topic: each.publish for topic, each in publications.items()},
         wanted={topic: each.wanted for topic, each in publications.items()},
         report=context.reporter.report,
-        clock_ns=monotonic_ns,
+        clock_ns=boottime_ns,
         wall_ns=wall_ns,
         pacing=TimerGroup(counts.pacing, timers.pacing.locked),
         holding=TimerGroup(counts.holding, timers.holding.locked),

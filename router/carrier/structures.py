@@ -388,7 +388,8 @@ class MessageRecord(ctypes.Structure):
         ("part", POINTER(Part)),
         ("received_at", c_int64),
         ("now", c_int64),
-        ("born", c_int64),
+        ("oldest", c_int64),
+        ("youngest", c_int64),
         ("column", c_uint32),
         ("is_single", c_uint32),
         ("length", c_uint32),
@@ -396,6 +397,12 @@ class MessageRecord(ctypes.Structure):
         ("payload_length", c_uint32),
         ("handler", c_uint32),
     )
+
+
+class Born(ctypes.Structure):
+    """`struct born` in freshness.h."""
+
+    _fields_ = (("oldest", c_int64), ("youngest", c_int64))
 
 
 class MirrorRecord(ctypes.Structure):
@@ -416,6 +423,7 @@ class MirrorRecord(ctypes.Structure):
 
 __all__ = [
     "REASONS",
+    "Born",
     "Case",
     "Change",
     "CommandRoute",

@@ -14,10 +14,11 @@ from time import sleep
 
 from router.carrier.ring import Ring
 from router.engine.dispatch import ServePart
+from router.engine.freshness import Born
 
 _TRIES, _TRY_S = 100, 0.0002
 
-_RECORD = Struct("@IIQqqqIIIIII")
+_RECORD = Struct("@IIQqqqqIIIIII")
 """`struct message_record`."""
 
 
@@ -144,7 +145,8 @@ class Worker:
                 _,
                 received_at,
                 now,
-                born,
+                oldest,
+                youngest,
                 column,
                 is_single,
                 length,
@@ -162,7 +164,7 @@ class Worker:
             datagram = bytes(records[data : data + length])
             self._edition += 1
             try:
-                function(payload, datagram, received_at, now, stage.sources[column], born)
+                function(payload, datagram, received_at, now, stage.sources[column], Born(oldest, youngest))
             except Exception as error:  # noqa: BLE001 as above
                 self._failed(error)
             for index in waiting:

@@ -16,14 +16,28 @@ from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
-from router.errors import Code, Diagnostic, MappingError, SourceSpan, did_you_mean
-from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, OnLimit, Route, RouteTable
+from router.errors import Code, Diagnostic, Located, MappingError, SourceSpan, did_you_mean
+from router.table.model import (
+    DEFAULT_REPEAT,
+    Deadman,
+    Destination,
+    FieldMap,
+    InboundDeadman,
+    OnLimit,
+    Route,
+    RouteTable,
+)
+from router.table.units import duration
 from router.types.board_limits import NON_FINITE
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 SHORTEST_REPEAT = 10_000_000
 """ns. Shorter would flood a board, which may still be busy with the last datagram."""
+
+SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 20_000_000, 10 * NS_PER_SECOND
+"""ns. Commands that come within a shorter timeout are rare, and in a longer one a rover gets far: other units are
+meant."""
 
 _NOTHING = MessageType("a deadman")
 """The source message of a deadman's payload: one without fields."""
@@ -54,8 +68,7 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
     """Warn of the first board that gets commands from a route without deadman."""
     for destination in route.destinations:
         name = destination.endpoint.value
-        endpoint = lookup.table.endpoints.get(name)
-        if route.no_deadman is None and endpoint is not None and endpoint.kind is EndpointKind.BOARD:
+        if route.no_deadman is None and name in lookup.boards:
             message = f"nothing stops '{name}' when '{route.case.value}' stops coming"
             hint = "say `deadman: {timeout: 500ms, send: {CASE: {FIELD: VALUE}}}`, or `deadman: {none: why}`"
             lookup.report(destination.endpoint.span, Code.NO_DEADMAN, message, hint)
@@ -70,24 +83,93 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
         return
     rates = [destination.max_rate for destination in feeding(route, deadman)]
     limited = [rate for rate in rates if rate is not None]
-    lookup.findings += timing_findings(deadman, max(limited) if len(limited) == len(rates) else None, "datagrams")
-    _want_no_late_commands(lookup, route, deadman)
+    max_rate = max(limited) if len(limited) == len(rates) else None
+    are_late = _report_late_commands(lookup, route, deadman)
+    lookup.findings += timing_findings(deadman, None if are_late else route.ttl, max_rate, "datagrams")
+    if deadman.because is None:
+        _want_all_boards(lookup, route, deadman)
+        _want_hand_over(lookup, route, deadman)
 
 
-def timing_findings(deadman: Deadman | InboundDeadman, max_rate: float | None, sends: str) -> Iterator[Diagnostic]:
-    """A deadman that trips while commands come, or that floods. `max_rate` (Hz) limits all its commands."""
+def timing_findings(
+    deadman: Deadman | InboundDeadman, ttl: Located[int] | None, max_rate: float | None, sends: str
+) -> Iterator[Diagnostic]:
+    """A deadman that trips while commands come, or that floods; and one whose times are most likely not meant.
+
+    `max_rate` (Hz) limits all its commands.
+    """
     if max_rate is not None and deadman.timeout.value * max_rate <= NS_PER_SECOND:
         message = f"it would trip between commands that `max_rate` holds down to {max_rate:g} Hz"
         yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
     if deadman.repeat.value < SHORTEST_REPEAT:
         message = f"more than 100 {sends} per second would flood who gets them"
         yield Diagnostic(deadman.repeat.span, Code.BAD_VALUE, message, "repeat it every 10ms at most")
+    if deadman.because is None:
+        for span, message, hint in _doubtful_times(deadman, ttl):
+            yield Diagnostic(span, Code.DOUBTFUL_DEADMAN, message, f"{hint}, or say `because: why`")
 
 
-def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+def _doubtful_times(
+    deadman: Deadman | InboundDeadman, ttl: Located[int] | None
+) -> Iterator[tuple[SourceSpan, str, str]]:
+    """Where, what, and what to write in its place."""
+    timeout, repeat = deadman.timeout, deadman.repeat
+    time = duration(timeout.value)
+    if timeout.value > LONGEST_TIMEOUT:
+        yield timeout.span, f"what moves goes on for {time} after the last command", "say for example `timeout: 500ms`"
+    elif timeout.value < SHORTEST_TIMEOUT:
+        message = f"it trips between commands unless they come faster than every {time}"
+        yield timeout.span, message, "say `timeout: 20ms` at least"
+    if repeat.value > max(2 * timeout.value, DEFAULT_REPEAT.value):
+        message = f"when its datagram is lost, the next one follows {duration(repeat.value)} later"
+        yield repeat.span, message, f"repeat it within the timeout of {time}"
+    if ttl is not None and ttl.value > timeout.value:
+        message = f"a command that comes {duration(ttl.value)} late would undo the deadman, which trips after {time}"
+        yield ttl.span, message, f"say `ttl: {time.replace(' ', '')}` at most"
+
+
+def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+    """Report the first board that the route commands and the deadman does not stop."""
+    stopped = {to.value for to in deadman.to}
+    if not stopped <= lookup.table.endpoints.keys():
+        return  # that is the mistake
+    for destination in route.destinations:
+        name = destination.endpoint.value
+        if name not in stopped and name in lookup.boards:
+            message = f"'{name}' gets '{route.case.value}' and is not in `to`: nothing stops it"
+            hint = "add it to `to`, or give it a route of its own, or say `because: why`"
+            lookup.report(deadman.to[0].span, Code.DOUBTFUL_DEADMAN, message, hint)
+            return
+
+
+def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+    """Report other routes with a deadman that command a board between whose commands this deadman would act."""
+    if deadman.disarmed_by == ():
+        return
+    boards = [to.value for to in deadman.to if to.value in lookup.boards]
+    forgotten: dict[str, str] = {}
+    for other in lookup.table.routes:
+        shared = [to.endpoint.value for to in other.destinations if to.endpoint.value in boards]
+        if shared and other.deadman and other.name != route.name and not takes_over(other, shared[0], route):
+            forgotten.setdefault(other.case.value, shared[0])
+    if not forgotten:
+        return
+    case, board = next(iter(forgotten.items()))
+    named = [name.value for name in deadman.disarmed_by or ()]
+    message = f"it would cut into commands of '{case}', which '{board}' gets too"
+    alternative = "`because: why`" if named else "`disarmed_by: []` if it is to"
+    cases = ", ".join((*named, *forgotten))
+    value = f"[{cases}]" if "," in cases else cases
+    hint = f"say `disarmed_by: {value}`, or {alternative}"
+    lookup.report(
+        deadman.disarmed_by[0].span if deadman.disarmed_by else deadman.span, Code.DOUBTFUL_DEADMAN, message, hint
+    )
+
+
+def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> bool:
     """Report commands that may wait longer than the timeout: sent late, they would undo the deadman."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
-        return
+        return False
     for destination in route.destinations:
         endpoint = lookup.table.endpoints.get(destination.endpoint.value)
         waits_for = "`on_limit: latest`" if destination.on_limit is OnLimit.LATEST else "the endpoint's bandwidth"
@@ -95,7 +177,8 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
             message = f"a command that waited for {waits_for} could undo the deadman when it is older than its timeout"
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
-            return
+            return True
+    return False
 
 
 def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
@@ -107,7 +190,7 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
     served = {each.case.value for each in found}
     served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
     are_known = all(to.value in table.endpoints for to in deadman.to)  # else that is the mistake
-    for name in deadman.disarmed_by:
+    for name in deadman.disarmed_by or ():
         if name.value not in lookup.envelope.cases:
             message = f"{lookup.envelope.name} has no payload case '{name.value}'"
             hint = did_you_mean(name.value, _commanding(table, route, deadman) or lookup.envelope.cases)
@@ -191,6 +274,6 @@ def takes_over(route: Route, endpoint: str, other: Route) -> bool:
     return (
         deadman is not None
         and other.name != route.name
-        and route.case.value in [case.value for case in deadman.disarmed_by]
+        and route.case.value in [case.value for case in deadman.disarmed_by or ()]
         and endpoint in [to.value for to in deadman.to]
     )

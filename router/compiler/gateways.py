@@ -72,7 +72,7 @@ def _inbound(lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str) -> I
     lookup.findings += [finding for finding in findings if finding]
     ros_type = lookup.ros_type(inbound.topic)
     if inbound.deadman is not None:
-        lookup.findings += timing_findings(inbound.deadman, inbound.topic.max_rate, "messages")
+        lookup.findings += timing_findings(inbound.deadman, inbound.ttl, inbound.topic.max_rate, "messages")
     if ros_type is None:
         return None
     return InboundPlan(inbound, name, ros_type, _deadman(lookup, gateway, inbound, name, ros_type))

@@ -8,7 +8,7 @@ the deadmen. It counts in a flat list. `router explain` prints it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import compress, count
 
@@ -29,12 +29,15 @@ Deliver = Callable[[str, CheckedTarget], None]
 NamedTarget = tuple[str, CheckedTarget]
 """A target with its part of the Python names."""
 
+_EXPIRY = {True: "command_expires", False: "expires"}
+"""The names of the time after which a message is stale, by whether the target is a board."""
+
 
 class HandlerSource:
     """The source of `def route_NAME(MESSAGE, received_at, now, source)` for one route, with the targets that it serves.
 
     MESSAGE is `m, datagram` of a route from UDP, `cdr` of one from ROS. With a `ttl` there is one more argument:
-    `born`, the arrival by the monotonic clock (ns).
+    `born`, the arrival by the boot clock (engine.freshness.Born).
     """
 
     def __init__(self, route: Route, case: PayloadCase, counters: Counters) -> None:
@@ -57,7 +60,7 @@ class HandlerSource:
         """
         named = self._serving([self._named(target) for target in targets], targets if served is None else served)
         with self._function("m", "datagram"):
-            self._expires()
+            self._expires(named)
             if collect is None:
                 self._serve(named)
             else:
@@ -81,7 +84,7 @@ class HandlerSource:
             self._all_lost(named, span, one_received)
             if subscription.stamp is not None:
                 self._born(subscription.stamp)
-            self._expires()
+            self._expires(named)
             if for_each is None:
                 self.out.line(one_received, span)
                 self._serve(named, subscription.when)
@@ -108,15 +111,19 @@ class HandlerSource:
         """The age counts from the stamp where the message has one, else from its arrival."""
         value = self.out.expression(stamp.node)
         with self.out.block(f"if {value}:", stamp.span):
-            self.out.line(f"born = min(born, monotonic({value}, received_at, now))", stamp.span)
+            self.out.line(f"born = born.or_before(stamped({value}, received_at, now))", stamp.span)
 
-    def _expires(self) -> None:
-        if self.route.ttl:
-            self.out.line(f"expires = born + {self.route.ttl.value}", self.route.ttl.span)
+    def _expires(self, targets: Iterable[NamedTarget]) -> None:
+        """Commands to boards are as old as they can be, anything else is as young."""
+        if not self.route.ttl:
+            return
+        for is_board, reading in ((True, "oldest"), (False, "youngest")):
+            if any(target.is_board is is_board for _, target in targets):
+                line = f"{_EXPIRY[is_board]} = born.{reading} + {self.route.ttl.value}"
+                self.out.line(line, self.route.ttl.span)
 
-    @property
-    def _expiry(self) -> str:
-        return "expires" if self.route.ttl else "None"
+    def _expiry(self, target: CheckedTarget) -> str:
+        return _EXPIRY[target.is_board] if self.route.ttl else "None"
 
     # frames
 
@@ -224,7 +231,7 @@ class HandlerSource:
                 self._count("messages_filtered", target)
             word = "elif"
         if self.route.ttl:
-            with self.out.block(f"{word} clock_ns() > expires:", self.route.ttl.span):
+            with self.out.block(f"{word} clock_ns() > {self._expiry(target)}:", self.route.ttl.span):
                 self._count("messages_dropped", target, "stale")
             word = "elif"
         if target.declared.max_rate is not None and target.declared.on_limit is OnLimit.FIRST:
@@ -254,7 +261,7 @@ class HandlerSource:
     def _send(self, name: str, target: CheckedTarget) -> None:
         arguments = self._data(name, target)
         if self.route.ttl or target.deadmen:
-            arguments += f", {self._expiry}"
+            arguments += f", {self._expiry(target)}"
         index = self.counters.index("sent_bytes", self.route.name, target.label)
         self.out.line(f"counts[{index}] += send_{name}({arguments})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
@@ -265,4 +272,4 @@ class HandlerSource:
 
     def _deliver(self, name: str, target: CheckedTarget) -> None:
         """Sent or published now or later. What delivers it then counts it and feeds the deadmen."""
-        self.out.line(f"deliver_{name}(now, {self._data(name, target)}, {self._expiry})", target.span)
+        self.out.line(f"deliver_{name}(now, {self._data(name, target)}, {self._expiry(target)})", target.span)

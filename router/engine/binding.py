@@ -113,7 +113,7 @@ def bind(handler: Handler, counters: Counters, context: EngineContext, freshness
         "counts": context.counts,
         "FAILURES": (*MAPPING_FAILURES, Stale, OSError, *context.publish_errors),
         "clock_ns": context.clock_ns,
-        "monotonic": freshness.born,
+        "stamped": freshness.born,
     }
     if handler.collect_timeout is not None:
         namespace["collect"] = _collect(handler, handler.collect_timeout, counters, context)

@@ -50,7 +50,7 @@ class Deadman(Timer):
 
     `start` and `greet` send the payload when the router starts, without a change of state. `send` is by endpoint and
     may raise OSError, which is counted and reported. `changed` is called with the route and whether the deadman is now
-    tripped. All times in ns of the monotonic clock.
+    tripped. All times in ns of the boot clock.
     """
 
     def __init__(

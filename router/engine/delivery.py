@@ -24,15 +24,15 @@ Place = tuple[str, str]
 Deliver = Callable[[int, bytes, int | None], None]
 """Called with the time, the datagram or CDR bytes, and the time after which they are stale (None: never).
 
-Monotonic times in ns. The message is counted before or after the return; losses raise nothing.
+Times of the boot clock in ns. The message is counted before or after the return; losses raise nothing.
 """
 
 Feed = Callable[[int], None]
-"""Called right before a command is sent, with the monotonic time in ns: restarts the timeouts of its deadmen."""
+"""Called right before a command is sent, with the time (boot clock, ns): restarts the timeouts of its deadmen."""
 
 Command = Callable[[bytes, int | None], int]
-"""Sends a datagram and returns its size; called with the datagram and the monotonic time in ns after which it is stale
-(None: never).
+"""Sends a datagram and returns its size; called with the datagram and the time (boot clock, ns) after which it
+is stale (None: never).
 
 Checks that, feeds or disarms the deadmen of the command and sends it, all under their lock: so no command leaves
 behind the datagram of a deadman that replaces it. Raises Stale or OSError.

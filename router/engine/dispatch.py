@@ -16,7 +16,7 @@ from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine.binding import EngineContext, Handle, bind, unbind
 from router.engine.delivery import Outcome, Report
-from router.engine.freshness import Freshness
+from router.engine.freshness import Born, Freshness
 from router.engine.slow_path import Rejected, SlowPath
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
@@ -25,12 +25,11 @@ Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], str]
 """Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
 
-Take = Callable[[bytes, int], None]
+Take = Callable[[bytes, int, bool], None]
 
-ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
-"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the
-wall clock and the monotonic clock at its receipt; the sender's name in expressions; and the monotonic time of its
-arrival in the kernel. Times in ns."""
+ServePart = Callable[[bytes | None, bytes, int, int, str, Born], None]
+"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the wall clock and
+the boot clock at its receipt; the sender's name in expressions; and when it arrived in the kernel. Times in ns."""
 
 _Addresses = Sequence[tuple[object, str]]
 """Keys by which endpoints are recognised (IP address, or IP address and port), each with the endpoint's name."""
@@ -62,14 +61,21 @@ class InboundEngine:
     """A program's routes from UDP.
 
     `arrived_at`, by listener, returns when the kernel got the datagram that was last received (wall clock, ns).
+    `freshness` belongs to the thread that receives, and outlives programs.
     """
 
-    def __init__(self, program: Program, context: EngineContext, arrived_at: Mapping[str, Callable[[], int]]) -> None:
+    def __init__(
+        self,
+        program: Program,
+        context: EngineContext,
+        arrived_at: Mapping[str, Callable[[], int]],
+        freshness: Freshness,
+    ) -> None:
         self._program = program
         self._context = context
         self._counts = context.counts
         self._arrived_at = arrived_at
-        self._freshness = context.state.keep("freshness of datagrams", Freshness)
+        self._freshness = freshness
         self._handles = {
             handler.route: bind(handler, program.counters, context, self._freshness)
             for handlers in program.inbound.values()
@@ -95,6 +101,7 @@ class InboundEngine:
         # Cases whose tag is at most two bytes long.
         by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._context.clock_ns, self._context.wall_ns, HISTOGRAM_BOUNDS_NS
+        look = self._freshness.look
         received, received_bytes = (
             counters.index("datagrams_received", listener),
             counters.index("received_bytes", listener),
@@ -105,6 +112,7 @@ class InboundEngine:
         def receive(data: bytes, peer: Peer) -> str:
             now = clock_ns()
             received_at = wall_ns()
+            look(received_at, now)
             size = len(data)
             counts[received] += 1
             counts[received_bytes] += size
@@ -229,7 +237,7 @@ class PartEngine:
         parse, parse_envelope = part.case.message_class.FromString, self._program.envelope.message_class.FromString
         name, is_aged = part.case.name, part.ttl is not None
 
-        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: int) -> None:
+        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: Born) -> None:
             try:
                 message = parse(payload) if payload is not None else getattr(parse_envelope(data), name)
             except ProtobufError as error:
@@ -253,13 +261,13 @@ class _OutboundRoute:
 
 
 class OutboundEngine:
-    """A program's routes from ROS."""
+    """A program's routes from ROS. `freshness` belongs to the thread that takes messages, and outlives programs."""
 
-    def __init__(self, program: Program, context: EngineContext) -> None:
+    def __init__(self, program: Program, context: EngineContext, freshness: Freshness) -> None:
         self._program = program
         self._context = context
         self._handles: list[FunctionType] = []
-        self._freshness = context.state.keep("freshness of ROS messages", Freshness)
+        self._freshness = freshness
 
     def close(self) -> None:
         """Free the handlers. No taker may be called afterwards."""
@@ -269,18 +277,25 @@ class OutboundEngine:
     def taker(self, topic: str) -> Take:
         """Return the function that takes one topic's messages. It never raises for what was received.
 
-        Its arguments are CDR bytes, and when the middleware got them (wall clock, ns).
+        Its arguments are CDR bytes, when the message set out (wall clock, ns), and whether it is known to come after
+        the topic's last one.
         """
         routes = [self._route(handler) for handler in self._program.outbound[topic]]
         counts, bounds, total = self._context.counts, HISTOGRAM_BOUNDS_NS, _SUM
         clock_ns, wall_ns, born = self._context.clock_ns, self._context.wall_ns, self._freshness.born
 
-        def take(cdr: bytes, arrived_at: int) -> None:
+        is_aged = any(route.is_aged for route in routes)
+        last = Born(0, 0)
+
+        def take(cdr: bytes, sent_at: int, follows: bool) -> None:
+            nonlocal last
             now = clock_ns()
             received_at = wall_ns()
+            if is_aged:
+                last = born(sent_at, received_at, now, last.oldest if follows else None)
             for route in routes:
                 if route.is_aged:
-                    route.handle(cdr, received_at, now, topic, born(arrived_at, received_at, now))
+                    route.handle(cdr, received_at, now, topic, last)
                 else:
                     route.handle(cdr, received_at, now, topic)
                 counts[route.last_message] = received_at

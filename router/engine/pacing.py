@@ -24,7 +24,7 @@ QUEUE, LEAST_QUEUE = NS, 65536
 
 
 class RateLimit:
-    """Passes at most `hertz` messages per second; all times are monotonic, in ns.
+    """Passes at most `hertz` messages per second; all times are of the boot clock, in ns.
 
     Passes keep to a grid of one period. A message up to half a period early takes its place on the grid (a limiter by
     interval would wait for the next and undershoot: 25 instead of 30 Hz out of 100); after a pause the grid starts
@@ -38,7 +38,7 @@ class RateLimit:
     def __init__(self, hertz: float) -> None:
         self._period = self.period(hertz)
         self._late = self._period - self._period // 2
-        self.next_pass = -self._period  # a whole period ago at any time, because monotonic time is not negative
+        self.next_pass = -self._period  # a whole period ago at any time, because the boot clock is not negative
 
     @staticmethod
     def period(hertz: float) -> int:

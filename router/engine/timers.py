@@ -12,7 +12,7 @@ R = TypeVar("R")
 class Timer(Protocol):
     """An object that acts at a deadline. The caller provides the clock and never makes two calls at once.
 
-    `next_due` is the monotonic time in ns at which `due` is to be called, or None. Any call of the object may change
+    `next_due` is the time (boot clock, ns) at which `due` is to be called, or None. Any call of the object may change
     it, to an earlier time as well.
     """
 

@@ -16,7 +16,7 @@ class ClientQueue:
 
     While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema): a newer frame
     takes the place of the one that waits, so that each topic keeps its turn. `sent` and `dropped` count frames since
-    the client came. Times are monotonic, in ns.
+    the client came. Times are of the boot clock, in ns.
     """
 
     def __init__(self, client: Client, number: int, on_wire: Callable[[Sequence[Frame]], Sequence[Frame]]) -> None:
@@ -80,7 +80,7 @@ class ClientQueue:
 
 
 class Clients:
-    """All clients of a gateway. `clock_ns` is monotonic, `wall_s` gives the wall clock in seconds.
+    """All clients of a gateway. `clock_ns` is the boot clock, `wall_s` gives the wall clock in seconds.
 
     `log` is to be flushed regularly.
     """

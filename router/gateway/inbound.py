@@ -34,7 +34,7 @@ class RefusedError(Exception):
 @dataclass(frozen=True, slots=True)
 class InboundOutputs:
     """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
-    the deadman's route, each called with the monotonic time before a message is published. Clocks in ns.
+    the deadman's route, each called with the time (boot clock) before a message is published. Clocks in ns.
     """
 
     publish: Mapping[str, Callable[[bytes], None]]
@@ -157,7 +157,7 @@ class InboundPublisher:
         """
         wall = self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
-        age = now - self._freshness.born(stamp, wall, now)
+        age = now - self._freshness.born(stamp, wall, now).youngest
         if age > ttl:
             detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
             raise self._dropped(topic, "stale", detail)

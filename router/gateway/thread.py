@@ -12,7 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import GatewayPlan, Program
 from router.engine import Report
@@ -86,7 +86,7 @@ class GatewayThread:
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
         self._services: dict[str, GatewayService] = {}
         self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
-        self._context = GatewayContext(self._subscriptions, self._converting, failed, monotonic_ns, wall_ns)
+        self._context = GatewayContext(self._subscriptions, self._converting, failed, boottime_ns, wall_ns)
         self._thread.start()
 
     def prepare(self, program: Program, feed: FeedMaker) -> GatewayChange:
@@ -254,6 +254,6 @@ def _outputs(program: Program, ros: RouterNode, feed: FeedMaker, report: Callabl
         publish_errors=ros.publish_errors,
         feed_deadman={route: feed(route, (route,)) for route in guarded},
         report=report,
-        clock_ns=monotonic_ns,
+        clock_ns=boottime_ns,
         wall_ns=wall_ns,
     )

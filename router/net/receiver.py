@@ -20,7 +20,9 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from time import monotonic_ns
 
+from router.clock import boottime_ns, wall_ns
 from router.engine.dispatch import Peer
+from router.engine.freshness import Freshness
 from router.net.udp import Listener
 
 Receive = Callable[[bytes, Peer], object]
@@ -151,7 +153,8 @@ class ReceiveThread:
 
     `limit` is the longest datagram in bytes that is received whole. A longer one has its true length (MSG_TRUNC) with
     arbitrary bytes at the end: the receiver must reject it by its length. `coalescing_target()` is how many datagrams
-    of a listener may gather before they are read. `failed` is called with what a receiver raises.
+    of a listener may gather before they are read. `failed` is called with what a receiver raises. `freshness` is that
+    of the datagrams.
     """
 
     def __init__(self, limit: int, coalescing_target: Callable[[], int], failed: Callable[[Exception], None]) -> None:
@@ -160,6 +163,7 @@ class ReceiveThread:
         self._listeners: Sequence[Listener] = ()
         self._readers: list[_Reader] = []
         self._failed = failed
+        self.freshness = Freshness()
         self._ended = False
         self._turns = 0
         self._tasks: deque[Callable[[], None]] = deque()
@@ -261,6 +265,7 @@ class ReceiveThread:
     def _from_one(self) -> None:
         """Serve a single listener until there are tasks, with one system call per datagram: a receive that blocks."""
         [reader] = self._readers
+        past = self.freshness.past
         receive, receive_from, size, tasks = reader.receive, reader.receive_from, reader.size, self._tasks
         reader.wait_at_most(_TASK_INTERVAL)
         while not tasks:
@@ -268,8 +273,9 @@ class ReceiveThread:
             since = monotonic_ns()
             for _ in range(SAMPLE):
                 try:
-                    data, peer = receive_from(size, _WAIT)
+                    data, peer = receive_from(size, _DONT_WAIT if past else _WAIT)
                 except BlockingIOError:
+                    self._found_empty()
                     break
                 except OSError:
                     reader.pass_on_error()
@@ -298,7 +304,10 @@ class ReceiveThread:
             pauses: dict[int, float] = {}  # by descriptor, when each ends by time.monotonic
             while not self._tasks:
                 self._turns += 1
-                for descriptor in _ready(waiting, pauses, wait_for):
+                ready = _ready(waiting, pauses, wait_for, 0 if self.freshness.past else _TASK_INTERVAL)
+                if not ready and not pauses:
+                    self._found_empty()
+                for descriptor in ready:
                     if pause := readers[descriptor].take_ready():
                         waiting.modify(descriptor, 0)
                         pauses[descriptor] = time.monotonic() + pause
@@ -310,6 +319,12 @@ class ReceiveThread:
                     else:
                         waiting.modify(descriptor, select.EPOLLIN)
                         del pauses[descriptor]
+
+    def _found_empty(self) -> None:
+        """What is still to come was not stamped under a setting of the clock that has passed."""
+        self.freshness.forget_past()
+        now = boottime_ns()
+        self.freshness.look(wall_ns(), now)
 
 
 class _PollFd(ctypes.Structure):
@@ -333,10 +348,12 @@ class _BriefWait:
         _ppoll(*self._arguments)
 
 
-def _ready(waiting: select.epoll, pauses: Mapping[int, float], wait_for: Callable[[float], None]) -> list[int]:
-    """Wait until the next pause ends; return the descriptors with datagrams that do not pause."""
+def _ready(
+    waiting: select.epoll, pauses: Mapping[int, float], wait_for: Callable[[float], None], most: float
+) -> list[int]:
+    """Wait until the next pause ends, or `most` s; return the descriptors with datagrams that do not pause."""
     if not pauses:
-        return [descriptor for descriptor, _ in waiting.poll(_TASK_INTERVAL)]
+        return [descriptor for descriptor, _ in waiting.poll(most)]
     if (timeout := min(pauses.values()) - time.monotonic()) > 0:
         wait_for(timeout)
     return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in pauses]

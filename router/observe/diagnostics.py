@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.cdr.primitives import HEADER, put_length, put_text
 from router.compiler.metrics import INTENDED_REASONS, RECORD_DROP_REASONS
 from router.compiler.program import GatewayPlan, Program
@@ -110,7 +110,7 @@ class Diagnostics:
         has_failed = False
         while not self._stopping.wait(PERIOD):
             try:
-                statuses = self._watch.statuses(monotonic_ns(), wall_ns())
+                statuses = self._watch.statuses(boottime_ns(), wall_ns())
                 self._publish(diagnostic_array(wall_ns(), self._node, statuses))
             except Exception as error:  # noqa: BLE001 routing goes on without diagnostics
                 if not has_failed:
@@ -127,10 +127,10 @@ class Watch:
         self._running = running
         self._host = platform.node()
         self._snapshots: deque[tuple[int, Snapshot]] = deque(maxlen=SNAPSHOTS)
-        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (monotonic)
+        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
 
     def statuses(self, now: int, wall: int) -> list[Status]:
-        """How everything is at `now`, of a monotonic clock, and `wall`, in ns."""
+        """How everything is at `now`, of the boot clock, and `wall`, in ns."""
         program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
         earlier = self._snapshots[-1][0] if self._snapshots else now
         silent = {name: now - self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}

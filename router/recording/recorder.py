@@ -14,7 +14,7 @@ from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
 from pathlib import Path
 
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.program import Program
 from router.errors import RouterError
 from router.log import logger
@@ -88,7 +88,7 @@ class Recorder:
         self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
         self._overflow = self._lost_by_faults = 0
         self._is_well = True
-        self._due = monotonic_ns() + PERIOD
+        self._due = boottime_ns() + PERIOD
         self._trips: deque[str] = deque()
         self._trips_saved_at: int | None = None
         self._requests: deque[tuple[str, Future[Path]]] = deque()
@@ -154,7 +154,7 @@ class Recorder:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
         with self._encoding:
             try:
-                self._encoder.add(batch, self._classifier, wall_ns(), monotonic_ns())
+                self._encoder.add(batch, self._classifier, wall_ns(), boottime_ns())
                 if self._encoder.size > LONGEST_CHUNK:
                     self._finish_chunk()
             except Exception as error:  # noqa: BLE001 of the router itself, and no reason to stop recording
@@ -181,7 +181,7 @@ class Recorder:
 
     def _run(self) -> None:
         while not self._closing:
-            self._wake_up.wait(self._due - monotonic_ns())
+            self._wake_up.wait(self._due - boottime_ns())
             self._write()
             self._save_requested()
             if self._trips and self._may_save_trips():
@@ -195,7 +195,7 @@ class Recorder:
 
     def _write(self) -> None:
         """Finish a chunk, and write all that are queued."""
-        self._due = monotonic_ns() + PERIOD
+        self._due = boottime_ns() + PERIOD
         with self._encoding:
             try:
                 self._finish_chunk()
@@ -209,13 +209,13 @@ class Recorder:
             else:
                 self._is_well = True
         if self._continuous is not None:
-            self._continuous.close_if_old(monotonic_ns())
+            self._continuous.close_if_old(boottime_ns())
 
     def _store(self, chunk: Chunk) -> None:
         if self._ring is not None:
             self._ring.add(chunk)
         if self._continuous is not None:
-            self._continuous.write(chunk, monotonic_ns())
+            self._continuous.write(chunk, boottime_ns())
 
     def _encoding_failed(self, error: Exception) -> None:
         """To be called with the lock `_encoding`."""
@@ -239,7 +239,7 @@ class Recorder:
     def _may_save_trips(self) -> bool:
         """Once in the time that is kept: a deadman that trips again and again fills no disk, and nothing is missed."""
         assert self._settings.last is not None  # noqa: S101 - or nobody has noted a trip
-        now = monotonic_ns()
+        now = boottime_ns()
         if self._trips_saved_at is not None and now - self._trips_saved_at < self._settings.last:
             return False
         self._trips_saved_at = now
@@ -275,7 +275,7 @@ class Recorder:
         try:
             for chunk in chunks:
                 file.write(chunk)
-                if monotonic_ns() >= self._due and not self._closing:
+                if boottime_ns() >= self._due and not self._closing:
                     self._write()
         except Exception:
             file.abandon()

@@ -243,7 +243,7 @@ class ContinuousWriter:
     """Writes all chunks to files that follow one another; what the disk does not take is counted in `lost`.
 
     A file is begun when there is something to write and the last one is full or old enough. `about` is called for each.
-    Times are monotonic, in ns.
+    Times are of the boot clock, in ns.
     """
 
     def __init__(

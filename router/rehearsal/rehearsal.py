@@ -16,6 +16,7 @@ from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import Report
 from router.engine.dispatch import Peer
+from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import P, R, Timer
 
@@ -133,9 +134,9 @@ class Rehearsal:
         self._arrived_at: int | None = None
         self._data = b""
         context = self._context(program)
-        inbound = InboundEngine(program, context, {plan.name: self._arrival for plan in program.listeners})
+        inbound = InboundEngine(program, context, {plan.name: self._arrival for plan in program.listeners}, Freshness())
         self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
-        outbound = OutboundEngine(program, context)
+        outbound = OutboundEngine(program, context, Freshness())
         self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
@@ -145,7 +146,7 @@ class Rehearsal:
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
         """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        self._take[topic](cdr, self.now if sent_ns is None else sent_ns)
+        self._take[topic](cdr, self.now if sent_ns is None else sent_ns, False)
 
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns` and serve the timers that are due by then. Never goes back."""

@@ -17,12 +17,17 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 
-from router.clock import wall_ns
+from router.clock import boottime_ns, wall_ns
+from router.engine.freshness import Freshness
 from router.ros.rcl import RCL, address
 from router.threads import join_or_leave, paused
 
-Receive = Callable[[bytes, int], None]
-"""Called with CDR bytes, and the time at which the message set out, in ns of the wall clock."""
+Receive = Callable[[bytes, int, bool], None]
+"""Called with CDR bytes, the time at which the message set out, in ns of the wall clock, and whether it is known to
+come after the topic's last one, as that is of the same publisher."""
+
+_MOST_LOST = 100
+"""A number that is higher by more is rather another publisher's."""
 
 MOST_KEPT = 5000
 """Messages that a subscription without a depth holds: the default of Fast DDS."""
@@ -39,6 +44,9 @@ _ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of what a native thread calls to take messages, and to forget why it could not."""
+
+_LOOK_S = 0.25
+"""The longest time between two looks at the clocks, in seconds."""
 
 
 class RawSubscription:
@@ -66,6 +74,9 @@ class RawSubscription:
         self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
         self._node = node
         self._subscription = subscription
+        self._number = 0
+        self.follows = False
+        """Whether the message that was last taken comes after the one before, as both are of the same publisher."""
         self.handle = subscription.handle
         self._message_class = message_class
 
@@ -85,6 +96,8 @@ class RawSubscription:
         if taken is None:
             return None
         cdr, info = taken
+        before, self._number = self._number, info["publication_sequence_number"]  # each publisher counts its messages
+        self.follows = 0 < self._number - before <= _MOST_LOST
         sent, received = info["source_timestamp"], info["received_timestamp"]  # 0 if unknown to the middleware
         return cdr, min(sent or received, received or sent) or wall_ns()
 
@@ -174,11 +187,13 @@ class Arrivals:
 class MessageThread:
     """Passes the messages of subscriptions to the functions set by `serve`. It starts once and stops once.
 
-    `failed` is called with what they raise. Stopping serves what has arrived by then.
+    `failed` is called with what they raise. `freshness` is that of the messages. Stopping serves what has arrived by
+    then.
     """
 
-    def __init__(self, failed: Callable[[Exception], None]) -> None:
+    def __init__(self, failed: Callable[[Exception], None], freshness: Freshness) -> None:
         """Raises one of `RCL_ERRORS`."""
+        self._freshness = freshness
         self._receive: dict[RawSubscription, Receive] = {}
         self._failed = failed
         self._arrivals = Arrivals([])
@@ -187,9 +202,11 @@ class MessageThread:
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     @classmethod
-    def serving(cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None]) -> MessageThread:
+    def serving(
+        cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None], freshness: Freshness
+    ) -> MessageThread:
         """Return a started thread that serves these. Raises one of `RCL_ERRORS`."""
-        thread = cls(failed)
+        thread = cls(failed, freshness)
         with ExitStack() as opening:
             opening.callback(thread._arrivals.close)
             thread.serve(receive)  # announces at once what has arrived by now
@@ -240,7 +257,10 @@ class MessageThread:
 
     def _run(self) -> None:
         while not self._stopping:
-            for subscription in self._arrivals.wait():
+            arrived = self._arrivals.wait(_LOOK_S)
+            now = boottime_ns()
+            self._freshness.look(wall_ns(), now)
+            for subscription in arrived:
                 self._do_tasks()
                 if subscription in self._receive:
                     self._serve(subscription)
@@ -258,13 +278,13 @@ class MessageThread:
             try:
                 if (message := subscription.take()) is None:
                     return
-                receive(*message)
+                receive(*message, subscription.follows)
             except Exception as error:  # noqa: BLE001 a bug of the router is reported, and receiving goes on
                 self._failed(error)
         self._arrivals.again(subscription)
 
     def _pass_on(self, receive: Receive, message: tuple[bytes, int]) -> None:
         try:
-            receive(*message)
+            receive(*message, False)
         except Exception as error:  # noqa: BLE001 as above
             self._failed(error)

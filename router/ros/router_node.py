@@ -9,6 +9,7 @@ from functools import partial
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
+from router.engine.freshness import Freshness
 from router.errors import SourceSpan, StartError
 from router.ros.endpoints import Publication, RosChange, Subscription, hand_over, left_by, opened_beside
 from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
@@ -51,6 +52,7 @@ class RouterNode:
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
+        self.freshness = Freshness()
         self._is_stuck = False
         self._is_left = False  # a thread uses subscriptions or publishers
         self._failed: Callable[[Exception], None] | None = None
@@ -149,7 +151,7 @@ class RouterNode:
         self._receive(change.subscriptions, receive)
         self._use(change)
         for topic, cdr, sent_at in more:
-            receive[topic](cdr, sent_at)
+            receive[topic](cdr, sent_at, False)
 
     def watch(self, change: RosChange) -> None:
         """Wait for events of the endpoints in use: `wanted` follows new subscribers from now on."""
@@ -178,7 +180,7 @@ class RouterNode:
                 self._messages.serve(served)
             elif served:
                 assert self._failed is not None  # noqa: S101 - set by `start`
-                self._messages = MessageThread.serving(served, self._failed)
+                self._messages = MessageThread.serving(served, self._failed, self.freshness)
         except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"ROS messages cannot be received: {error}") from error
 

@@ -292,26 +292,30 @@ DEFAULT_REPEAT = Located(100_000_000, SourceSpan("the default"))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeadmanKeys:
-    """The keys that the deadmen of routes and of gateways have in common. Durations in ns."""
+    """The keys that the deadmen of routes and of gateways have in common. Durations in ns.
+
+    `because` is the reason of what looks like a mistake.
+    """
 
     timeout: Annotated[Located[int], DURATION]
     repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
     at_start: Annotated[bool, AT_START] = True
+    because: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Deadman(DeadmanKeys):
     """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
 
-    `span` is the key `deadman`. `disarmed_by` are payload cases. `at_start` says whether it is sent when the router
-    starts as well.
+    `span` is the key `deadman`. `disarmed_by` are payload cases; None if the table does not say. `at_start` says
+    whether it is sent when the router starts as well.
     """
 
     span: SourceSpan
     case: Located[str]
     fields: FieldMap
     to: tuple[Located[str], ...]
-    disarmed_by: tuple[Located[str], ...] = ()
+    disarmed_by: tuple[Located[str], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,8 @@ a publisher, {"topic": ..., "message": {...}} for a message, {"result": ...} for
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import threading
 from collections.abc import Mapping
@@ -14,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from queue import Queue
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, cast
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -37,10 +39,14 @@ class RosPeer:
     """`with RosPeer({"imu_data": "comms/msg/ImuSensorInformation"}) as peer:`; each topic has its publisher by then.
 
     It publishes as well. A topic may have several publishers, each with a name; without one it is the topic's.
+    `environment` is what its own differs in: then nothing is loaded before.
     """
 
-    def __init__(self, topics: Mapping[str, str] | None = None) -> None:
-        self._process = ForkedProcess(__file__, json.dumps(dict(topics or {})))
+    def __init__(
+        self, topics: Mapping[str, str] | None = None, *, environment: Mapping[str, str] | None = None
+    ) -> None:
+        arguments = __file__, json.dumps(dict(topics or {}))
+        self._process = _alone(arguments, environment) if environment else ForkedProcess(*arguments)
         self._arrivals: Queue[Arrival] = Queue()
         self._results: Queue[Any] = Queue()
         self._matches: Queue[str] = Queue()
@@ -110,6 +116,17 @@ class RosPeer:
         self._process.stdin.write(json.dumps({"command": command, "name": name, **details}) + "\n")
         self._process.stdin.flush()
         return self._results.get(timeout=PATIENCE)
+
+
+def _alone(arguments: tuple[str, str], environment: Mapping[str, str]) -> ForkedProcess:
+    process = subprocess.Popen(
+        [sys.executable, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
+    return cast("ForkedProcess", process)  # as far as it is used
 
 
 def main() -> None:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import os
 import queue
+import re
 import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from time import monotonic_ns
+from time import CLOCK_BOOTTIME
 
 import pytest
 
 from router.app.timers import TimerThread
+from router.clock import boottime_ns
+from router.threads import Alarm
 
 MS = 1_000_000
 HOUR = 3600 * 1000 * MS
@@ -81,7 +84,7 @@ def running() -> Iterator[Running]:
 
 def test_what_is_due_at_the_start_is_done(running: Running) -> None:
     bell = Bell(running.rung)
-    bell.next_due = monotonic_ns()
+    bell.next_due = boottime_ns()
     running.thread.add(bell)
     running.start()
     assert running.heard() == "bell"
@@ -111,11 +114,11 @@ def test_a_timer_is_added_while_another_one_is_stuck(running: Running) -> None:
 def test_a_locked_call_that_brings_something_nearer_wakes_the_thread(running: Running) -> None:
     bell = Bell(running.rung)
     ring_at = running.thread.locked(bell, bell.ring_at)
-    ring_at(monotonic_ns() + HOUR)
+    ring_at(boottime_ns() + HOUR)
     running.start()
     for _ in range(50):
-        ring_at(monotonic_ns() + HOUR)
-        ring_at(monotonic_ns())
+        ring_at(boottime_ns() + HOUR)
+        ring_at(boottime_ns())
         assert running.heard() == "bell"
     assert running.failures.empty()
 
@@ -126,7 +129,7 @@ def test_what_another_timer_is_handed_wakes_the_thread_too(running: Running) -> 
     running.thread.add(second)
     hand_on = running.thread.locked(first, second.ring_at)
     running.start()
-    hand_on(monotonic_ns())
+    hand_on(boottime_ns())
     assert running.heard() == "second"
 
 
@@ -140,7 +143,7 @@ def test_what_a_timer_hands_on_when_it_is_due_is_seen_to(running: Running) -> No
             second.ring_at(now)
 
     first = HandsOn(running.rung, "first")
-    first.next_due = monotonic_ns()
+    first.next_due = boottime_ns()
     running.thread.add(second)
     running.thread.add(first)
     running.start()
@@ -149,7 +152,7 @@ def test_what_a_timer_hands_on_when_it_is_due_is_seen_to(running: Running) -> No
 
 def test_timers_are_served_in_the_order_of_their_times(running: Running) -> None:
     names = ["third", "first", "second"]
-    now = monotonic_ns()
+    now = boottime_ns()
     for name, delay in zip(names, (200, 40, 120), strict=True):
         bell = Bell(running.rung, name)
         running.thread.locked(bell, bell.ring_at)(now + delay * MS)
@@ -163,16 +166,16 @@ def test_nothing_is_done_before_its_time(running: Running) -> None:
     ring_at = running.thread.locked(bell, bell.ring_at)
     running.start()
     for delay in (0, 1, 10, 50):
-        time = monotonic_ns() + delay * MS
+        time = boottime_ns() + delay * MS
         ring_at(time)
         running.heard()
-        assert monotonic_ns() >= time
+        assert boottime_ns() >= time
 
 
 def test_a_failure_is_handed_over_and_the_other_timers_are_served(running: Running) -> None:
     broken, sound = Bell(running.rung, "broken"), Bell(running.rung, "sound")
     broken.error = LookupError("a bug")
-    broken.next_due = sound.next_due = monotonic_ns()
+    broken.next_due = sound.next_due = boottime_ns()
     running.thread.add(sound)
     running.thread.add(broken)
     running.start()
@@ -183,14 +186,14 @@ def test_a_failure_is_handed_over_and_the_other_timers_are_served(running: Runni
 def test_a_timer_that_failed_is_tried_again_but_not_all_the_time(running: Running) -> None:
     broken = Bell(running.rung)
     broken.error = LookupError("a bug")
-    broken.next_due = begun = monotonic_ns()
+    broken.next_due = begun = boottime_ns()
     running.thread.add(broken)
     running.start()
     for _ in range(3):
         assert isinstance(running.failures.get(timeout=PATIENCE), LookupError)
     broken.error = None
     running.thread.stop()
-    assert 3 + running.failures.qsize() <= 1 + (monotonic_ns() - begun) / (100 * MS)
+    assert 3 + running.failures.qsize() <= 1 + (boottime_ns() - begun) / (100 * MS)
 
 
 def test_a_locked_call_returns_and_raises_what_the_call_does(running: Running) -> None:
@@ -210,7 +213,7 @@ def test_no_two_calls_happen_at_once(running: Running) -> None:
 
     def hammer(index: int) -> None:
         for _ in range(2000):
-            ring_at[index % 2](monotonic_ns())
+            ring_at[index % 2](boottime_ns())
 
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
@@ -230,9 +233,9 @@ def test_stopping_does_not_wait_for_what_is_due_later(running: Running, due: int
     ring_at = running.thread.locked(bell, bell.ring_at)
     running.thread.start()
     if due is not None:
-        ring_at(monotonic_ns() + due)
+        ring_at(boottime_ns() + due)
     running.thread.stop()
-    ring_at(monotonic_ns())  # can still be called, and nothing comes of it
+    ring_at(boottime_ns())  # can still be called, and nothing comes of it
     assert (running.heard(), running.rung.empty()) == ("bell ends", True)
 
 
@@ -273,14 +276,34 @@ def test_a_wall_clock_that_is_set_back_delays_nothing(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", waits], env=environment, timeout=2 * PATIENCE, check=True)
 
 
+def test_deadlines_are_of_the_boot_clock_as_after_a_suspend() -> None:
+    """Nobody may suspend the machine for a test. In this namespace the boot clock is ahead, as after a suspend."""
+    waits = f"import {__name__} as tests; tests.wait_for_a_bell(); tests.show_timers()"
+    command = ["unshare", "--time", "--boottime", "100000", sys.executable, "-c", waits]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    if os.geteuid() != 0:
+        pytest.skip("only root makes namespaces")
+    done = subprocess.run(command, env=environment, timeout=2 * PATIENCE, check=True, capture_output=True, text=True)
+    assert done.stdout.split() == [f"{CLOCK_BOOTTIME}"]
+
+
+def show_timers() -> None:
+    """Print the clock of each timer of this process. A suspend does not stop those of CLOCK_BOOTTIME alone."""
+    alarm = Alarm()
+    for info in Path("/proc/self/fdinfo").iterdir():
+        with suppress(FileNotFoundError):  # that of the directory
+            print(*re.findall(r"^clockid: (\d+)$", info.read_text(), re.MULTILINE))
+    alarm.close()
+
+
 def wait_for_a_bell() -> None:
     """In a process of its own, without queues: they wait as locks do."""
     with ExitStack() as stack:
         running = Running(stack)
         bell = Bell(running.rung)
-        bell.next_due = monotonic_ns() + 10 * MS
+        bell.next_due = boottime_ns() + 10 * MS
         running.thread.add(bell)
         running.start()
-        deadline = monotonic_ns() + PATIENCE * 1000 * MS
+        deadline = boottime_ns() + PATIENCE * 1000 * MS
         while running.rung.empty():
-            assert monotonic_ns() < deadline, "it never rang"
+            assert boottime_ns() < deadline, "it never rang"

@@ -5,9 +5,11 @@
 #include <stdint.h>
 #include <time.h>
 
-extern int64_t seam_monotonic, seam_wall;
+extern int64_t seam_boottime, seam_wall;
 
-static inline int64_t clock_read(clockid_t clock) { return clock == CLOCK_REALTIME ? seam_wall : seam_monotonic; }
+static inline int64_t clock_read(clockid_t clock) { return clock == CLOCK_REALTIME ? seam_wall : seam_boottime; }
+
+static inline int64_t boottime_ns(void) { return clock_read(CLOCK_BOOTTIME); }
 
 static inline int64_t monotonic_ns(void) { return clock_read(CLOCK_MONOTONIC); }
 

@@ -4,7 +4,7 @@
 #include "receive.c"
 #include "seams.c"
 
-int64_t seam_monotonic, seam_wall;
+int64_t seam_boottime, seam_wall;
 
 void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, size_t size, uint32_t address, uint32_t port,
                  int64_t arrived_at);

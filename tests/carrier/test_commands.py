@@ -13,7 +13,7 @@ from time import monotonic, sleep
 import pytest
 
 from router.carrier.commands import NativeCommands
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, run_program
@@ -209,14 +209,14 @@ def test_a_brake_leaves_behind_the_last_command_and_commands_of_others_disarm_it
     board = commanding.boards["driving_board"]
     commanding.subscriptions["drive"].put(drive(1), wall_ns())
     wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.deadmen_serve(deadmen, monotonic_ns() + SECOND)
+    commanding.library.deadmen_serve(deadmen, boottime_ns() + SECOND)
     command, brake = board.received()
     assert of(command) == 1
     assert brake == commanding.program.deadmen[0].datagrams[0][1]
     commanding.subscriptions["arm"].put(arm(1), wall_ns())
     wait_until(lambda: commanding.count("messages_received", "arm_ctrl", "arm"))
     assert len(board.received()) == 2
-    commanding.library.deadmen_serve(deadmen, monotonic_ns() + 10 * SECOND)
+    commanding.library.deadmen_serve(deadmen, boottime_ns() + 10 * SECOND)
     assert board.received() == []
 
 
@@ -224,7 +224,7 @@ def test_a_stale_command_feeds_no_deadman(opened: Open) -> None:
     commanding = opened()
     commanding.subscriptions["drive"].put(drive(1), wall_ns() - SECOND)
     wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.deadmen_serve(commanding.deadmen.address, monotonic_ns() + SECOND)
+    commanding.library.deadmen_serve(commanding.deadmen.address, boottime_ns() + SECOND)
     assert commanding.boards["driving_board"].received() == []
 
 

@@ -6,8 +6,12 @@ import ctypes
 import errno
 import gc
 import os
+import re
 import socket
+import subprocess
+import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
@@ -24,7 +28,7 @@ from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.program import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
-from router.clock import monotonic_ns
+from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from router.engine.deadman import Deadman
@@ -324,9 +328,9 @@ def test_a_command_is_sent_or_raises_what_python_would(side: NativeSide, outlet:
     for feeds in ([], [(deadman, False)]):
         command = side.deadmen.command(cast("NativeSender", outlet), feeds)
         assert command(b"dr\0ve", None) == 5
-        assert command(b"drive", monotonic_ns() + 60_000 * MS) == 5
+        assert command(b"drive", boottime_ns() + 60_000 * MS) == 5
         with pytest.raises(Stale):
-            command(b"too late", monotonic_ns() - 1)
+            command(b"too late", boottime_ns() - 1)
         outlet.breaks(is_broken=True)
         with pytest.raises(OSError, match=os.strerror(errno.ENOTSOCK)):
             command(b"lost", None)
@@ -337,7 +341,7 @@ def test_a_command_is_sent_or_raises_what_python_would(side: NativeSide, outlet:
 def test_a_stale_command_feeds_nothing(side: NativeSide, outlet: Outlet) -> None:
     command = side.deadmen.command(cast("NativeSender", outlet), [(side.add(PLAN), False)])
     with pytest.raises(Stale):
-        command(b"too late", monotonic_ns() - 1)
+        command(b"too late", boottime_ns() - 1)
     assert side.next_due == NEVER
 
 
@@ -352,7 +356,7 @@ def test_a_command_that_waits_for_the_lock_until_it_is_stale_is_not_sent(
     side: NativeSide, outlet: Outlet, seams: ctypes.CDLL
 ) -> None:
     command = side.deadmen.command(cast("NativeSender", outlet), [(side.add(PLAN), False)])
-    expires = monotonic_ns() + 50 * MS
+    expires = boottime_ns() + 50 * MS
     outcome: list[object] = []
 
     def send() -> None:
@@ -364,7 +368,7 @@ def test_a_command_that_waits_for_the_lock_until_it_is_stale_is_not_sent(
     seams.seam_lock(side.deadmen.address)
     thread = threading.Thread(target=send)
     thread.start()
-    while monotonic_ns() <= expires:
+    while boottime_ns() <= expires:
         pass
     seams.seam_unlock(side.deadmen.address)
     thread.join()
@@ -392,7 +396,7 @@ def test_what_a_command_feeds_lives_as_long_as_the_command(side: NativeSide, out
     command = side.deadmen.command(cast("NativeSender", outlet), [(side.add(open_plan(timeout=1)), False)])
     gc.collect()
     command(b"drive", None)
-    side.serve(monotonic_ns() + MS)
+    side.serve(boottime_ns() + MS)
     assert ("tripped", "drive", "", 0) in side.events()
 
 
@@ -411,7 +415,7 @@ def test_commands_leave_the_timer_alone_and_it_wakes_whoever_waits(
     tripped = False
     while not tripped:
         assert readable(timer, 10)
-        now = monotonic_ns()
+        now = boottime_ns()
         side.serve(now)
         tripped = ("tripped", "drive", "", 0) in side.events()
         assert tripped == (now >= due)
@@ -451,3 +455,22 @@ def test_without_room_for_events_the_oldest_are_dropped(
 )
 def test_no_old_command_leaves_behind_a_brake(tmp_path: Path, sanitizers: str) -> None:
     run_program("brakes", tmp_path, 3000 if sanitizers else 1000, sanitizers=sanitizers)
+
+
+def test_the_timer_counts_a_suspend(side: NativeSide, seams: ctypes.CDLL) -> None:
+    info = Path(f"/proc/self/fdinfo/{seams.seam_timer(side.deadmen.address)}").read_text()
+    assert re.findall(r"^clockid: (\d+)$", info, re.MULTILINE) == [str(time.CLOCK_BOOTTIME)]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes namespaces")
+def test_ages_and_deadlines_are_of_the_clock_that_counts_a_suspend() -> None:
+    """Where that clock is ahead of the monotonic one, as it is after a suspend: nobody may suspend the machine here."""
+    tests = (
+        test_a_command_is_sent_or_raises_what_python_would.__name__,
+        test_a_stale_command_feeds_nothing.__name__,
+        test_commands_leave_the_timer_alone_and_it_wakes_whoever_waits.__name__,
+    )
+    pytest_alone = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    chosen = [f"{__file__}::{name}" for name in tests]
+    command = ["unshare", "--time", "--boottime", "100000", *pytest_alone, *chosen]
+    subprocess.run(command, check=True)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier import structures as c
-from router.engine.freshness import MEMORY, TOLERANCE, Freshness
+from router.engine.freshness import MEMORY, TOLERANCE, Born, Freshness
 from router.engine.pacing import RateLimit
 
 _MOST_BYTES = 4096
@@ -28,20 +28,32 @@ class Native:
         self._library = library
         self._structure = ctypes.create_string_buffer(_MOST_BYTES)
 
-    def born(self, stamp: int, received_at: int, now: int) -> int:
-        return int(self._library.freshness_born(self._structure, stamp, received_at, now))
+    def look(self, received_at: int, now: int) -> None:
+        self._library.freshness_look(self._structure, received_at, now)
+
+    def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
+        known = -(1 << 63) if not_before is None else not_before
+        found = self._library.freshness_born(self._structure, stamp, received_at, now, known)
+        return Born(found.oldest, found.youngest)
 
 
-@given(steps=st.lists(st.tuples(spans.map(abs), spans, st.booleans(), spans), max_size=120))
+@given(steps=st.lists(st.tuples(spans.map(abs), spans, st.booleans(), spans, st.none() | spans), max_size=120))
 def test_the_age_of_messages_while_the_wall_clock_jumps(
-    library: ctypes.CDLL, steps: list[tuple[int, int, bool, int]]
+    library: ctypes.CDLL, steps: list[tuple[int, int, bool, int, int | None]]
 ) -> None:
+    """The last of each step is how long before now the message was at most; None: only the clocks are looked at."""
     python, native, now, ahead = Freshness(), Native(library), 10**12, 10**18
-    for passed, jump, jumps, age in steps:
+    for passed, jump, jumps, age, known in steps:
         now = min(now + passed, 10**18)
         ahead = max(-(10**18), min(ahead + jump * jumps, 2 * 10**18))
         received_at = now + ahead
-        assert native.born(received_at - age, received_at, now) == python.born(received_at - age, received_at, now)
+        if known is None:
+            native.look(received_at, now)
+            python.look(received_at, now)
+            continue
+        for not_before in (None, now - known):
+            event = received_at - age, received_at, now, not_before
+            assert native.born(*event) == python.born(*event)
 
 
 @given(

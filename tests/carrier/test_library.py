@@ -32,7 +32,10 @@ Choose = Callable[[str], "ctypes.CDLL | None"]
 
 def kind(declared: str) -> type | None:
     """The type that ctypes has for that of a parameter, with its name, or of a function."""
-    return ctypes.c_void_p if "*" in declared else KINDS[declared.split(maxsplit=1)[0]]
+    if "*" in declared:
+        return ctypes.c_void_p
+    first, *more = declared.split()
+    return STRUCTURES[more[0]] if first == "struct" else KINDS[first]
 
 
 def test_functions_are_declared_as_in_the_headers() -> None:
@@ -141,7 +144,14 @@ typedef struct {
     uint8_t *buffer; size_t buffer_length; size_t buffer_capacity; rcutils_allocator_t allocator;
 } rcutils_uint8_array_t;
 """,
-    "rmw/types.h": "typedef struct { int64_t source_timestamp, received_timestamp; } rmw_message_info_t;",
+    "rmw/types.h": """
+#define RMW_GID_STORAGE_SIZE 16u
+typedef struct { const char *implementation_identifier; uint8_t data[RMW_GID_STORAGE_SIZE]; } rmw_gid_t;
+typedef struct {
+    int64_t source_timestamp, received_timestamp; uint64_t publication_sequence_number, reception_sequence_number;
+    rmw_gid_t publisher_gid;
+} rmw_message_info_t;
+""",
 }
 """Headers like those of rcl, as far as they are used."""
 
@@ -154,6 +164,8 @@ typedef struct {
         ("*allocate, *deallocate", "*deallocate, *allocate"),
         ("source_timestamp, received_timestamp", "received_timestamp, source_timestamp"),
         ("[1024]", "[2048]"),
+        ("uint64_t publication_sequence_number, reception_sequence_number;", "uint64_t sequence_number;"),
+        ("16u", "24u"),
     ],
 )
 def test_other_headers_of_rcl_are_noticed(ours: str, theirs: str, tmp_path: Path) -> None:

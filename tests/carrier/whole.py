@@ -26,6 +26,7 @@ from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import PartEngine
 from router.engine.binding import State
+from router.engine.freshness import Born
 from router.engine.pacing import RateLimit
 from router.types.framing import MAX_DATAGRAM
 from tests.carrier.building import sanitizing
@@ -171,7 +172,7 @@ class Whole:
     ) -> None:
         self._library, self._program = loaded, made
         self._names = Names()
-        self._clock, self._wall = (c_int64.in_dll(loaded, name) for name in ("seam_monotonic", "seam_wall"))
+        self._clock, self._wall = (c_int64.in_dll(loaded, name) for name in ("seam_boottime", "seam_wall"))
         self._rig = Rig(made, unwanted)  # for its timers and topics
         size = len(made.counters.fresh_counts())
         self._counts, self._publish_counts = (c_int64 * size)(), (c_int64 * size)()
@@ -234,7 +235,7 @@ class Whole:
     def receive(self, data: bytes, peer: tuple[str, int], listener: str, arrived_before: int) -> None:
         """`arrived_before` in ns. Then Python serves what it is handed."""
         address = int.from_bytes(socket.inet_aton(peer[0]), "big")
-        arrived_at = Rig.WALL + self._rig.now - arrived_before
+        arrived_at = self._rig.wall(self._rig.now - arrived_before)
         number = self._numbers[listener]
         self._library.seam_handle(self._carrier, number, data, len(data), address, peer[1], arrived_at)
         self._events.take()
@@ -258,13 +259,17 @@ class Whole:
         self._set_clocks()
         self._collect()
 
+    def set_clock(self, by: int) -> None:
+        self._rig.set_clock(by)
+        self._set_clocks()
+
     def counts(self) -> list[int]:
         """Those of all threads."""
         of_threads = zip(self._counts, self._publish_counts, self._rig.counts, strict=True)
         return [sum(counts) for counts in of_threads]
 
     def _set_clocks(self) -> None:
-        self._clock.value, self._wall.value = self._rig.now, Rig.WALL + self._rig.now
+        self._clock.value, self._wall.value = self._rig.now, self._rig.wall(self._rig.now)
 
     def _collect(self) -> None:
         for name, destination in self._destinations.items():
@@ -322,7 +327,7 @@ class Whole:
             payload = bytes(records[first : first + record.payload_length]) if record.is_single else None
             function, waiting = self._functions[part][self._native.handlers[record.handler].route]
             source = self._native.sources[record.column]
-            function(payload, datagram, record.received_at, record.now, source, record.born)
+            function(payload, datagram, record.received_at, record.now, source, Born(record.oldest, record.youngest))
             for index in waiting:
                 self._rig.counts[index] -= 1
             position += record.size
@@ -380,6 +385,10 @@ class Comparison:
         )
         for each in (python, carrier):
             each.pass_time(passes)
+        if noise.random() < 0.03:
+            by = noise.choice((-1, 1)) * noise.choice((3 * MS, 50 * MS, noise.randrange(600 * MS), 3600 * 1000 * MS))
+            for each in (python, carrier):
+                each.set_clock(by)
         data, peer, listener = self.datagram(), noise.choice(PEERS), noise.choice(("trimmed", "exact"))
         python.arrived_before = noise.choice((0, noise.randrange(250 * MS)))
         python.receive(data, peer, listener)

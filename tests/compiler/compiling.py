@@ -13,7 +13,7 @@ from router.compiler.program import Handler, Program
 from router.compiler.source import Source
 from router.engine.binding import bind
 from router.engine.delivery import MAPPING_FAILURES
-from router.engine.freshness import Freshness
+from router.engine.freshness import Born, Freshness
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
@@ -124,5 +124,5 @@ class Published:
         """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""
         for made in (self.reports, self.sent, self._published):
             made.clear()
-        self._handle(message, DATAGRAM, RECEIVED_AT, 1, SOURCE, *((1,) if self._is_aged else ()))
+        self._handle(message, DATAGRAM, RECEIVED_AT, 1, SOURCE, *((Born(1, 1),) if self._is_aged else ()))
         return dict(self._published)

@@ -113,7 +113,8 @@ def test_only_who_commands_the_same_endpoint_can_take_over(
     check_text: CheckText, to: str, cases: str, codes: list[Code]
 ) -> None:
     found = check_text(TURNS.format(to=to, cases=cases), endpoints=THREE).diagnostics
-    assert [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE] == codes
+    apart = {Code.UNCOVERED_PAYLOAD_CASE, Code.DOUBTFUL_DEADMAN}  # it need not stop the board here
+    assert [finding.code for finding in found if finding.code not in apart] == codes
 
 
 def test_a_broken_route_is_not_blamed_for_what_it_would_take_over(check_text: CheckText) -> None:
@@ -170,7 +171,8 @@ def test_a_deadman_floods_nobody(check_text: CheckText, repeat: str, accepted: b
 def test_no_command_waits_until_after_the_deadman_has_tripped(
     check_text: CheckText, destination: str, ttl: str | None, accepted: bool
 ) -> None:
-    route = ROUTE.format(destinations=destination, deadman=BRAKE) + (f"    ttl: {ttl}\n" if ttl else "")
+    deadman = BRAKE.replace("[board]", "[board, paced]")
+    route = ROUTE.format(destinations=destination, deadman=deadman) + (f"    ttl: {ttl}\n" if ttl else "")
     endpoints = (
         "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
         " paced: {address: 127.0.0.4:8, kind: board, bandwidth: 10kB/s}}"
@@ -178,3 +180,64 @@ def test_no_command_waits_until_after_the_deadman_has_tripped(
     found = check_text(route, endpoints=endpoints).diagnostics
     codes = [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE]
     assert codes == ([] if accepted else [Code.BAD_VALUE])
+
+
+@pytest.mark.parametrize(
+    ("deadman", "ttl", "doubts"),
+    [
+        ("timeout: 10s", "10s", 0),
+        ("timeout: 10001ms", "1s", 1),
+        ("timeout: 20ms", "20ms", 0),
+        ("timeout: 19999us", "19ms", 1),
+        ("timeout: 200ms, repeat: 400ms", "200ms", 0),
+        ("timeout: 200ms, repeat: 401ms", "200ms", 1),
+        ("timeout: 30ms, repeat: 100ms", "30ms", 0),
+        ("timeout: 200ms", "201ms", 1),
+        ("timeout: 1ms, repeat: 101ms, to: base", "1s", 4),
+        ("timeout: 1ms, repeat: 101ms, to: base, because: it is a test", "1s", 0),
+    ],
+)
+def test_what_looks_like_a_mistake_is_a_warning_unless_a_reason_stands_there(
+    check_text: CheckText, deadman: str, ttl: str, doubts: int
+) -> None:
+    route = ROUTE.format(destinations="board", deadman=f"{{{deadman}, send: {{manual_brake: {{brake: true}}}}}}")
+    found = check_text(f"{route}    ttl: {ttl}\n").diagnostics
+    codes = [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE]
+    assert codes == doubts * [Code.DOUBTFUL_DEADMAN]
+
+
+BESIDE = """
+routes:
+  manual_drive:
+    source: base
+    destinations: [{destinations}]
+    deadman: {{timeout: 500ms, send: {{manual_brake: {{}}}}{drive}}}
+  manual_arm:
+    source: base
+    destinations: [board]
+    deadman: {{{arm}}}
+"""
+ARM = "timeout: 500ms, send: {manual_arm: {}}"
+
+
+@pytest.mark.parametrize(
+    ("destinations", "drive", "arm", "places"),
+    [
+        ("board", "", ARM, ["manual_arm", "manual_drive"]),
+        ("board", ", disarmed_by: manual_arm", ARM, ["manual_drive"]),
+        ("board", ", disarmed_by: manual_arm", f"{ARM}, disarmed_by: []", []),
+        ("board", ", disarmed_by: []", f"{ARM}, because: it is a test", []),
+        ("board", ", disarmed_by: manual_arm", f"{ARM}, disarmed_by: manual_drive", []),
+        ("board", "", "none: it stays where it is", []),
+        ("tool", "", ARM, []),
+    ],
+)
+def test_deadmen_of_one_board_know_each_other(
+    check_text: CheckText, destinations: str, drive: str, arm: str, places: list[str]
+) -> None:
+    """Else one cuts into commands of the other route: `places` are the cases of these."""
+    table = BESIDE.format(destinations=destinations, drive=drive, arm=arm)
+    found = [each for each in check_text(table, endpoints=THREE).diagnostics if each.code is Code.DOUBTFUL_DEADMAN]
+    assert [each.message for each in found] == [
+        f"it would cut into commands of '{case}', which 'board' gets too" for case in places
+    ]

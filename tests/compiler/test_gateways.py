@@ -139,7 +139,7 @@ def test_gateways_do_not_send_to_each_other(check_text: CheckText) -> None:
         (f"{{{TWIST}, max_rate: 2, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.BAD_VALUE]),
         (f"{{{TWIST}, max_rate: 2.1, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
         (f"{{{TWIST}, deadman: {{timeout: 500ms, send: {{}}, repeat: 9ms}}}}", [Code.BAD_VALUE]),
-        (f"{{{TWIST}, ttl: 5s, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
+        (f"{{{TWIST}, ttl: 5s, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.DOUBTFUL_DEADMAN]),
         (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.w: 0}}}}}}", [Code.UNKNOWN_FIELD]),
         (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: y}}}}}}", [Code.UNKNOWN_FIELD]),
         (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: received_at}}}}}}", [Code.UNKNOWN_FIELD]),

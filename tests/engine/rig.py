@@ -18,6 +18,7 @@ from router.engine import InboundEngine, OutboundEngine, Report
 from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import FrameOutcome, Outcome
+from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import Timer
 from tests.tables import PROTOS
@@ -124,9 +125,9 @@ class Ledger:
 class Rig:
     """An engine and everything that came out of it.
 
-    `failures` makes an outlet raise, by endpoint or topic. `now` is the monotonic clock in ns, the wall
-    clock is `WALL` ahead of it; every call of an outlet takes `work_ns`. `unwanted` topics have no subscriber.
-    `changes` has what deadmen said. One thread does everything here, so one list has all counts.
+    `failures` makes an outlet raise, by endpoint or topic. `now` is the boot clock in ns, the wall
+    clock is `WALL` ahead of it until it is set; every call of an outlet takes `work_ns`. `unwanted` topics have no
+    subscriber. `changes` has what deadmen said. One thread does everything here, so one list has all counts.
     """
 
     WALL = 1_700_000_000_000_000_000
@@ -137,6 +138,7 @@ class Rig:
         self.ledger = Ledger(made, self.counts)
         self.now = 0
         self.work_ns = 0
+        self._settings = [(0, self.WALL)]  # since when the wall clock is by how much ahead
         self.sent: list[tuple[str, bytes]] = []
         self.published: list[tuple[str, bytes]] = []
         self.reports: list[Report] = []
@@ -158,7 +160,7 @@ class Rig:
             wanted=self.wanted,
             report=self.reports.append,
             clock_ns=lambda: self.now,
-            wall_ns=lambda: self.WALL + self.now,
+            wall_ns=lambda: self.wall(self.now),
             pacing=group,
             holding=group,
             collecting=group,
@@ -168,19 +170,27 @@ class Rig:
             boards=made.boards,
         )
         self.arrived_before = 0
-        arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}
-        engine = InboundEngine(made, self.context, arrived_at)
+        arrived_at = {plan.name: lambda: self.wall(self.now - self.arrived_before) for plan in made.listeners}
+        engine = InboundEngine(made, self.context, arrived_at, Freshness())
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
-        outbound = OutboundEngine(made, self.context)
+        outbound = OutboundEngine(made, self.context, Freshness())
         self.takers = {plan.label: outbound.taker(plan.label) for plan in made.subscriptions}
         self.changes: list[tuple[str, bool]] = []
 
     def receive(self, data: bytes, peer: tuple[str, int] = SENSOR_BOARD, listener: str = "trimmed") -> None:
         self.receivers[listener](data, peer)
 
-    def take(self, topic: str, cdr: bytes) -> None:
-        """A ROS message, which the middleware got `arrived_before` ns ago."""
-        self.takers[topic](cdr, self.WALL + self.now - self.arrived_before)
+    def take(self, topic: str, cdr: bytes, *, follows: bool = False) -> None:
+        """A ROS message, which set out `arrived_before` ns ago, perhaps after the last one."""
+        self.takers[topic](cdr, self.wall(self.now - self.arrived_before), follows)
+
+    def wall(self, time: int) -> int:
+        """What the wall clock showed at `time`."""
+        return time + next(ahead for since, ahead in reversed(self._settings) if since <= time or not since)
+
+    def set_clock(self, by: int) -> None:
+        """Sets the wall clock forward, or back."""
+        self._settings.append((self.now, self._settings[-1][1] + by))
 
     def pass_time(self, ns: int) -> None:
         """Moves the clocks, and serves timers when they are due."""

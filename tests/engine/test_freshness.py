@@ -1,4 +1,4 @@
-"""The age of a message is that of the monotonic clock, whatever is done to the wall clock meanwhile."""
+"""The age of a message is that of the boot clock, whatever is done to the wall clock meanwhile."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.freshness import MEMORY, TOLERANCE, Freshness
+from router.engine.freshness import MEMORY, TOLERANCE, Born, Freshness
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -18,7 +18,7 @@ JUMPS = [sign * size for sign in (1, -1) for size in (50 * MS, SECOND, 2 * SECON
 
 @dataclass
 class Computer:
-    """Two clocks. `settings` has since when the wall clock is by how much ahead of the monotonic one."""
+    """Two clocks. `settings` has since when the wall clock is by how much ahead of the boot clock."""
 
     slew: float = 0.0
     now: int = 10_000 * SECOND
@@ -41,8 +41,16 @@ class Computer:
         self.settings.append((self.now, self.settings[-1][1] + by))
 
     def born(self, event: int) -> int:
-        """What the router makes of a message that was stamped at `event` and is looked at now."""
-        return self.freshness.born(self.wall(event), self.wall(self.now), self.now)
+        """The youngest reading of a message that was stamped at `event` and is looked at now."""
+        return self.readings(event).youngest
+
+    def readings(self, event: int, not_before: int | None = None) -> Born:
+        return self.freshness.born(self.wall(event), self.wall(self.now), self.now, not_before)
+
+    def find_empty(self) -> None:
+        """As the receive thread when there is nothing to receive."""
+        self.freshness.forget_past()
+        self.freshness.look(self.wall(self.now), self.now)
 
     def command_for(self, duration: int, rate: int = 50) -> None:
         """Fresh commands, each of them found to be so."""
@@ -130,7 +138,7 @@ def test_a_pause_between_reading_the_clocks_is_no_lasting_jump() -> None:
     computer = Computer()
     computer.command_for(SECOND)
     read, computer.now = computer.now, computer.now + 2 * SECOND
-    assert computer.freshness.born(computer.wall(read), computer.wall(computer.now), read) == read
+    assert computer.freshness.born(computer.wall(read), computer.wall(computer.now), read).youngest == read
     computer.command_for(SECOND)
 
 
@@ -140,10 +148,69 @@ def test_settings_are_remembered_within_bounds() -> None:
         computer.now += MS
         computer.jump(SECOND)
         computer.born(computer.now)
-    assert len(computer.freshness._past) < 100
+    assert len(computer.freshness.past) < 100
     computer.now += MEMORY + 1
     computer.born(computer.now)
-    assert len(computer.freshness._past) == 0
+    assert len(computer.freshness.past) == 0
+
+
+@pytest.mark.parametrize("jump", [*JUMPS, -3 * SECOND, 3 * SECOND])
+def test_what_waited_for_3_s_is_stale_by_its_oldest_reading_whatever_was_done_to_the_clock(jump: int) -> None:
+    """As when the router is stopped for 3 s, and the clock is set meanwhile: also by just these 3 s."""
+    for share in (0, 1, 2, 3):
+        computer = Computer()
+        computer.command_for(5 * SECOND)
+        first = computer.now
+        computer.now += share * SECOND
+        computer.jump(jump)
+        computer.now += (3 - share) * SECOND
+        not_before = None
+        for event in range(first, computer.now - 200 * MS, 20 * MS):
+            alone, in_order = computer.readings(event).oldest, computer.readings(event, not_before).oldest
+            assert alone <= event + TOLERANCE
+            assert in_order <= event + TOLERANCE
+            not_before = in_order
+
+
+@pytest.mark.parametrize("jump", JUMPS)
+def test_messages_that_are_in_order_are_never_taken_for_older_than_they_are(jump: int) -> None:
+    """As those of a ROS publisher: each is known not to be older than the one before."""
+    computer = Computer()
+    computer.command_for(5 * SECOND)
+    not_before = computer.readings(computer.now).oldest
+    computer.jump(jump)
+    for _ in range(250):
+        computer.now += 20 * MS
+        event = computer.now - 5 * MS
+        not_before = computer.readings(event, not_before).oldest
+        assert abs(not_before - event) <= 2 * TOLERANCE
+
+
+@pytest.mark.parametrize("jump", JUMPS)
+def test_what_comes_after_nothing_was_waiting_is_never_taken_for_older_than_it_is(jump: int) -> None:
+    """As datagrams: when none is waiting, those that come later were stamped later."""
+    computer = Computer()
+    computer.command_for(5 * SECOND)
+    computer.jump(jump)
+    computer.now += 30 * MS
+    computer.find_empty()  # here the jump is seen
+    computer.find_empty()
+    for _ in range(250):
+        computer.now += 20 * MS
+        event = computer.now - 5 * MS
+        assert computer.readings(event) == (event, event)
+
+
+def test_a_fresh_message_of_which_nothing_else_is_known_may_be_old_for_as_long_as_the_clock_was_set_back() -> None:
+    computer = Computer()
+    computer.command_for(5 * SECOND)
+    computer.jump(-2 * SECOND)
+    since, refused_until = computer.now, 0
+    for _ in range(250):
+        computer.now += 20 * MS
+        if computer.readings(computer.now).oldest < computer.now - TOLERANCE:
+            refused_until = computer.now
+    assert abs(since + 2 * SECOND - refused_until) <= 20 * MS + TOLERANCE
 
 
 jumps = st.just(0) | st.sampled_from(JUMPS) | st.integers(-5 * SECOND, 5 * SECOND) | st.integers(-50 * HOUR, 50 * HOUR)
@@ -166,9 +233,10 @@ def test_with_any_jumps_the_truth_or_what_a_jump_at_that_time_made_of_it_is_foun
         computer.jump(jump)
         computer.now += gap - before
         event = computer.now - delay
-        found = computer.born(event)
-        assert found <= computer.now
+        oldest, found = computer.readings(event)
+        assert oldest <= found <= computer.now
         if delay <= MEMORY:
+            assert oldest <= event + TOLERANCE
             last_look = max((look for look in looks if look < event), default=0)
             errors = [computer.setting(event) - offset for offset in computer.settings_since(last_look - TOLERANCE)]
             assert min(abs(found - event - error) for error in errors if error >= 0) <= TOLERANCE

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from router.app.parts import OF_PYTHON, Part, divided
 from router.compiler.program import Program
 from router.engine import PartEngine
+from router.engine.freshness import Born
 from tests.engine.rig import SENSOR_BOARD, PublishError, Rig, program
 from tests.engine.test_both_directions import MS, enveloped
 from tests.engine.wire import framed
@@ -51,7 +52,7 @@ class Carried:
         for part in (Part.DESTINATIONS, Part.TOPICS):
             if route in self.parts[part]:
                 serve, _ = self.parts[part][route]
-                serve(payload, datagram, Rig.WALL + self.rig.now, self.rig.now, "sensor_board", born)
+                serve(payload, datagram, Rig.WALL + self.rig.now, self.rig.now, "sensor_board", Born(born, born))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
 
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.program import GatewayPlan, Program
 from router.engine import Report
@@ -167,7 +167,7 @@ class Stage:
         loop.set_exception_handler(lambda _, context: self.faults.append(context["exception"]))
         subscriptions = Subscriptions(cast("RosTopics", self._graph), INTERFACES, loop)
         self._closing.callback(subscriptions.close)
-        self.context = GatewayContext(subscriptions, worker, self.faults.append, monotonic_ns, wall_ns)
+        self.context = GatewayContext(subscriptions, worker, self.faults.append, boottime_ns, wall_ns)
         self.played = {plan.settings.name: Played(self, plan) for plan in self._plans}
         return self
 
@@ -193,7 +193,7 @@ class Stage:
             publish_errors=(),
             feed_deadman={},
             report=self.reports.append,
-            clock_ns=monotonic_ns,
+            clock_ns=boottime_ns,
             wall_ns=wall_ns,
         )
         encoding = ENCODINGS[plan.settings.format](plan.settings)

@@ -20,7 +20,7 @@ from tests.ros.peers import wait_until
 
 DEEP = replace(RELIABLE, depth=1000)
 SPANS = {"greeting": SPAN, "farewell": SPAN}
-Take = Callable[[bytes, int], None]
+Take = Callable[[bytes, int, bool], None]
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_each_message_is_taken_once_and_in_order(speaker: RouterNode, depths: tu
 
     plans = [string_topic(replace(RELIABLE, depth=depth)) for depth in depths]
     with closing(open_ros(subscriptions=plans[:1])) as ros:
-        receive: dict[str, Take] = {"greeting": lambda data, _: got.append(data)}
+        receive: dict[str, Take] = {"greeting": lambda data, *_: got.append(data)}
         ros.start(receive, print)
         wait_until(lambda: speaker.wanted["greeting"][0])
         thread = threading.Thread(target=speak)
@@ -96,7 +96,7 @@ def test_a_change_that_fails_at_last_leaves_the_topics_as_they_were(
     speaker: RouterNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     got: list[bytes] = []
-    receive: dict[str, Take] = {"greeting": lambda data, _: got.append(data), "farewell": lambda *_: None}
+    receive: dict[str, Take] = {"greeting": lambda data, *_: got.append(data), "farewell": lambda *_: None}
     announce = RawSubscription.announce_to
 
     def fail(subscription: RawSubscription, eventfd: int | None) -> None:

@@ -62,8 +62,8 @@ class Receiver:
     def start(self) -> None:
         self.ros.start({topic: self._receiver(topic) for topic in self._topics}, self.failures.append)
 
-    def _receiver(self, topic: str) -> Callable[[bytes, int], None]:
-        def receive(data: bytes, stamp: int) -> None:
+    def _receiver(self, topic: str) -> Callable[[bytes, int, bool], None]:
+        def receive(data: bytes, stamp: int, _: bool) -> None:
             self.stamps.append(stamp)
             self.messages.append((topic, data))
 
@@ -177,7 +177,7 @@ def test_what_has_arrived_is_received_before_receiving_stops(publisher: Publish)
     first, go_on = threading.Event(), threading.Event()
     messages: list[bytes] = []
 
-    def receive(data: bytes, _: int) -> None:
+    def receive(data: bytes, *_: object) -> None:
         messages.append(data)
         first.set()
         go_on.wait()
@@ -212,7 +212,7 @@ def test_a_topic_may_be_published_and_subscribed_to_and_publishing_outlives_rece
     received: list[bytes] = []
     both = string_topic()
     with closing(open_ros(both, subscriptions=[both])) as ros, Receiver(both) as other:
-        ros.start({"greeting": lambda data, _: received.append(data)}, raising)
+        ros.start({"greeting": lambda data, *_: received.append(data)}, raising)
         wait_until(lambda: ros.wanted["greeting"][0])
         ros.publish["greeting"](HELLO)
         wait_until(lambda: received == [HELLO])
@@ -227,7 +227,7 @@ def test_what_a_receiver_raises_is_told_and_receiving_goes_on(publisher: Publish
     received: list[bytes] = []
     failures: list[Exception] = []
 
-    def receive(data: bytes, _: int) -> None:
+    def receive(data: bytes, *_: object) -> None:
         received.append(data)
         raise KeyError(len(received))
 
@@ -269,7 +269,7 @@ def test_ros_arguments_rename_subscribed_topics(publisher: Publish) -> None:
     received: list[bytes] = []
     renaming = ("--ros-args", "-r", "greeting:=salute")
     with closing(open_ros(subscriptions=[string_topic()], args=renaming)) as ros:
-        ros.start({"greeting": lambda data, _: received.append(data)}, raising)
+        ros.start({"greeting": lambda data, *_: received.append(data)}, raising)
         publisher("salute").publish([HELLO])
         wait_until(lambda: received == [HELLO])
 

@@ -102,7 +102,7 @@ def test_a_payload_of_defaults_and_a_repeat_of_its_own_are_taken(tmp_path: Path)
     text = text.replace("300 ms, send", "300 ms, repeat: 20ms, send").replace(",\n      disarmed_by: [arm_target]", "")
     deadman = route(good(tmp_path, text), "manual_drive").deadman
     assert deadman
-    assert (deadman.repeat.value, deadman.fields.entries, deadman.disarmed_by) == (20_000_000, (), ())
+    assert (deadman.repeat.value, deadman.fields.entries, deadman.disarmed_by) == (20_000_000, (), None)
 
 
 def test_names_of_routes_differ_whatever_cases_are_called(tmp_path: Path) -> None:

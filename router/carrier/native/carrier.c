@@ -84,7 +84,7 @@ void *timer_thread(void *of) {
         poll(waiting, 2, until_turn(carrier, turn));
         eventfd_t ignored;
         if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) deadmen_serve(carrier->deadmen, monotonic_ns());
+        if (waiting[0].revents) deadmen_serve(carrier->deadmen, boottime_ns());
         if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
             turn = monotonic_ns() + atomic_load(&carrier->interval);

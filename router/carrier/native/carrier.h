@@ -125,7 +125,7 @@ struct message_record {
     uint32_t size, generation;
     const struct part *part;
     int64_t received_at;  /* wall clock */
-    int64_t now, born;    /* monotonic: when it was received, and when it arrived */
+    int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct born */
     uint32_t column;      /* of the sender */
     uint32_t is_single;   /* the payload is the only field */
     uint32_t length;      /* of the datagram */

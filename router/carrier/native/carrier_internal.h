@@ -70,6 +70,12 @@ void report_send_error(struct reporter *reporter, int64_t now, uint32_t route, c
 /* Count a duration in ns in the histogram that begins at this counter. */
 void count_duration(counter *counters, uint32_t histogram, int64_t elapsed);
 
+/* When a message expires for a destination; NEVER without `ttl`. Commands to boards are as old as they can be, anything
+ * else is as young. */
+static inline int64_t destination_expiry(const struct destination *to, struct born born, int64_t ttl) {
+    return ttl ? (to->board ? born.oldest : born.youngest) + ttl : NEVER;
+}
+
 /* Check that a message that was received at `now` has not expired (NEVER: it does not), and that `max_rate` lets it
  * pass; else count it, and return false. */
 bool destination_may_send(counter *counters, const struct destination *to, int64_t now, int64_t expires);

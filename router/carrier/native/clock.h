@@ -1,4 +1,5 @@
-/* The monotonic clock, for durations, and the wall clock, for time stamps. Both in ns. */
+/* All in ns: the boot clock, for ages, deadlines and rates; the monotonic clock, for waits; the wall clock, for time
+ * stamps. While the computer is suspended the monotonic clock stands still, and the boot clock goes on. */
 #ifndef CLOCK_H
 #define CLOCK_H
 
@@ -10,6 +11,8 @@ static inline int64_t clock_read(clockid_t clock) {
     clock_gettime(clock, &now);
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
 }
+
+static inline int64_t boottime_ns(void) { return clock_read(CLOCK_BOOTTIME); }
 
 static inline int64_t monotonic_ns(void) { return clock_read(CLOCK_MONOTONIC); }
 

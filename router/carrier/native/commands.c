@@ -3,6 +3,7 @@
 #include <errno.h>
 #include <pthread.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 #include <unistd.h>
@@ -13,6 +14,14 @@
 enum {
     TURN = 32, /* messages of one topic before others have their turn */
     TOPICS_PER_WAIT = 16,
+    LOOK_MS = 250, /* the longest time between two looks at the clocks */
+    MOST_PUBLISHERS = 64,
+};
+
+/* A publisher sends its messages in order. By the oldest readings of its last message's stamps: */
+struct publisher {
+    uint8_t gid[GID_SIZE];
+    int64_t sent, stamped; /* INT64_MIN if it is not known */
 };
 
 struct commands {
@@ -32,6 +41,7 @@ struct commands {
     take_function *take;
     reset_function *reset;
     struct freshness freshness;
+    struct publisher publishers[MOST_PUBLISHERS];
     int epoll, wake;
     bool is_urgent;
     struct serialized_message message;
@@ -39,12 +49,14 @@ struct commands {
     uint8_t datagram[MOST_CONVERTED];
 };
 
-/* A message that is served: monotonic times but for `received_at`. */
+/* A message that is served. */
 struct command {
     const uint8_t *data;
     size_t size;
-    int64_t sent_at, received_at; /* wall clock */
-    int64_t now;
+    int64_t published_at, arrived_at; /* wall clock of the sender, and of this computer; 0 if it is not known */
+    int64_t received_at;              /* wall clock */
+    int64_t now;                      /* boot clock */
+    struct publisher *publisher;
 };
 
 /* ---- messages ---- */
@@ -56,8 +68,9 @@ static void lose_invalid(struct commands *commands, const struct command_route *
 }
 
 static void serve_target(struct commands *commands, const struct command_route *route,
-                         const struct command_target *target, const struct command *command, int64_t expires) {
+                         const struct command_target *target, const struct command *command, struct born born) {
     const struct destination *to = &target->destination;
+    int64_t expires = destination_expiry(to, born, route->ttl);
     if (!destination_may_send(commands->counters, to, command->now, expires)) return;
     size_t size;
     if (!datagram_write(target->writes, target->write_count, target->literals, command->data, commands->slots,
@@ -71,53 +84,80 @@ static void serve_target(struct commands *commands, const struct command_route *
     if (error && error != COMMAND_STALE) report_send_error(&commands->reporter, command->now, route->id, to, error);
 }
 
+static struct born earlier_of(struct born one, struct born other) {
+    if (other.oldest < one.oldest) one.oldest = other.oldest;
+    if (other.youngest < one.youngest) one.youngest = other.youngest;
+    return one;
+}
+
+/* When a message was sent by the sender's clock, or arrived if that is earlier: then the sender's clock is ahead. Its
+ * arrival is not known to be in order, so of that the youngest reading counts. */
+static struct born sent(struct commands *commands, const struct command *command) {
+    int64_t stamp = command->published_at ? command->published_at : command->arrived_at;
+    if (!stamp) stamp = command->received_at;
+    struct born sent = freshness_born(&commands->freshness, stamp, command->received_at, command->now,
+                                      command->publisher->sent);
+    command->publisher->sent = sent.oldest;
+    if (!command->published_at || !command->arrived_at) return sent;
+    int64_t arrived = freshness_born(&commands->freshness, command->arrived_at, command->received_at, command->now,
+                                     INT64_MIN).youngest;
+    return earlier_of(sent, (struct born){arrived, arrived});
+}
+
 /* When the message was born: when it was sent, or when it was stamped, if that is earlier. */
-static int64_t born(struct commands *commands, const struct command_route *route, const struct command *command,
-                    int64_t sent) {
+static struct born born(struct commands *commands, const struct command_route *route, const struct command *command,
+                        struct born sent) {
     if (route->seconds == NO_SLOT) return sent;
     int64_t seconds = message_integer(command->data, &commands->slots[route->seconds], SCALAR_INT32);
     int64_t nanoseconds = message_integer(command->data, &commands->slots[route->nanoseconds], SCALAR_UINT32);
     int64_t stamp = seconds * 1000000000 + nanoseconds;
     if (!stamp) return sent;
-    int64_t stamped = freshness_born(&commands->freshness, stamp, command->received_at, command->now);
-    return stamped < sent ? stamped : sent;
+    struct born stamped = freshness_born(&commands->freshness, stamp, command->received_at, command->now,
+                                         command->publisher->stamped);
+    command->publisher->stamped = stamped.oldest;
+    return earlier_of(sent, stamped);
 }
 
 static void serve_targets(struct commands *commands, const struct command_route *route, const struct command *command) {
-    /* Freshness follows the wall clock by every message. */
-    int64_t sent = 0;
-    if (route->ttl) sent = freshness_born(&commands->freshness, command->sent_at, command->received_at, command->now);
+    struct born when = {0, 0};
+    if (route->ttl) when = sent(commands, command);
     counter_add(commands->counters, route->received, 1);
     bool is_valid = message_read(route->reads, route->read_count, command->data, command->size, commands->slots);
-    int64_t expires = NEVER;
-    if (is_valid && route->ttl) expires = born(commands, route, command, sent) + route->ttl;
+    if (is_valid && route->ttl) when = born(commands, route, command, when);
     for (uint32_t index = 0; index < route->target_count; index++) {
-        if (is_valid) serve_target(commands, route, &route->targets[index], command, expires);
+        if (is_valid) serve_target(commands, route, &route->targets[index], command, when);
         else lose_invalid(commands, route, &route->targets[index], command->now);
     }
 }
 
-static void serve_message(struct commands *commands, const struct command_topic *topic, int64_t sent_at) {
+/* Return what is known of a publisher. One with the same hash is forgotten. */
+static struct publisher *find_publisher(struct commands *commands, const uint8_t *gid) {
+    uint32_t hash = 2166136261; /* FNV-1a */
+    for (int index = 0; index < GID_SIZE; index++) hash = (hash ^ gid[index]) * 16777619;
+    struct publisher *found = &commands->publishers[hash % MOST_PUBLISHERS];
+    if (memcmp(found->gid, gid, GID_SIZE)) {
+        memcpy(found->gid, gid, GID_SIZE);
+        found->sent = found->stamped = INT64_MIN;
+    }
+    return found;
+}
+
+static void serve_message(struct commands *commands, const struct command_topic *topic, const struct message_info *info) {
     struct command command = {.data = commands->message.buffer, .size = commands->message.length};
-    command.now = monotonic_ns();
+    command.now = boottime_ns();
     command.received_at = wall_ns();
-    command.sent_at = sent_at ? sent_at : command.received_at;
+    command.published_at = info->source_timestamp;
+    command.arrived_at = info->received_timestamp;
+    command.publisher = find_publisher(commands, info->publisher);
     for (uint32_t index = 0; index < topic->route_count; index++) {
         const struct command_route *route = &topic->routes[index];
         serve_targets(commands, route, &command);
         counter_set(commands->counters, route->last_message, command.received_at);
-        count_duration(commands->counters, route->duration, monotonic_ns() - command.now);
+        count_duration(commands->counters, route->duration, boottime_ns() - command.now);
     }
 }
 
 /* ---- the middleware ---- */
-
-/* When a message was sent by the sender's clock, or received by ours if that is earlier; 0 if it is not known. */
-static int64_t sent_at(const struct message_info *info) {
-    int64_t sent = info->source_timestamp, received = info->received_timestamp;
-    if (!sent || !received) return sent ? sent : received;
-    return sent < received ? sent : received;
-}
 
 /* Take a message, without the lock, and serve it. Return whether there was one. */
 static bool serve_one(struct commands *commands, const struct command_topic *topic) {
@@ -133,7 +173,7 @@ static bool serve_one(struct commands *commands, const struct command_topic *top
     pthread_mutex_lock(&commands->lock);
     if (error || commands->is_left) return false;
     edition_begin(&commands->edition);
-    serve_message(commands, topic, sent_at(&info));
+    serve_message(commands, topic, &info);
     edition_end(&commands->edition);
     return true;
 }
@@ -194,8 +234,10 @@ static bool serve_turn(struct commands *commands, const struct command_topic *to
 static void serve_arrivals(struct commands *commands) {
     struct epoll_event ready[TOPICS_PER_WAIT];
     pthread_mutex_unlock(&commands->lock);
-    int count = epoll_wait(commands->epoll, ready, TOPICS_PER_WAIT, -1);
+    int count = epoll_wait(commands->epoll, ready, TOPICS_PER_WAIT, LOOK_MS);
     pthread_mutex_lock(&commands->lock);
+    int64_t now = boottime_ns();
+    freshness_look(&commands->freshness, wall_ns(), now);
     if (!goes_on(commands)) return;
     for (int index = 0; index < count; index++) {
         const struct command_topic *topic = find_topic(commands->current, ready[index].data.fd);

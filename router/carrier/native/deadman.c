@@ -37,7 +37,7 @@ static int open_lock(pthread_mutex_t *lock) {
 struct deadmen *deadmen_open(counter *counters, struct ring *events) {
     struct deadmen *deadmen = calloc(1, sizeof *deadmen);
     if (!deadmen) return NULL;
-    deadmen->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
+    deadmen->timer = timerfd_create(CLOCK_BOOTTIME, TFD_CLOEXEC | TFD_NONBLOCK);
     if (deadmen->timer < 0) {
         free(deadmen);
         return NULL;
@@ -251,11 +251,11 @@ int command_send_at(struct deadmen *deadmen, struct sender *sender, const void *
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count) {
     if (!count) {
-        int64_t now = expires == NEVER ? 0 : monotonic_ns();
+        int64_t now = expires == NEVER ? 0 : boottime_ns();
         return command_send_at(deadmen, sender, data, size, expires, feeds, count, now);
     }
     pthread_mutex_lock(&deadmen->lock);
-    int error = command_send_at(deadmen, sender, data, size, expires, feeds, count, monotonic_ns());
+    int error = command_send_at(deadmen, sender, data, size, expires, feeds, count, boottime_ns());
     pthread_mutex_unlock(&deadmen->lock);
     return error;
 }

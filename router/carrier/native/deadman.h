@@ -35,7 +35,7 @@ struct deadmen {
     counter *counters;
     struct ring *events;       /* of struct deadman_event, written under the lock; may be NULL */
     int timer;                 /* timerfd, readable when a deadman is due */
-    int64_t timer_set_for;     /* monotonic, ns; NEVER while it is not set */
+    int64_t timer_set_for;     /* boot clock, ns; NEVER while it is not set */
     _Atomic int64_t next_due;  /* NEVER if nothing is due; may be read without the lock */
     struct deadman *first;     /* a linked list */
 };
@@ -70,12 +70,12 @@ void deadman_replace(struct deadmen *deadmen, struct deadman *next, struct deadm
 /* Send a last time if armed or tripped; nothing is due any more. */
 void deadman_end(struct deadmen *deadmen, struct deadman *deadman);
 
-/* Serve the deadmen that are due, and set the timer for the next one. `now` is monotonic. */
+/* Serve the deadmen that are due, and set the timer for the next one. `now` is of the boot clock. */
 void deadmen_serve(struct deadmen *deadmen, int64_t now);
 
 enum { COMMAND_STALE = -1 };
 
-/* Send a command: check that it has not expired (`expires`, monotonic ns; NEVER: it does not), feed or disarm the
+/* Send a command: check that it has not expired (`expires`, boot clock, ns; NEVER: it does not), feed or disarm the
  * deadmen, and send, all under the lock. Return 0, COMMAND_STALE, or an errno of `sender_send`. Without feeds the lock
  * is not taken. */
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,

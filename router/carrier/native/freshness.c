@@ -27,21 +27,39 @@ static bool is_possible(int64_t time, int64_t since, int64_t until) {
     return since - TOLERANCE <= time && time <= until + TOLERANCE;
 }
 
-/* `event` is what the stamp means under the present setting. Of all times that are possible, return the latest. */
-static int64_t latest_possible(const struct freshness *freshness, int64_t stamp, int64_t event, int64_t now) {
-    bool is_found = is_possible(event, freshness->since, now);
-    int64_t latest = event;
+static int64_t earlier(int64_t one, int64_t other) { return one < other ? one : other; }
+
+/* What is found of the times that are possible. */
+struct found {
+    struct born born;
+    int64_t oldest_in_order; /* not before what is known */
+    bool is_any, is_in_order;
+};
+
+static void find(struct found *found, int64_t time, int64_t not_before) {
+    if (!found->is_any || time < found->born.oldest) found->born.oldest = time;
+    if (!found->is_any || time > found->born.youngest) found->born.youngest = time;
+    found->is_any = true;
+    if (not_before == INT64_MIN || time < not_before - TOLERANCE) return;
+    if (!found->is_in_order || time < found->oldest_in_order) found->oldest_in_order = time;
+    found->is_in_order = true;
+}
+
+/* `event` is what the stamp means under the present setting. */
+static struct born possible(const struct freshness *freshness, int64_t stamp, int64_t event, int64_t now,
+                            int64_t not_before) {
+    struct found found = {0};
+    if (is_possible(event, freshness->since, now)) find(&found, event, not_before);
     for (uint32_t index = 0; index < freshness->count; index++) {
         const struct setting *past = &freshness->past[(freshness->first + index) % FRESHNESS_MOST_SETTINGS];
         int64_t time = stamp - past->offset;
-        if (!is_possible(time, past->since, past->until)) continue;
-        if (!is_found || time > latest) latest = time;
-        is_found = true;
+        if (is_possible(time, past->since, past->until)) find(&found, time, not_before);
     }
-    return latest;
+    if (!found.is_any) return (struct born){event, event};
+    return (struct born){found.is_in_order ? found.oldest_in_order : found.born.oldest, found.born.youngest};
 }
 
-int64_t freshness_born(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now) {
+void freshness_look(struct freshness *freshness, int64_t received_at, int64_t now) {
     int64_t offset = received_at - now;
     if (!freshness->is_known) {
         freshness->is_known = 1;
@@ -52,10 +70,16 @@ int64_t freshness_born(struct freshness *freshness, int64_t stamp, int64_t recei
         freshness->since = freshness->seen;
     }
     freshness->seen = now;
-    int64_t event = stamp - offset;
+}
+
+struct born freshness_born(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
+                           int64_t not_before) {
+    freshness_look(freshness, received_at, now);
+    int64_t event = stamp - (received_at - now);
+    struct born born = {event, event};
     if (freshness->count) {
         forget_old(freshness, now);
-        event = latest_possible(freshness, stamp, event, now);
+        born = possible(freshness, stamp, event, now, not_before);
     }
-    return event < now ? event : now;
+    return (struct born){earlier(born.oldest, now), earlier(born.youngest, now)};
 }

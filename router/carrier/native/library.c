@@ -21,7 +21,7 @@ const char *carrier_checksum(void) { return CARRIER_CHECKSUM; }
 /* The structures that structures.py has too. The last one has no name. */
 const struct structure_size *carrier_structure_sizes(void) {
     static const struct structure_size sizes[] = {
-        SIZE(wire_field),     SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
+        SIZE(born), SIZE(wire_field),     SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
         SIZE(destination),    SIZE(waiting),   SIZE(part),        SIZE(route), SIZE(entry),
         SIZE(payload_case),   SIZE(peer),      SIZE(listener),    SIZE(program), SIZE(change),
         SIZE(message_record), SIZE(mirror_record), SIZE(read_op), SIZE(write_op), SIZE(command_target), SIZE(command_route),

@@ -23,7 +23,7 @@ void run_soon(void);
 void run_in_turn(void);
 
 /* Take the priority from the calling thread for a turn of 100 ms after one of which it used three quarters: a flood would
- * leave others next to nothing of its processor core. `now` is monotonic. */
+ * leave others next to nothing of its processor core. `now` is of the boot clock. */
 void share_processor(struct share *share, int64_t now);
 
 #endif

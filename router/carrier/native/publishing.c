@@ -126,7 +126,7 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
         counter_add(counters, target->filtered, 1);
         return false;
     }
-    if (outcome == COMPOSED && served->expires != NEVER && monotonic_ns() > served->expires) outcome = LOSS_STALE;
+    if (outcome == COMPOSED && served->expires != NEVER && boottime_ns() > served->expires) outcome = LOSS_STALE;
     if (outcome == COMPOSED && target->limit && !limit_passes(target->limit, served->record->now)) {
         counter_add(counters, target->rate_limited, 1);
         return false;
@@ -144,7 +144,7 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
 static bool serve(struct publishing *publishing, const struct message_record *record) {
     const struct publish_route *route = record->part->publishes;
     struct served served = {.record = record, .route = route};
-    served.expires = route->ttl ? record->born + route->ttl : NEVER;
+    served.expires = route->ttl ? record->youngest + route->ttl : NEVER;
     for (uint32_t index = 0; index < route->target_count; index++) {
         const struct publish_target *target = &route->targets[index];
         if (!__atomic_load_n(target->topic->wanted, __ATOMIC_RELAXED))

@@ -26,10 +26,15 @@ struct serialized_message {
     struct allocator allocator;
 };
 
+enum { GID_SIZE = 16 };
+
 /* rmw_message_info_t begins like this. Times of the wall clock, 0 where the middleware does not know. */
 struct message_info {
     int64_t source_timestamp, received_timestamp;
-    uint8_t rest[240];
+    uint64_t publication_sequence_number, reception_sequence_number;
+    const char *implementation;
+    uint8_t publisher[GID_SIZE]; /* rmw_gid_t has these two */
+    uint8_t rest[200];
 };
 
 /* rcutils_error_string_t */

@@ -24,7 +24,8 @@ struct received {
     uint32_t address, port; /* of the sender */
     const struct peer *peer; /* NULL for a stranger */
     uint32_t column;
-    int64_t received_at, now, born;
+    int64_t received_at, now;
+    struct born born;
     struct envelope envelope;
 };
 
@@ -72,9 +73,9 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
 /* ---- targets ---- */
 
 static void forward(struct carrier *carrier, const struct route *route, const struct received *received) {
-    int64_t expires = route->ttl ? received->born + route->ttl : NEVER;
     for (uint32_t index = 0; index < route->destination_count; index++) {
         const struct destination *to = &route->destinations[index];
+        int64_t expires = destination_expiry(to, received->born, route->ttl);
         if (!destination_may_send(carrier->counters, to, received->now, expires)) continue;
         if (!destination_takes(carrier->counters, &carrier->reporter, received->now, route->id, to, carrier->datagram,
                                received->envelope.size))
@@ -115,7 +116,8 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .part = part,
                                       .received_at = received->received_at,
                                       .now = received->now,
-                                      .born = received->born,
+                                      .oldest = received->born.oldest,
+                                      .youngest = received->born.youngest,
                                       .column = received->column,
                                       .is_single = received->envelope.is_single,
                                       .length = received->envelope.size,
@@ -169,17 +171,17 @@ static int route(struct carrier *carrier, const struct payload_case *found, cons
     forward(carrier, chosen, received);
     for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
     counter_set(carrier->counters, chosen->last_message, received->received_at);
-    count_duration(carrier->counters, chosen->duration, monotonic_ns() - received->now);
+    count_duration(carrier->counters, chosen->duration, boottime_ns() - received->now);
     return ROUTED;
 }
 
 static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
     const struct listener *listener = received->listener;
     counter *counters = carrier->counters;
-    received->now = monotonic_ns();
+    received->now = boottime_ns();
     received->received_at = wall_ns();
     received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
-                                    received->received_at, received->now);
+                                    received->received_at, received->now, INT64_MIN);
     counter_add(counters, listener->received, 1);
     counter_add(counters, listener->received_bytes, (int64_t)received->length);
     received->peer = find_peer(listener, received->address, received->port);
@@ -221,18 +223,27 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     return length;
 }
 
-/* Receive and handle a datagram. Return whether there was one. */
-static bool receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
+/* There was nothing to receive: so what is still to come was not stamped under a setting of the clock that has passed. */
+static void found_empty(struct carrier *carrier) {
+    freshness_forget_past(&carrier->freshness);
+    int64_t now = boottime_ns();
+    freshness_look(&carrier->freshness, wall_ns(), now);
+}
+
+enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
+
+/* Receive and handle a datagram if there is one. */
+static enum outcome receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
     struct sockaddr_in sender;
     union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct timespec))]; } control;
     struct iovec into = {carrier->datagram, MAX_DATAGRAM + 1};
     struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
                              .msg_control = &control, .msg_controllen = sizeof control};
     ssize_t length = receive(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
-    if (length < 0) return false;
+    if (length < 0) return errno == EAGAIN ? FOUND_EMPTY : RECEIVE_FAILED;
     if (!message.msg_namelen) { /* input has ended; an empty datagram has a sender */
         if (!(flags & MSG_DONTWAIT)) usleep(1000);
-        return false;
+        return FOUND_EMPTY;
     }
     struct received received = {.listener = listener, .length = (size_t)length,
                                 .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
@@ -240,18 +251,19 @@ static bool receive_one(struct carrier *carrier, const struct listener *listener
     handle(carrier, &received, arrival(&message));
     edition_end(&carrier->edition);
     share_processor(&carrier->share, received.now);
-    return true;
+    return RECEIVED;
 }
 
 static void brake(struct carrier *carrier) {
     int64_t due = atomic_load_explicit(&carrier->deadmen->next_due, memory_order_relaxed);
     if (due == NEVER) return;
-    int64_t now = monotonic_ns();
+    int64_t now = boottime_ns();
     if (due <= now) deadmen_serve(carrier->deadmen, now);
 }
 
 static void drain(struct carrier *carrier, const struct listener *listener) {
-    for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT); left--) brake(carrier);
+    for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT) == RECEIVED; left--)
+        brake(carrier);
 }
 
 /* ---- changes of the program ---- */
@@ -306,11 +318,13 @@ static bool goes_on(struct carrier *carrier) {
     return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
 }
 
-/* With one system call per datagram: a receive that blocks. */
+/* With one system call per datagram: a receive that blocks, unless the clock was set since nothing was waiting. */
 static void receive_from_one(struct carrier *carrier) {
     const struct listener *listener = carrier->program->listeners;
-    do receive_one(carrier, listener, 0);
-    while (goes_on(carrier));
+    do {
+        int flags = carrier->freshness.count ? MSG_DONTWAIT : 0;
+        if (receive_one(carrier, listener, flags) == FOUND_EMPTY) found_empty(carrier);
+    } while (goes_on(carrier));
 }
 
 /* One datagram of each listener that has some per turn, so that none starves the others. */
@@ -322,13 +336,16 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
     }
     do {
         struct epoll_event ready[LISTENERS_PER_WAIT];
-        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS), served = 0;
+        int turn = carrier->freshness.count ? 0 : TURN_MS;
+        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, turn), empty = 0;
+        bool has_noted = false;
         for (int index = 0; index < count; index++) {
             const struct listener *listener = &program->listeners[ready[index].data.u32];
-            if (ready[index].events & EPOLLERR) served += sender_note_errors(listener->fd);
-            served += receive_one(carrier, listener, MSG_DONTWAIT);
+            if (ready[index].events & EPOLLERR) has_noted |= sender_note_errors(listener->fd);
+            empty += receive_one(carrier, listener, MSG_DONTWAIT) == FOUND_EMPTY;
         }
-        if (count > 0 && !served) usleep(1000); /* input has ended, which epoll says again and again */
+        if (count > 0 && empty == count && !has_noted) usleep(1000); /* input has ended, which epoll says again and again */
+        if (count >= 0 && empty == count && count < LISTENERS_PER_WAIT) found_empty(carrier);
     } while (goes_on(carrier));
     for (uint32_t index = 0; index < program->listener_count; index++)
         epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);

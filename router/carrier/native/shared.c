@@ -88,7 +88,7 @@ void report_loss_because(struct reporter *reporter, int64_t now, const struct lo
 /* ---- destinations ---- */
 
 bool destination_may_send(counter *counters, const struct destination *to, int64_t now, int64_t expires) {
-    if (expires != NEVER && monotonic_ns() > expires) {
+    if (expires != NEVER && boottime_ns() > expires) {
         counter_add(counters, to->stale, 1);
         return false;
     }

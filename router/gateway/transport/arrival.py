@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from router.clock import monotonic_ns, wall_ns
+from router.clock import boottime_ns, wall_ns
 
 TICK_SECONDS = 0.02
 
@@ -21,9 +21,9 @@ CATCH_UP_NS = 100_000_000
 
 
 class LoopClock:
-    """Detects, while started, when the event loop was away. `clock_ns` is monotonic."""
+    """Detects, while started, when the event loop was away. `clock_ns` is the boot clock."""
 
-    def __init__(self, clock_ns: Callable[[], int] = monotonic_ns) -> None:
+    def __init__(self, clock_ns: Callable[[], int] = boottime_ns) -> None:
         self._clock_ns = clock_ns
         self._last_tick = 0
         self._left = 0

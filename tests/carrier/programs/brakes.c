@@ -68,7 +68,7 @@ static struct deadman *open_deadman(bool has_spare) {
 static void *send_commands(void *seed) {
     unsigned random = (unsigned)(uintptr_t)seed;
     for (long number = 0; number < commands; number++) {
-        int64_t born = monotonic_ns();
+        int64_t born = boottime_ns();
         struct datagram command = {COMMAND, born, born + TTL};
         struct feed feeds[] = {{atomic_load(&acting), 0, 0}, {takes_over, 1, 0}};
         if (rand_r(&random) % 50 == 0) usleep(150);
@@ -94,7 +94,7 @@ static void *send_others(void *seed) {
 static void *wait_for_timer(void *unused) {
     while (!atomic_load(&is_done)) {
         struct pollfd waiting = {deadmen->timer, POLLIN, 0};
-        if (poll(&waiting, 1, 20) > 0) deadmen_serve(deadmen, monotonic_ns());
+        if (poll(&waiting, 1, 20) > 0) deadmen_serve(deadmen, boottime_ns());
     }
     return unused;
 }
@@ -102,7 +102,7 @@ static void *wait_for_timer(void *unused) {
 /* As the receive thread does between two datagrams. */
 static void *look_for_due(void *unused) {
     while (!atomic_load(&is_done)) {
-        int64_t now = monotonic_ns();
+        int64_t now = boottime_ns();
         if (atomic_load_explicit(&deadmen->next_due, memory_order_relaxed) <= now) deadmen_serve(deadmen, now);
         usleep(100);
     }

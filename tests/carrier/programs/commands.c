@@ -76,7 +76,7 @@ int main(void) {
     for (int times = 200; times; times--) {
         int64_t copy[COUNTERS];
         assert(commands_serve(commands, times % 2 ? &one : &both));
-        deadmen_serve(deadmen, monotonic_ns());
+        deadmen_serve(deadmen, boottime_ns());
         if (commands_counters(commands, copy, COUNTERS)) assert(copy[RECEIVED] == copy[SENT] + copy[LOST]);
     }
     for (int index = 0; index < 2; index++) pthread_join(publishing[index], NULL);
