@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.acceptance import two_networks
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import FLOWS, TOPICS
@@ -21,6 +22,17 @@ class Rover:
     site: Site
     router: RouterProcess
     table: Path
+
+
+@pytest.fixture(params=["native", "python"])
+def plane(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(name="site")
+def rover_on_two_networks(tmp_path: Path) -> Iterator[two_networks.Rover]:
+    with two_networks.rover_with_networks(tmp_path) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

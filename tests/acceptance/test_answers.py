@@ -5,16 +5,13 @@ from __future__ import annotations
 import errno
 import signal
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import RouterProcess, key, wait_until
-from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover, rover_with_networks
+from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover
 from tests.namespaces import Computer
 
 TABLE = """\
@@ -38,24 +35,6 @@ SEVERAL = TABLE.replace(
 DIAG = WIRE.encode(WIRE.case("drive_diag"), WIRE.case("drive_diag").message_class())
 
 
-@pytest.fixture(params=["native", "python"])
-def plane(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Rover]:
-    with rover_with_networks(tmp_path) as found:
-        yield found
-
-
-@contextmanager
-def running(site: Rover, plane: str, text: str = TABLE) -> Iterator[RouterProcess]:
-    path = site.table(text)
-    with site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane)) as router:
-        yield router
-
-
 def exchange(site: Rover, to: tuple[str, int] = RADIO) -> tuple[str, int]:
     """The basestation drives, the board answers where that came from, and the basestation gets the answer."""
     site.basestation.sendto(DRIVE, to)
@@ -68,7 +47,7 @@ def exchange(site: Rover, to: tuple[str, int] = RADIO) -> tuple[str, int]:
 
 def test_an_answer_to_where_a_command_came_from_is_routed_and_counted(site: Rover, plane: str) -> None:
     """The listener is on all networks of a computer that has several."""
-    with running(site, plane):
+    with site.router(TABLE, plane):
         assert exchange(site) == LAN
         assert site.count("messages_received_total", route="drive_diag", source="driving_board") == 1
         assert site.count("datagrams_received_total", listener="rover") == 2
@@ -80,7 +59,7 @@ def test_datagrams_leave_from_the_address_of_the_listener(site: Rover, plane: st
     site.rover.ip("address", "flush", "dev", "lan0")
     for address in ("10.78.1.7/24", "10.78.1.1/24"):
         site.rover.ip("address", "add", address, "dev", "lan0")
-    with running(site, plane, TABLE.replace("0.0.0.0:5000", "10.78.1.1:5000")):
+    with site.router(TABLE.replace("0.0.0.0:5000", "10.78.1.1:5000"), plane):
         site.radio.ip("route", "add", "10.78.1.0/24", "via", RADIO[0])
         assert exchange(site, LAN) == LAN
 
@@ -88,7 +67,7 @@ def test_datagrams_leave_from_the_address_of_the_listener(site: Rover, plane: st
 def test_a_firewall_that_lets_only_answers_in_lets_them_in(site: Rover, plane: str) -> None:
     """It is the rover's own: what the board sends is part of the exchange that the command has begun."""
     only_answers(site.rover)
-    with running(site, plane):
+    with site.router(TABLE, plane):
         exchange(site)
 
 
@@ -126,7 +105,7 @@ def test_of_several_listeners_the_table_chooses(
     site: Rover, plane: str, keys: str, lan: int, leaves_from: int | None
 ) -> None:
     text = SEVERAL.replace("0.0.0.0:5000, interface: lan0", f"0.0.0.0:{lan}, interface: lan0")
-    with running(site, plane, text.replace("kind: board", f"kind: board, {keys}".rstrip(", "))):
+    with site.router(text.replace("kind: board", f"kind: board, {keys}".rstrip(", ")), plane):
         site.basestation.sendto(DRIVE, RADIO)
         _, where_from = site.board.recvfrom(1000)
         assert where_from[0] == LAN[0]
@@ -134,7 +113,7 @@ def test_of_several_listeners_the_table_chooses(
 
 
 def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
-    with running(site, plane) as router:
+    with site.router(TABLE, plane) as router:
 
         def leaves_from(table: str, port: int) -> int:
             reloads = len(router.events("table reloaded"))
@@ -151,7 +130,7 @@ def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
 
 
 def test_nobody_else_gets_the_port(site: Rover, plane: str) -> None:
-    with running(site, plane):
+    with site.router(TABLE, plane):
         with pytest.raises(OSError, match="Address already in use") as caught:
             site.rover.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).bind(("0.0.0.0", 5000)))
         assert caught.value.errno == errno.EADDRINUSE
@@ -167,7 +146,7 @@ def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane:
     """Each datagram is refused by the board's computer; the next one reports it, and the last one has no next."""
     site.board.close()
     labels = {"route": "manual_drive"}
-    with running(site, plane, table) as router:
+    with site.router(table, plane) as router:
 
         def counted() -> tuple[float, float]:
             found = site.samples()
@@ -190,7 +169,7 @@ def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane:
 
 def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover, plane: str) -> None:
     """ICMP messages that say that nobody listens, about datagrams that the listener's port has never sent."""
-    with running(site, plane), site.radio.inside(raw_icmp) as forging:
+    with site.router(TABLE, plane), site.radio.inside(raw_icmp) as forging:
         for _ in range(20):
             for _ in range(500):
                 forging.sendto(REFUSAL, (RADIO[0], 0))

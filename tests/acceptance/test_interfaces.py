@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import signal
 import socket
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
@@ -24,7 +22,6 @@ from tests.acceptance.two_networks import (
     RADIO,
     Rover,
     attacker,
-    rover_with_networks,
 )
 from tests.namespaces import Computer, cable
 
@@ -52,12 +49,6 @@ routes:
 DIAG = WIRE.encode(WIRE.case("drive_diag"), WIRE.case("drive_diag").message_class())
 ARM = WIRE.encode(WIRE.case("arm_diag"), WIRE.case("arm_diag").message_class())
 IMU = WIRE.encode(WIRE.case("imu_info"), WIRE.case("imu_info").message_class())
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Rover]:
-    with rover_with_networks(tmp_path) as found:
-        yield found
 
 
 def test_a_command_is_believed_by_its_listener_only(site: Rover) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
 from tests.acceptance.site import ROOT, RouterProcess, wait_until
-from tests.acceptance.two_networks import BRAKE, DRIVE, LAN, RADIO, Rover, rover_with_networks, udp
+from tests.acceptance.two_networks import BRAKE, DRIVE, LAN, RADIO, Rover, udp
 from tests.namespaces import cable
 
 TABLE = """\
@@ -37,24 +35,6 @@ TUNNEL = TABLE.replace(
 UNREACHABLE = "nothing can be sent to this endpoint now; it is tried with every datagram"
 WAITS = "this listener receives nothing before its network is there; the others do"
 THERE = "listeners receive: their networks are there"
-
-
-@pytest.fixture(params=["native", "python"])
-def plane(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Rover]:
-    with rover_with_networks(tmp_path) as found:
-        yield found
-
-
-@contextmanager
-def running(site: Rover, plane: str, text: str) -> Iterator[RouterProcess]:
-    path = site.table(text)
-    with site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane)) as router:
-        yield router
 
 
 def reload(site: Rover, router: RouterProcess, text: str) -> str:
@@ -90,7 +70,7 @@ def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
 ) -> None:
     if route:
         site.rover.ip("route", "add", *route)
-    with running(site, plane, TABLE) as router:
+    with site.router(TABLE, plane) as router:
         [warning] = router.events(UNREACHABLE)
         assert (warning["endpoint"], warning["address"], warning["why"]) == ("other", "10.79.9.9:9000", why)
         assert warning["remedy"]
@@ -109,7 +89,7 @@ def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
 def test_nor_does_one_that_a_reload_brings(site: Rover, plane: str, route: tuple[str, ...], why: str) -> None:
     if route:
         site.rover.ip("route", "add", *route)
-    with running(site, plane, TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
+    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60"), plane) as router:
         log = reload(site, router, TABLE)
         assert "table reloaded" in log
         assert [each["why"] for each in router.events(UNREACHABLE)] == [why]
@@ -124,7 +104,7 @@ def test_the_broadcast_address_of_an_interface_is_refused(site: Rover, plane: st
     assert refused.wait() == 78
     assert f"{path}:8:20: {said}" in refused.text()
     assert "broadcast and multicast are not supported" in refused.text()
-    with running(site, plane, TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
+    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60"), plane) as router:
         assert said in reload(site, router, wrong)
         assert not router.events("table reloaded")
         drives(site)
@@ -176,7 +156,7 @@ def test_a_listener_waits_for_its_network_and_the_others_serve(
 ) -> None:
     goes(site)
     text = TUNNEL.replace("{tunnel}", tunnel)
-    with running(site, plane, TABLE.replace("0.0.0.0", LAN[0]) if is_reloaded else text) as router:
+    with site.router(TABLE.replace("0.0.0.0", LAN[0]) if is_reloaded else text, plane) as router:
         assert site.board.recv(100) == BRAKE
         if is_reloaded:
             reload(site, router, text)
@@ -213,7 +193,7 @@ def status(site: Rover) -> str:
 def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rover, plane: str) -> None:
     gone_address(site)
     text = TUNNEL.replace("{tunnel}", ABSENT["address"][0]).replace("kind: board", "kind: board, send_from: tunnel")
-    with running(site, plane, text) as router:
+    with site.router(text, plane) as router:
         assert site.board.recvfrom(100)[1][1] != 5001  # the brake of the start leaves all the same
         new_address(site)
         wait_until(lambda: bool(router.events(THERE)), "the binding")
@@ -226,7 +206,7 @@ def test_of_listeners_on_one_port_one_that_is_there_serves_for_those_that_wait(s
     gone_interface(site)
     text = TUNNEL.replace("{tunnel}", "{{address: 0.0.0.0:5000, interface: radio0}}")
     text = text.replace("10.78.1.1:5000", "0.0.0.0:5000, interface: lan0")
-    with running(site, plane, text.replace("kind: board", "kind: board, send_from: tunnel")):
+    with site.router(text.replace("kind: board", "kind: board, send_from: tunnel"), plane):
         assert site.board.recvfrom(100) == (BRAKE, LAN)
 
 
@@ -234,7 +214,7 @@ def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane
     """The only listener is at the address of a tunnel, by which commands come; the board is in another network."""
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
     site.lan.ip("route", "add", "10.78.2.0/24", "via", LAN[0])
-    with running(site, plane, text):
+    with site.router(text, plane):
         assert site.board.recvfrom(100) == (BRAKE, RADIO)
         drives(site)
         gone_address(site)
