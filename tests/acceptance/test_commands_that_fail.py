@@ -5,12 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from tests.acceptance.payloads import WIRE
+from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import wait_until
 from tests.acceptance.two_networks import BOARD, BRAKE, Rover, rover_with_networks
 
@@ -101,6 +102,28 @@ def test_the_deadman_trips_while_no_route_leads_to_the_board_and_the_brake_comes
         site.rover.ip("route", "del", kind, f"{BOARD[0]}/32")
         assert site.board.recv(1000) == BRAKE
         assert site.board_gets() == []
+
+
+def test_a_board_that_was_gone_gets_few_old_commands_and_then_the_brake(site: Rover) -> None:
+    """While it does not answer, the kernel keeps what is sent to it, for up to three seconds."""
+    with site.router(TABLE.replace("{bandwidth}", "")):
+        with driving(site):
+            site.lan.ip("link", "set", "eth0", "down")
+            site.rover.ip("neighbour", "flush", "dev", "lan0")
+            wait_until(lambda: trips(site) == 1, "the trip")
+        site.board.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:  # what came before
+                site.board.recv(1000)
+        site.board.settimeout(PATIENCE)
+        site.lan.ip("link", "set", "eth0", "up")
+        arrived = [site.board.recv(1000)]
+        while arrived[-1] != BRAKE:
+            arrived.append(site.board.recv(1000))
+        assert arrived[:-1] == (len(arrived) - 1) * [DRIVE]
+        assert len(arrived) - 1 <= 24
+        errors = site.count("deadman_send_errors_total", route="manual_drive", destination="driving_board")
+        assert errors == 0
 
 
 def test_a_board_that_refuses_commands_is_braked(site: Rover) -> None:
