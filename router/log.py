@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import select
@@ -10,7 +11,7 @@ import threading
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import structlog
 
@@ -18,10 +19,43 @@ from router.clock import monotonic_ns
 
 logger: structlog.typing.FilteringBoundLogger = structlog.get_logger("router")
 
+Emit = Callable[..., None]
+"""Called as `emit(event, **values)`, like a method of a structlog logger."""
+
 LEVELS = ("debug", "info", "warning", "error")
 
 SUMMARY_INTERVAL_NS = 10_000_000_000
 MOST_KEYS = 1000
+
+
+NO_THREAD = "can't start new thread"
+"""What Python says where the kernel refuses one."""
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Whether memory, threads or descriptors have run out: no fault of the router, and it may pass."""
+    if isinstance(error, OSError):
+        return error.errno in {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error) == NO_THREAD)
+
+
+class Fault(NamedTuple):
+    """What to log of an exception that nobody expected. `error` has the traceback."""
+
+    emit: Emit
+    event: str
+    error: BaseException | None
+
+    def log(self) -> None:
+        self.emit(self.event, exc_info=self.error)
+
+
+def fault(error: BaseException, what: str, within: str = "the router itself") -> Fault:
+    """Describe an exception that nobody expected, and `what` it did, such as "lost a message"."""
+    if is_shortage(error):
+        why = str(error) or "no memory"
+        return Fault(logger.error, f"memory, threads or descriptors have run out, which {what}: {why}", None)
+    return Fault(logger.critical, f"a fault in {within} {what}; please report it", error)
 
 
 def configure_log(level: str = "info", *, coloured: bool = False) -> None:
@@ -80,10 +114,6 @@ def _is_file(stream: TextIO) -> bool:
     except io.UnsupportedOperation:  # in memory, for tests
         return False
     return True
-
-
-Emit = Callable[..., None]
-"""Called as `emit(event, **values)`, like a method of a structlog logger."""
 
 
 @dataclass(slots=True)

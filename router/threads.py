@@ -1,4 +1,4 @@
-"""Wake-up events, background scheduling, an executor that never delays the end of the process, and pauses."""
+"""Threads that never delay the end of the process; wake-up events, pauses, and stops with deadlines."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from queue import SimpleQueue
+from time import monotonic, sleep
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
-from router.log import logger
+from router.log import NO_THREAD, is_shortage, logger
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -23,6 +24,61 @@ _LONGEST_WAIT_MS = 3_600_000
 
 PAUSE_TIMEOUT_S = 1.0
 """Seconds within which a thread has to pause. No datagram is routed meanwhile, and the watchdog is not fed."""
+
+
+START_S = 2.0
+"""Seconds within which a started thread has to run."""
+
+REST_S = 0.1
+"""Seconds for which a thread rests when something has run out, before it tries again."""
+
+
+class Thread(threading.Thread):
+    """A daemon thread. `target` is called again after a rest if something has run out (`is_shortage`)."""
+
+    def __init__(self, target: Callable[..., object], name: str, args: tuple[object, ...] = ()) -> None:
+        super().__init__(name=name, daemon=True)
+        self._call = target
+        self._arguments = args
+        self._first = threading.Lock()  # taken by the thread when it runs, or by the starter that gives it up
+        self._started: threading.Event = _Started()
+
+    def start(self) -> None:
+        """Raises RuntimeError or MemoryError; then the target is not called.
+
+        Python waits without end for a thread that dies before it says that it runs, for lack of memory.
+        """
+        try:
+            super().start()
+        except _NotInTimeError:
+            if self._first.acquire(blocking=False):
+                raise RuntimeError(NO_THREAD) from None
+
+    def run(self) -> None:
+        if not self._first.acquire(blocking=False):
+            return
+        while True:
+            try:
+                self._call(*self._arguments)
+            except Exception as error:
+                if not is_shortage(error):
+                    raise
+                sleep(REST_S)
+            else:
+                return
+
+
+class _NotInTimeError(Exception):
+    pass
+
+
+class _Started(threading.Event):
+    """What `threading.Thread.start` waits for, with a timeout."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        if not super().wait(START_S if timeout is None else timeout):
+            raise _NotInTimeError
+        return True
 
 
 class WakeEvent:
@@ -133,20 +189,21 @@ class DaemonThread(Executor):
     def __init__(self, name: str) -> None:
         self._name = name
         self._calls: SimpleQueue[_Call | None] = SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._thread: Thread | None = None
         self._is_shut_down = False
         self._lock = threading.Lock()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Raises RuntimeError after `shutdown`."""
+        """Raises RuntimeError after `shutdown`, and where the thread cannot be started: the next call tries again."""
         done: Future[T] = Future()
         with self._lock:
             if self._is_shut_down:
                 raise RuntimeError(f"the thread '{self._name}' takes no more")
-            self._calls.put(_Call(done, lambda: fn(*args, **kwargs)))
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                self._thread.start()
+                thread = Thread(self._run, self._name)
+                thread.start()
+                self._thread = thread
+            self._calls.put(_Call(done, lambda: fn(*args, **kwargs)))
         return done
 
     def shutdown(self, wait: bool = False, *, cancel_futures: bool = True) -> None:
@@ -174,6 +231,59 @@ def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
     if thread.is_alive():
         logger.error("a thread is stuck, and is left", thread=thread.name)
     return not thread.is_alive()
+
+
+class StopStack(ExitStack):
+    """An ExitStack whose callbacks have deadlines: one that is stuck is logged and left, and the others follow.
+
+    Each callback is called in a thread of its own; once none can be had, without one and without a deadline.
+    `outer` is a stack with which this one shares its time.
+    """
+
+    def __init__(self, outer: StopStack | None = None) -> None:
+        super().__init__()
+        self._steps: _Steps = outer._steps if outer else _Steps()
+
+    def callback(self, callback: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[P, T]:
+        name = getattr(callback, "__qualname__", repr(callback))
+        super().callback(self._steps.call_or_leave, name, lambda: callback(*args, **kwargs))
+        return callback
+
+
+STEP_S, STEPS_S, LEAST_S = 3.0, 6.0, 0.2
+"""Seconds for a step of a stop, for all together, and for each of those that are left then: a unit kills after 10 s."""
+
+
+class _Steps:
+    """The steps of one stop, in sequence."""
+
+    def __init__(self) -> None:
+        self._until: float | None = None
+        self._has_threads = True
+
+    def call_or_leave(self, name: str, work: Callable[[], object]) -> None:
+        if self._until is None:
+            self._until = monotonic() + STEPS_S
+        call = _Call(Future(), work)
+        if (thread := self._started(call, name)) is None:
+            call.run()
+        else:
+            thread.join(max(LEAST_S, min(STEP_S, self._until - monotonic())))
+        if call.done.done():
+            call.done.result()
+        else:
+            logger.error("a step of the stop is stuck, and is left", step=name)
+
+    def _started(self, call: _Call, name: str) -> Thread | None:
+        if self._has_threads:
+            try:
+                thread = Thread(call.run, f"stop: {name}")
+                thread.start()
+            except (RuntimeError, MemoryError):
+                self._has_threads = False
+            else:
+                return thread
+        return None
 
 
 class StuckError(RuntimeError):

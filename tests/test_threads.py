@@ -1,15 +1,20 @@
-"""Background scheduling and the executor that never delays the end of the process."""
+"""Background scheduling, threads that nothing can hold up, and the end of the process in spite of what is stuck."""
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 import threading
+from _thread import start_new_thread
+from collections.abc import Callable
 
 import pytest
+from structlog.testing import capture_logs
 
-from router.threads import DaemonThread, background_threads
+from router import threads
+from router.threads import DaemonThread, StopStack, Thread, background_threads
 
 TIMEOUT_S = 20.0
 
@@ -99,3 +104,98 @@ def test_a_process_ends_though_a_call_does_not() -> None:
         "begun.wait(); thread.shutdown()"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=TIMEOUT_S)
+
+
+class StillbornThread(Thread):
+    """Python's part of it never runs, as if there were no memory for it, until `late`."""
+
+    late: Callable[[], None]
+
+    def _bootstrap(self) -> None:
+        self.late = super()._bootstrap  # type: ignore[misc]  # Python's own
+
+
+def test_a_thread_that_dies_before_it_runs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "START_S", 0.05)
+    called = threading.Event()
+    thread = StillbornThread(called.set, "stillborn")
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        thread.start()
+    has_run = threading.Event()
+
+    def run_late() -> None:
+        thread.late()
+        has_run.set()
+
+    start_new_thread(run_late, ())
+    assert has_run.wait(TIMEOUT_S)
+    assert not called.is_set()
+
+
+def test_an_executor_whose_thread_cannot_be_started_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "START_S", 0.05)
+    executor = DaemonThread("calls")
+    with monkeypatch.context() as short:
+        short.setattr(threads, "Thread", StillbornThread)
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            executor.submit(int)
+    assert executor.submit(int, "4").result(TIMEOUT_S) == 4
+    executor.shutdown()
+
+
+def test_a_loop_goes_on_when_a_shortage_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "REST_S", 0.0)
+    shortages = [MemoryError(), OSError(errno.EMFILE, ""), RuntimeError("can't start new thread")]
+    ended = threading.Event()
+
+    def loop() -> None:
+        if shortages:
+            raise shortages.pop()
+        ended.set()
+
+    Thread(loop, "loop").start()
+    assert ended.wait(TIMEOUT_S)
+
+
+def test_a_step_of_a_stop_that_is_stuck_is_left_and_the_others_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "STEP_S", 0.05)
+    steps, never = list[str](), threading.Event()
+
+    def stuck() -> None:
+        never.wait()
+
+    with capture_logs() as logs, StopStack() as stack:
+        stack.callback(steps.append, "last")
+        stack.callback(stuck)
+        inner = stack.enter_context(StopStack(stack))
+        inner.callback(steps.append, "second")
+        inner.callback(stuck)
+        stack.callback(steps.append, "first")
+    never.set()
+    assert steps == ["first", "second", "last"]
+    left = "a step of the stop is stuck, and is left"
+    assert [each["step"].rpartition(".")[2] for each in logs if each["event"] == left] == ["stuck", "stuck"]
+
+
+def test_an_error_of_a_step_is_raised_after_all_others() -> None:
+    steps: list[str] = []
+
+    def fail() -> None:
+        raise LookupError
+
+    stack = StopStack()
+    stack.callback(steps.append, "last")
+    stack.callback(fail)
+    with pytest.raises(LookupError):
+        stack.close()
+    assert steps == ["last"]
+
+
+def test_a_stop_without_threads_does_each_step_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "START_S", 0.05)
+    monkeypatch.setattr(threads, "Thread", StillbornThread)
+    steps: list[str] = []
+    with StopStack() as stack:
+        for number in "321":
+            stack.callback(steps.append, number)
+    assert steps == ["1", "2", "3"]

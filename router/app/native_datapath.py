@@ -104,7 +104,7 @@ class NativeDatapath:
         self._generations = count(1)
         context.counts.most = MOST_COUNTERS
         self._wiring: NativeWiring | None = None
-        self._is_running = self._has_stopped = False
+        self._is_running = self._is_stopping = self._has_stopped = False
         report, failed = context.reporter.report, context.reporter.failed
         received, braked, published = (Ring(library, _EVENTS) for _ in range(3))
         receive_counts, deadman_counts, publish_counts = (_fixed_counts() for _ in range(3))
@@ -393,6 +393,7 @@ class NativeDatapath:
         return True
 
     def stop(self, listeners: Sequence[Listener]) -> None:
+        self._is_stopping = True
         for listener in listeners:
             listener.end_input()
         self._carrier.stop_receiving()
@@ -403,16 +404,18 @@ class NativeDatapath:
         self._stop_threads_of_ros()
 
     def _stop_threads_of_ros(self) -> None:
-        self._has_stopped = True
         have_ended = [self._publishing.stop(), *(commands.stop() for commands in self._commands)]
         if not all(have_ended) and self._ros is not None:
             self._ros.leave_open()
+        self._has_stopped = True
 
     def close(self) -> None:
-        if not self._has_stopped:  # the start has failed
+        if not self._is_stopping:  # the start has failed
             self._stop_threads_of_ros()
         for deadman in self._wiring.deadmen.values() if self._wiring else ():
             deadman.end()
+        if not self._has_stopped:  # `stop` is stuck, and its threads use what would be freed
+            return
         self._events.close()
         self._carrier.close()
 

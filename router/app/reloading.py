@@ -15,7 +15,7 @@ from router.compiler.check import Checked
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
-from router.log import logger
+from router.log import fault, logger
 from router.observe.running import ReloadResult
 from router.table.keys import are_same
 from router.table.model import NodeSettings, RouteTable
@@ -102,8 +102,9 @@ class Reloader:
         except OSError as error:  # files come and go while they are read, and descriptors may be short
             why = f"the table cannot be read or opened now: {error}"
         except Exception as error:  # noqa: BLE001 a bug of the router, which is logged, must not end the caller
-            logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
-            why = f"a fault in the router itself: {error!r}"
+            found = fault(error, "kept it from reloading")
+            found.log()
+            why = f"{found.event}: {error!r}"
         else:
             self._notify_replaced()
             return "ok", ReloadResult(True, tuple(findings), text)
@@ -122,7 +123,7 @@ class Reloader:
         try:
             self._replaced()
         except Exception as error:  # noqa: BLE001 as above; the new table runs already
-            logger.critical("a fault in the router itself after a reload; please report it", exc_info=error)
+            fault(error, "came after a reload").log()
 
     def _count(self, kind: str) -> None:
         self._counts.own[self._counts.counters.index("config_reloads", kind)] += 1

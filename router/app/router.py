@@ -29,7 +29,7 @@ from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
-from router.threads import DaemonThread, background_threads
+from router.threads import DaemonThread, StopStack, background_threads
 from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
@@ -71,13 +71,13 @@ class Router:
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._collector: tuple[Program, CountersCollector] | None = None
-        self._open = ExitStack()
+        self._open = StopStack()
 
     def __enter__(self) -> Router:
-        with ExitStack() as opening:
+        with StopStack() as opening:
             opening.callback(self._reporter.close)
             self._runtime.close_with(opening)
-            services = opening.enter_context(ExitStack())  # closed after deadmen have sent a last time
+            services = opening.enter_context(StopStack(opening))  # closed after deadmen have sent a last time
             self._runtime.end_with(opening)
             with background_threads():
                 change = self._runtime.prepare(self._first)

@@ -17,7 +17,7 @@ from router.app.wiring import Datapath, RouterContext, Wiring
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import SourceSpan, StartError
-from router.log import logger
+from router.log import fault
 from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
@@ -91,7 +91,8 @@ class Runtime:
     def end_with(self, closing: ExitStack) -> None:
         """Have `closing` stop gateways, then open frames, waiting messages and last deadmen, which send once more."""
         closing.callback(self.datapath.close)
-        closing.callback(self._context.timers.stop)
+        for thread in self._context.timers.threads:  # of deadmen last
+            closing.callback(thread.stop)
         closing.callback(self._stop_gateways)
 
     def prepare(self, program: Program) -> Change:
@@ -138,10 +139,7 @@ class Runtime:
         try:
             self._finish(change, earlier)
         except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
-            logger.critical(
-                "a fault in the router itself kept it from closing what it does not use; please report it",
-                exc_info=error,
-            )
+            fault(error, "kept it from closing what it does not use").log()
 
     def _swap(self, change: Change) -> None:
         """Replace the program, while the thread of ROS is paused."""

@@ -62,6 +62,14 @@ def _source(name: str | None, listeners: Mapping[str, Listener]) -> Listener | N
     return next((each for each in listeners.values() if each.address == named.address and not each.is_waiting), named)
 
 
+_Destination = tuple[Address, model.EndpointKind]
+
+
+def _destination(endpoint: model.Endpoint) -> _Destination:
+    """What a Sender depends on."""
+    return endpoint.address.value, endpoint.kind
+
+
 class KernelDrops:
     """Datagrams that the kernel dropped, by listener and by receiving gateway, including closed sockets."""
 
@@ -104,7 +112,7 @@ class Sockets:
         self._open_sender = open_sender
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
-        self._senders: dict[str, tuple[Address, Sender]] = {}
+        self._senders: dict[str, tuple[_Destination, Sender]] = {}
         self._drops = drops
 
     def prepare(self, program: Program) -> SocketChange:
@@ -124,8 +132,8 @@ class Sockets:
             every = [*self._bound.values(), *listeners.values()]
             for to in program.senders:
                 source = _source(sent_from(program.table, to), listeners)
-                address, sender = self._senders.get(to.name, (None, None))
-                is_new = sender is None or address != to.address.value
+                destination, sender = self._senders.get(to.name, (None, None))
+                is_new = sender is None or destination != _destination(to)
                 _check_reachable(to, is_new)
                 if sender is None or is_new:
                     sender = self._open_sender(to, source, every)
@@ -161,7 +169,7 @@ class Sockets:
             listener.follow(plans[name])
         self.listeners = change.listeners
         self._bound = {plans[name].bound_to: listener for name, listener in change.listeners.items()}
-        self._senders = {to.name: (to.address.value, change.senders[to.name]) for to in change.program.senders}
+        self._senders = {to.name: (_destination(to), change.senders[to.name]) for to in change.program.senders}
 
     def close_listeners(self) -> None:
         for listener in self.listeners.values():

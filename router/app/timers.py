@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from router.clock import boottime_ns
 from router.engine.timers import P, R, Timer
 from router.log import logger
-from router.threads import LEAVING_S, Alarm, StuckError, join_or_leave
+from router.threads import LEAVING_S, Alarm, StuckError, Thread, join_or_leave
 
 _NEVER = 1 << 63
 _RETRY = 100_000_000
@@ -33,7 +33,7 @@ class TimerThread:
         self._alarm = Alarm()
         self._waits_until = 0  # while the thread does not wait
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = Thread(self._run, name)
 
     def add(self, timer: Timer) -> None:
         """Serve `timer` from now on. Idempotent; for one thread at a time.
@@ -152,19 +152,15 @@ class Timers:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         names = "deadman", "inbound deadman", "pacing", "holding", "collect"
-        self._threads = tuple(TimerThread(name, failed) for name in names)
-        self.deadman, self.inbound_deadman, self.pacing, self.holding, self.collecting = self._threads
+        self.threads = tuple(TimerThread(name, failed) for name in names)
+        """To be stopped in reverse order: open frames first, then messages that wait, deadmen last."""
+        self.deadman, self.inbound_deadman, self.pacing, self.holding, self.collecting = self.threads
 
     def start(self) -> None:
-        for thread in self._threads:
+        for thread in self.threads:
             thread.start()
-
-    def stop(self) -> None:
-        """End all timers: open frames first, then messages that wait, deadmen last."""
-        for thread in reversed(self._threads):
-            thread.stop()
 
     def release(self, candidates: Sequence[object]) -> None:
         """End those of the candidates that are timers, in the same order."""
-        for thread in reversed(self._threads):
+        for thread in reversed(self.threads):
             thread.release(candidates)

@@ -12,6 +12,7 @@ from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener
 from router.table.model import RouteTable
+from router.threads import Thread
 from router.types.proto_files import walk
 
 PERIOD = 0.5
@@ -38,7 +39,7 @@ class Watcher:
         self._changed = changed
         self._handled = self._snapshot()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
+        self._thread = Thread(self._run, "watch")
         self._thread.start()
 
     def close(self) -> None:
@@ -79,7 +80,7 @@ class InterfaceWatcher:
         self._listeners = listeners
         self._reopen = reopen
         self._stopped = threading.Event()
-        threading.Thread(target=self._run, name="interfaces", daemon=True).start()
+        Thread(self._run, "interfaces").start()
 
     def close(self) -> None:
         self._stopped.set()

@@ -90,7 +90,7 @@ class Deadmen:
     def command(
         self, sender: NativeSender, feeds: Sequence[tuple[NativeDeadman, bool]]
     ) -> Callable[[bytes, int | None], int]:
-        """Return what sends a command: it checks `expires`, feeds or disarms (True) deadmen and sends, under the lock.
+        """Return what sends a command: it checks `expires`, sends, and feeds or disarms (True) deadmen, under the lock.
 
         Returns the number of bytes sent; raises Stale, or OSError.
         """

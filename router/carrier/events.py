@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import select
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from socket import inet_ntoa
@@ -14,6 +13,7 @@ from router.carrier.program import Names
 from router.carrier.ring import Ring
 from router.compiler.metrics import REJECT_REASONS
 from router.engine.delivery import Report
+from router.threads import Thread, join_or_leave
 
 _TRIPPED, _RELEASED, _DEADMAN_ERROR, _REJECTED, _LOST = range(1, 6)
 """`enum event_kind`."""
@@ -70,14 +70,14 @@ class EventThread:
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in rings]
         """By ring and counter: how much of it was reported, and the last report."""
         self._wakes = [ring.watch() for ring, _ in rings]
-        self._thread = threading.Thread(target=self._run, name="carrier events", daemon=True)
+        self._thread = Thread(self._run, "carrier events")
         self._thread.start()
 
     def close(self) -> None:
         """Read what has been told, and end."""
         self._stopping = True
         os.eventfd_write(self._wakes[0], 1)
-        self._thread.join()
+        join_or_leave(self._thread)
 
     def _run(self) -> None:
         poll = select.poll()

@@ -15,6 +15,7 @@ from time import sleep
 from router.carrier.ring import Ring
 from router.engine.dispatch import ServePart
 from router.engine.freshness import Born
+from router.threads import Thread
 
 _TRIES, _TRY_S = 100, 0.0002
 
@@ -52,7 +53,7 @@ class Worker:
         self._latest = 0
         self._switched = threading.Condition()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = Thread(self._run, name)
 
     @property
     def name(self) -> str:

@@ -43,10 +43,10 @@ class Deadman(Timer):
     armed:   trips `timeout` after the last command was sent.
     tripped: has sent the payload when it tripped, and repeats it on the grid of the time at which that was due.
 
-    Sending a command arms the deadman in any state (`feed`); a command of a route that it hands over to disarms it
-    (`disarm`). Both are to be called right before the command is sent, not when it begins to wait, so that the deadman
-    sends nothing behind the command. Calls of a deadman that was replaced act on its successor: what waits during a
-    reload is sent afterwards.
+    A command that was sent arms the deadman in any state (`feed`); one of a route that it hands over to disarms it
+    (`disarm`). Both are called after the sending has succeeded, under the lock that was taken before it, so the deadman
+    sends nothing in between. A command that failed changes nothing: the deadman trips when no other one leaves. Calls
+    of a deadman that was replaced act on its successor: what waits during a reload is sent afterwards.
 
     `start` and `greet` send the payload when the router starts, without a change of state. `send` is by endpoint and
     may raise OSError, which is counted and reported. `changed` is called with the route and whether the deadman is now
@@ -85,14 +85,14 @@ class Deadman(Timer):
         self._changed = changed
 
     def feed(self, now: int) -> None:
-        """Called when a fresh command is about to be sent."""
+        """Called when a command was sent at `now`."""
         acting = self._acting[0]
         acting.next_due = now + acting._plan.timeout
         acting._greets_again = False
         acting._release()
 
     def disarm(self, now: int) -> None:
-        """Called when a fresh command of a route that it hands over to is about to be sent."""
+        """Called when a command of a route that it hands over to was sent."""
         acting = self._acting[0]
         acting.next_due = None
         acting._release()
@@ -218,8 +218,9 @@ def commander(
             now = clock_ns()
             if expires is not None and now > expires:
                 raise Stale
+            size = send_one(data)
             feed(now)
-            return send_one(data)
+            return size
 
         return locked(deadmen[names[0]], send_fed)
 

@@ -28,14 +28,14 @@ Times of the boot clock in ns. The message is counted before or after the return
 """
 
 Feed = Callable[[int], None]
-"""Called right before a command is sent, with the time (boot clock, ns): restarts the timeouts of its deadmen."""
+"""Called when a command was sent, with the time of that (boot clock, ns): restarts the timeouts of its deadmen."""
 
 Command = Callable[[bytes, int | None], int]
 """Sends a datagram and returns its size; called with the datagram and the time (boot clock, ns) after which it
 is stale (None: never).
 
-Checks that, feeds or disarms the deadmen of the command and sends it, all under their lock: so no command leaves
-behind the datagram of a deadman that replaces it. Raises Stale or OSError.
+Checks that, sends the command and, if that succeeded, feeds or disarms its deadmen, all under their lock: so no command
+leaves behind the datagram of a deadman that replaces it. Raises Stale or OSError.
 """
 
 

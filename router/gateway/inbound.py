@@ -34,7 +34,7 @@ class RefusedError(Exception):
 @dataclass(frozen=True, slots=True)
 class InboundOutputs:
     """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
-    the deadman's route, each called with the time (boot clock) before a message is published. Clocks in ns.
+    the deadman's route, each called once a message was published, with the time (boot clock) before that. Clocks in ns.
     """
 
     publish: Mapping[str, Callable[[bytes], None]]
@@ -141,12 +141,12 @@ class InboundPublisher:
             self._check_age(topic, topic.ttl, sent, arrived_ns, now)
         if topic.may_pass and not topic.may_pass(now):
             raise self._dropped(topic, "rate_limited", f"more often than {topic.max_rate:g} Hz")
-        if topic.plan.deadman is not None:
-            self._outputs.feed_deadman[topic.plan.deadman.route](now)
         try:
             self._outputs.publish[topic.plan.label](cdr)
         except self._outputs.publish_errors as error:
             raise self._dropped(topic, "publish_error", str(error), error) from error
+        if topic.plan.deadman is not None:
+            self._outputs.feed_deadman[topic.plan.deadman.route](now)
         self._counts[topic.published] += 1
 
     def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:

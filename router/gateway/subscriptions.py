@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from router.compiler.lookup import layout
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
 from router.gateway.publishers import Selection, select
+from router.threads import DaemonThread
 from router.types.model import MessageType
 from router.types.ros import RosInterfaces
 
@@ -194,7 +194,7 @@ class Subscriptions:
         self._loop = loop
         self._open: dict[tuple[str, bool], TopicSubscription] = {}  # by topic, and whether every message is wanted
         self._types: dict[str, ReadyType | str] = {}  # or why a type cannot be received
-        self._loader = ThreadPoolExecutor(1, thread_name_prefix="gateway types")
+        self._loader = DaemonThread("gateway types")
 
     def resolved(self, names: Iterable[str]) -> frozenset[str]:
         """Return the absolute names that ROS makes of these."""

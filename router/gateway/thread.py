@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
@@ -34,7 +33,7 @@ from router.log import logger
 from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
-from router.threads import DaemonThread, StuckError, join_or_leave
+from router.threads import DaemonThread, StuckError, Thread, join_or_leave
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -47,6 +46,10 @@ MOST_REQUEST = 4096
 
 _PATIENCE_S = 5.0
 """Seconds for which a change of gateways waits for the event loop: opening a Zenoh session takes some."""
+_PATIENCE_OF_STOP_S = 2.5
+
+_CLOSED = "Invalid file descriptor: -1"
+"""What asyncio raises when it wants to accept again, a second after descriptors ran out, and the socket is closed."""
 
 PAGE = Path(__file__).with_name("page.html")
 
@@ -83,7 +86,7 @@ class GatewayThread:
         self._converting = DaemonThread("gateway bulk")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
-        self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
+        self._thread = Thread(self._loop.run_forever, "gateway")
         self._services: dict[str, GatewayService] = {}
         self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
         self._context = GatewayContext(self._subscriptions, self._converting, failed, boottime_ns, wall_ns)
@@ -184,7 +187,7 @@ class GatewayThread:
     def stop(self) -> None:
         """Close all gateways and end the thread. If it is stuck in the middleware, that is logged, and it is left."""
         try:
-            self._call(_close(self._services.values()))
+            self._call(_close(self._services.values()), _PATIENCE_OF_STOP_S)
         except StuckError as error:
             logger.error("gateways are left open", why=str(error))
         finally:  # a running thread would keep the process
@@ -194,17 +197,19 @@ class GatewayThread:
             if join_or_leave(self._thread):
                 self._loop.close()
 
-    def _call(self, work: Coroutine[Any, Any, T]) -> T:
+    def _call(self, work: Coroutine[Any, Any, T], patience: float = _PATIENCE_S) -> T:
         """Do work in the loop. Raises StuckError if the loop is stuck, as when a client's message is published."""
         done = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
-            return done.result(_PATIENCE_S)
+            return done.result(patience)
         except FutureTimeoutError as error:
             raise StuckError("the gateways are stuck in the middleware") from error
 
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Report what a callback of the loop raised: a fault of the router."""
         error = context.get("exception")
+        if isinstance(error, ValueError) and str(error) == _CLOSED:
+            return
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
 
 

@@ -12,7 +12,6 @@ import select
 import socket
 import struct
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +23,7 @@ from router.clock import boottime_ns, wall_ns
 from router.engine.dispatch import Peer
 from router.engine.freshness import Freshness
 from router.net.udp import Listener
+from router.threads import Thread, join_or_leave
 
 Receive = Callable[[bytes, Peer], object]
 """Takes a datagram. What it returns is of no use here."""
@@ -59,6 +59,9 @@ _FAULT_PAUSE = 0.001
 
 _MOST_WAITING = 1 << 16
 """The most datagrams that are read when a listener ends: more than a receive buffer holds."""
+
+_EMPTYING_S = 2.5
+"""How long the end of the thread may take, with all that is read then."""
 
 _ppoll = ctypes.CDLL(None).ppoll
 """Python's own functions wait for whole milliseconds, or (select) for no descriptor above 1023."""
@@ -168,7 +171,7 @@ class ReceiveThread:
         self._turns = 0
         self._tasks: deque[Callable[[], None]] = deque()
         self._first: Callable[[], None] | None = None
-        self._thread = threading.Thread(target=self._run, name="receive")
+        self._thread = Thread(self._run, "receive")
 
     @property
     def turns(self) -> int:
@@ -231,7 +234,7 @@ class ReceiveThread:
         for listener in self._listeners:
             listener.end_input()
         self._tasks.append(self._end)
-        self._thread.join()
+        join_or_leave(self._thread, _EMPTYING_S)
 
     def _end(self) -> None:
         for reader in self._readers:

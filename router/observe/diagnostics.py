@@ -19,7 +19,7 @@ from router.log import logger
 from router.observe.running import Running
 from router.observe.snapshot import MOST_STALLED, Labels, Snapshot, snapshot
 from router.table.model import Endpoint, Route
-from router.threads import background_threads, join_or_leave
+from router.threads import Thread, background_threads, join_or_leave
 
 PERIOD = 1.0
 """Seconds."""
@@ -98,7 +98,7 @@ class Diagnostics:
         self._watch = Watch(running)
         self._publish = publish
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="diagnostics", daemon=True)
+        self._thread = Thread(self._run, "diagnostics")
         with background_threads():
             self._thread.start()
 

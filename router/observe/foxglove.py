@@ -19,13 +19,13 @@ from google.protobuf.descriptor import Descriptor
 
 from router.compiler.program import Program
 from router.errors import Located, StartError
-from router.log import logger
-from router.net.kernel import port_holder
+from router.log import fault, logger
+from router.net.kernel import is_listening, port_holder
 from router.observe.running import Running
 from router.recording.channels import descriptor_set
 from router.recording.mirror import Classifier, Mirrored, first_field
 from router.table.addresses import Address
-from router.threads import background_threads
+from router.threads import Thread, background_threads, join_or_leave
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0
@@ -68,17 +68,21 @@ class FoxgloveServer(ServerListener):
         self._subscribed: set[tuple[int, int]] = set()  # client and channel
         self._detach: Callable[[], None] | None = None
         self._changed, self._is_closing = threading.Event(), False
-        self._thread = threading.Thread(target=self._run, name="foxglove")
+        self._thread = Thread(self._run, "foxglove")
         with background_threads():
             self._server = _started(address, running.program.table.node.name, self._context, self)
+            self._address = Located(Address(address.value.host, self._server.port), address.span)
             self._view = self._view_of(running.program)
             self._thread.start()
-        self.address = Address(address.value.host, self._server.port)
+
+    @property
+    def address(self) -> Address:
+        return self._address.value
 
     def close(self) -> None:
         self._is_closing = True
         self._changed.set()
-        self._thread.join()
+        join_or_leave(self._thread)
         self._server.stop()
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
@@ -96,15 +100,28 @@ class FoxgloveServer(ServerListener):
             self._changed.wait(LOOK_SECONDS)
             self._changed.clear()
             try:
+                self._listen_again()
                 self._update_channels()
                 self._attach_while_subscribed()
+            except StartError as error:
+                if is_well:
+                    logger.error("the view for Foxglove is closed: trying on", why=str(error))
+                is_well = False
             except Exception as error:  # noqa: BLE001 a fault of the router, reported once; it may be over next time
                 if is_well:
-                    logger.critical("a fault in the view for Foxglove; please report it", exc_info=error)
+                    fault(error, "holds it up", "the view for Foxglove").log()
                 is_well = False
             else:
                 is_well = True
         self._detach_from_mirror()
+
+    def _listen_again(self) -> None:
+        """The library ceases to accept connections for good when descriptors run out. Raises StartError."""
+        if not is_listening(self.address.port):
+            self._server.stop()
+            self._subscribed.clear()
+            self._server = _started(self._address, self._running.program.table.node.name, self._context, self)
+            logger.warning("Foxglove could not connect any more, and can again", address=str(self.address))
 
     def _attach_while_subscribed(self) -> None:
         if not self._subscribed:

@@ -20,19 +20,16 @@ import ipaddress
 import re
 import socket
 import struct
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from email.message import Message
 from enum import IntEnum
-from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from io import BytesIO
 from pathlib import Path
-from socketserver import ThreadingTCPServer
 from time import monotonic, sleep
 from typing import Any
 from urllib.parse import parse_qs
@@ -40,13 +37,14 @@ from urllib.parse import parse_qs
 from prometheus_client.exposition import gzip_accepted
 
 from router.errors import SourceSpan, StartError
-from router.log import logger
+from router.log import FloodLog, fault
 from router.net.kernel import port_holder
 from router.observe.responses import SAVE, Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
 from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
 from router.table.addresses import Address
+from router.threads import REST_S, Thread, join_or_leave
 
 MAX_PER_HOST = 16
 """Connections. The router's own computer counts as one host, whatever its addresses."""
@@ -95,45 +93,81 @@ class HttpServer:
             why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
             what = f"{span}: metrics cannot be served at {address}: {why}"
             raise StartError(what, "choose another http.address") from error
-        self._thread = threading.Thread(target=self._server.serve_forever, name="http", daemon=True)
-        self._thread.start()
+        self._thread = Thread(self._server.serve, "http")
+        try:
+            self._thread.start()
+        except BaseException:
+            self._server.socket.close()
+            raise
         self.address = Address(*self._server.socket.getsockname())
 
     def close(self) -> None:
-        # The server looks every half second whether it is to stop, and whenever its socket stirs.
-        self._server.socket.shutdown(socket.SHUT_RDWR)
-        self._server.shutdown()
-        self._thread.join()
+        self._server.end()
+        join_or_leave(self._thread)
         self._server.connections.end_all()
-        self._server.server_close()
+        self._server.socket.close()
         self._status.close()
 
 
-class _Server(ThreadingTCPServer):
-    """A thread for each connection that is admitted; others are closed at once."""
+class _Server:
+    """A thread for each connection that is admitted; others are closed at once.
 
-    allow_reuse_address = True
-    daemon_threads = True
-    block_on_close = False
-    request_queue_size = 256
+    Where memory, threads or descriptors have run out, the connection is closed, and the next one accepted after a rest.
+    """
 
     def __init__(self, address: Address, responder: Responder) -> None:
         self.connections = Connections()
-        super().__init__(address, partial(_Handler, responder, self.connections))
+        self._responder = responder
+        self._log = FloodLog()
+        self._is_ending = False
+        self.socket = socket.create_server(address, backlog=256)
 
-    def verify_request(self, request: Any, client_address: Any) -> bool:
-        is_own = is_own_computer(client_address[0], request.getsockname()[0])
-        return self.connections.admit(request, OWN_COMPUTER if is_own else client_address[0])
+    def serve(self) -> None:
+        """Accept until `end`."""
+        while not self._is_ending:
+            try:
+                self._accept()
+            except Exception as error:  # noqa: BLE001 reported; whatever it was, the next client is served
+                if not self._is_ending:
+                    self._lost(error)
+                    sleep(REST_S)
 
-    def shutdown_request(self, request: Any) -> None:
-        self.connections.remove(request)
-        super().shutdown_request(request)
+    def end(self) -> None:
+        self._is_ending = True
+        self.socket.shutdown(socket.SHUT_RDWR)  # wakes `accept`
+        self._log.flush(final=True)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Called in an except block. Clients that leave are no error."""
-        error = sys.exc_info()[1]
-        if not isinstance(error, (ConnectionError, TimeoutError)):
-            logger.critical("a fault in the router itself lost an answer over HTTP; please report it", exc_info=error)
+    def _accept(self) -> None:
+        connection, peer = self.socket.accept()
+        try:
+            is_own = is_own_computer(peer[0], connection.getsockname()[0])
+            if self.connections.admit(connection, OWN_COMPUTER if is_own else peer[0]):
+                Thread(self._serve, "http connection", (connection, peer)).start()
+            else:
+                connection.close()
+        except BaseException:
+            self._close(connection)
+            raise
+
+    def _serve(self, connection: socket.socket, peer: object) -> None:
+        try:
+            _Handler(self._responder, self.connections, connection, peer, self)
+        except (ConnectionError, TimeoutError):
+            pass  # the client has left
+        except Exception as error:  # noqa: BLE001 reported, and lost to this client alone
+            self._lost(error)
+        finally:
+            self._close(connection)
+
+    def _close(self, connection: socket.socket) -> None:
+        self.connections.remove(connection)
+        with suppress(OSError):  # the client has left already
+            connection.shutdown(socket.SHUT_WR)
+        connection.close()
+
+    def _lost(self, error: Exception) -> None:
+        self._log.note(type(error).__name__, *fault(error, "lost an answer over HTTP"))
+        self._log.flush()
 
 
 class _Stage(IntEnum):

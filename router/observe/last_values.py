@@ -15,6 +15,7 @@ from google.protobuf.json_format import MessageToDict
 from router.compiler.program import Program
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, first_field
+from router.threads import Thread
 
 LOOKED_AT_SECONDS = 5.0
 """How long the mirror stays attached after a request; a page asks every second."""
@@ -45,7 +46,11 @@ class LastValues:
             if self._detach is None and not self._closing.is_set():
                 self._values = {}
                 self._detach = self._running.mirror.attach(self._take)
-                threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
+                try:
+                    Thread(self._end_when_idle, "last values").start()
+                except BaseException:
+                    self._end()
+                    raise
             with self._newest_lock:
                 newest, self._newest = self._newest, {}
             classifier = Classifier(program.envelope, program.table)

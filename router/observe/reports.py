@@ -6,9 +6,10 @@ import threading
 from collections.abc import Callable
 
 from router.engine import Report
-from router.log import SUMMARY_INTERVAL_NS, FloodLog, logger
+from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import nobody_listens
 from router.table.addresses import Address
+from router.threads import Thread, join_or_leave
 
 
 class Reporter:
@@ -19,13 +20,13 @@ class Reporter:
         self._address_of = address_of
         self._floods = FloodLog()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._summarise, name="log", daemon=True)  # the start may fail
+        self._thread = Thread(self._summarise, "log")  # the start may fail
         self._thread.start()
 
     def close(self) -> None:
         """Log what has not been logged yet."""
         self._stopped.set()
-        self._thread.join()
+        join_or_leave(self._thread)
         self._floods.flush(final=True)
 
     def report(self, report: Report) -> None:
@@ -63,12 +64,7 @@ class Reporter:
         return str(error) if address is None else nobody_listens(address)
 
     def failed(self, error: Exception) -> None:
-        self._floods.note(
-            ("bug", type(error)),
-            logger.critical,
-            "a fault in the router itself lost a message; please report it",
-            error,
-        )
+        self._floods.note(("bug", type(error)), *fault(error, "lost a message"))
 
     def deadman_changed(self, route: str, active: bool) -> None:
         if active:

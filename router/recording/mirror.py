@@ -17,6 +17,7 @@ from router.clock import wall_ns
 from router.compiler.network import recognisers
 from router.engine.dispatch import Peer, Receive
 from router.table.model import Framing, RouteTable
+from router.threads import Thread, join_or_leave
 from router.types.framing import MAX_DATAGRAM, restored
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import LEN, varint
@@ -68,7 +69,7 @@ class Mirror:
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
         self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: Thread | None = None
 
     @property
     def is_observed(self) -> bool:
@@ -81,11 +82,13 @@ class Mirror:
         A consumer must not detach itself; one that is being called while it is detached finishes that call.
         """
         with self._attaching:
+            if not self._consumers:
+                stopping = threading.Event()
+                thread = Thread(self._run, "mirror", (stopping,))
+                thread.start()
+                self._stopping, self._thread = stopping, thread
             self._consumers = (*self._consumers, consumer)
             if len(self._consumers) == 1:
-                self._stopping = threading.Event()
-                self._thread = threading.Thread(target=self._run, name="mirror", args=(self._stopping,), daemon=True)
-                self._thread.start()
                 self._rewire()
 
         def detach() -> None:
@@ -138,8 +141,8 @@ class Mirror:
     def _end(self) -> None:
         assert self._thread is not None  # noqa: S101 - there is one while there are consumers
         self._stopping.set()
-        self._thread.join()
-        self._deliver()
+        if join_or_leave(self._thread):
+            self._deliver()
 
     def _run(self, stopping: threading.Event) -> None:
         while not stopping.wait(PERIOD):

@@ -17,13 +17,13 @@ from pathlib import Path
 from router.clock import boottime_ns, wall_ns
 from router.compiler.program import Program
 from router.errors import RouterError
-from router.log import logger
+from router.log import fault, logger
 from router.recording.channels import Channels
 from router.recording.encoder import LONGEST_CHUNK, Chunk, Encoder
 from router.recording.mirror import Classifier, Mirror, Mirrored
 from router.recording.writer import ContinuousWriter, RecordingDirectory
 from router.table.model import RecordSettings
-from router.threads import WakeEvent
+from router.threads import Thread, WakeEvent
 
 PERIOD = 500_000_000
 """ns from chunk to chunk: what a kill costs, with what the mirror still has; more only where the disk is slow."""
@@ -95,7 +95,7 @@ class Recorder:
         self._requesting = threading.Lock()
         self._closing = False
         self._wake_up = WakeEvent()
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)  # a disk may hang
+        self._thread = Thread(self._run, "recorder")  # a disk may hang
         self._thread.start()
         self._detach = mirror.attach(self._take)
 
@@ -225,7 +225,7 @@ class Recorder:
     def _report(self, error: Exception) -> None:
         """Log a fault, and not those that follow it."""
         if self._is_well:
-            logger.critical("a fault in the recorder lost datagrams; please report it", exc_info=error)
+            fault(error, "lost datagrams", "the recorder").log()
         self._is_well = False
 
     def _save_requested(self) -> None:
@@ -258,8 +258,9 @@ class Recorder:
             logger.error("the last datagrams could not be saved", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
         except Exception as error:
-            logger.critical("a fault in the recorder kept it from saving; please report it", exc_info=error)
-            raise RecordError(f"a fault in the router itself: {error!r}") from error
+            found = fault(error, "kept it from saving", "the recorder")
+            found.log()
+            raise RecordError(f"{found.event}: {error!r}") from error
         logger.info("saved the last datagrams", reason=reason, file=str(path))
         return path
 

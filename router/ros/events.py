@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -18,9 +17,9 @@ from rclpy.qos import qos_policy_name_from_kind
 from router.clock import monotonic_ns
 from router.compiler.metrics import QOS_POLICIES
 from router.compiler.program import TopicPlan
-from router.log import logger
+from router.log import fault, logger
 from router.ros.qos import ActualQos, incompatible_policies
-from router.threads import join_or_leave
+from router.threads import Thread, join_or_leave
 
 if TYPE_CHECKING:
     from router.ros.endpoints import Publication, Subscription
@@ -193,7 +192,7 @@ class EventThread:
         self._context = node.context
         self._check = check
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="ros events", daemon=True)
+        self._thread = Thread(self._run, "ros events")
 
     def start(self) -> None:
         self._thread.start()
@@ -227,4 +226,4 @@ class EventThread:
         try:
             callback()
         except Exception as error:  # noqa: BLE001 a bug, which is logged; the next events are served
-            logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
+            fault(error, "lost an event").log()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import select
-import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -20,7 +19,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from router.clock import boottime_ns, wall_ns
 from router.engine.freshness import Freshness
 from router.ros.rcl import RCL, address
-from router.threads import join_or_leave, paused
+from router.threads import Thread, join_or_leave, paused
 
 Receive = Callable[[bytes, int, bool], None]
 """Called with CDR bytes, the time at which the message set out, in ns of the wall clock, and whether it is known to
@@ -199,7 +198,7 @@ class MessageThread:
         self._arrivals = Arrivals([])
         self._tasks: deque[Callable[[], None]] = deque()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
+        self._thread = Thread(self._run, "ros")
 
     @classmethod
     def serving(

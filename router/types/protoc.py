@@ -9,6 +9,7 @@ import posixpath
 import re
 import tempfile
 from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import grpc_tools
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import _protoc_compiler
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest, shown_path
+from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, did_you_mean, nearest, shown_path
 from router.types.proto_files import Folder, declaring, scan
 from router.types.proto_source import ProtoText
 
@@ -165,13 +166,12 @@ def compile_protos(folder: Folder, names: Sequence[str], homes: Mapping[str, str
 
     Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. `homes`
     says which file a message is known to belong to: a second one of that name is blamed elsewhere.
-    Raises TableError with one finding for each error of protoc.
+    Raises TableError with one finding for each error of protoc, and StartError.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        include = _include(scratch, folder, names)
+    with _scratch(folder, names) as include:
         if complaints := _complaints(include):
             raise TableError(findings_of(complaints, folder, homes))
-        output = Path(scratch, "descriptors")
+        output = Path(include[0]).with_name("descriptors")
         options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
         arguments = ["protoc", *(f"--proto_path={path}" for path in include), *options, EVERYTHING]
         if status := _protoc_compiler.run_main([argument.encode() for argument in arguments]):
@@ -184,9 +184,24 @@ def compile_protos(folder: Folder, names: Sequence[str], homes: Mapping[str, str
 
 
 def check_protos(folder: Folder, compiled: Sequence[str], names: Sequence[str]) -> Sequence[Complaint]:
-    """What protoc says against the named files; those that were `compiled` come first, so that none of them clashes."""
-    with tempfile.TemporaryDirectory() as scratch:
-        return _complaints(_include(scratch, folder, [*compiled, *names]))
+    """What protoc says against the named files; those that were `compiled` come first, so that none of them clashes.
+
+    Raises StartError.
+    """
+    with _scratch(folder, [*compiled, *names]) as include:
+        return _complaints(include)
+
+
+@contextmanager
+def _scratch(folder: Folder, names: Sequence[str]) -> Iterator[list[str]]:
+    """The folders in which protoc finds EVERYTHING, in a temporary one that is removed. Raises StartError."""
+    with ExitStack() as ending:
+        try:
+            include = _include(ending.enter_context(tempfile.TemporaryDirectory()), folder, names)
+        except OSError as error:
+            what = f"protoc needs a temporary folder, and none can be written to: {error.strerror}"
+            raise StartError(what, "make /tmp writable, or set TMPDIR to a folder that is") from error
+        yield include
 
 
 def _include(scratch: str, folder: Folder, names: Sequence[str]) -> list[str]:

@@ -19,8 +19,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from structlog.testing import capture_logs
 
+from router import threads
 from router.app import Router
 from router.app.native_datapath import NativeDatapath
+from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
 from router.carrier.worker import Worker
 from router.compiler.metrics import REJECT_REASONS
@@ -28,6 +30,7 @@ from router.engine.dispatch import Receive
 from router.errors import StartError
 from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
+from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
 from router.recording.recorder import Recorder, RecordError
@@ -384,3 +387,26 @@ def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
         f"with Router(check_table(Path({str(path)!r})).program): sys.exit('rclpy' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize("place", ["_stop_gateways", "_stop_ros"])
+def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
+    site: Site, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    never = threading.Event()
+
+    def stuck(_: Runtime) -> None:
+        never.wait()
+
+    monkeypatch.setattr(threads, "STEP_S", 0.1)
+    monkeypatch.setattr(Runtime, place, stuck)
+    monkeypatch.setattr(HttpServer, "close", stuck)
+    more = f"http: {{address: 127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}}}\n"
+    with capture_logs() as logs:
+        with Router(site.program(ROUTE + TURNS.replace("20ms", "20s"), more)):
+            assert site.basestation.recv(1000) == BRAKE  # of the start
+            site.send(DRIVE)
+            assert site.basestation.recv(1000) == DRIVE
+        assert site.basestation.recv(1000) == BRAKE
+    never.set()
+    assert len([each for each in logs if each["event"] == "a step of the stop is stuck, and is left"]) == 2

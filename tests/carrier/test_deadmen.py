@@ -119,10 +119,10 @@ class PythonSide:
         self._deadmen.remove(deadman)
 
     def command(self, now: int, feeds: list[tuple[Deadman, bool]], data: bytes) -> None:
-        for deadman, disarms in feeds:
-            (deadman.disarm if disarms else deadman.feed)(now)
         with suppress(OSError):
             self._send["wheels"](data)
+            for deadman, disarms in feeds:
+                (deadman.disarm if disarms else deadman.feed)(now)
 
     def serve(self, now: int) -> None:
         for deadman in reversed(self._deadmen):

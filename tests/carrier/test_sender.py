@@ -22,6 +22,7 @@ from router.net import udp
 from router.net.kernel import IP_FREEBIND
 from router.net.udp import Inherited, Listener, Sender
 from router.table.addresses import Address
+from router.table.model import EndpointKind
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
 
@@ -309,16 +310,45 @@ def test_without_ipv6_it_sends_from_another_port_and_says_so(
     assert [(each["log_level"], each["listener"]) for each in logged] == [("warning", "rover")]
 
 
-def test_a_full_buffer_is_an_error_and_nobody_waits(stack: ExitStack, make: Make) -> None:
+def fill(sender: Sender) -> int:
+    """Send until the buffer is full. Return how many datagrams it has taken."""
+    for number in range(1000):
+        try:
+            sender.send(b"command %d" % number)
+        except BlockingIOError:
+            return number
+    pytest.fail("the buffer has room for everything")
+
+
+def test_of_commands_to_a_board_that_is_gone_few_are_kept_and_every_brake_is_sent(stack: ExitStack, make: Make) -> None:
     """The kernel keeps what it cannot send before it knows the receiver's hardware address."""
-    rover, station = stack.enter_context(computers("rover", "station"))
-    cable(rover, "lan", "10.78.1.1/24", station, "lan", "10.78.1.2/24")
-    sender = stack.enter_context(closing(rover.inside(lambda: make(endpoint("board", Address("10.78.1.9", 9000))))))
-    sender.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
-    with suppress(BlockingIOError):
-        for _ in range(100):
-            sender.send(b"x")
-        pytest.fail("the buffer has room for everything")
+    rover, lan = stack.enter_context(computers("rover", "lan"))
+    cable(rover, "lan0", "10.78.1.1/24", lan, "eth0", "10.78.1.2/24")
+    board = stack.enter_context(lan.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+    board.bind(("10.78.1.2", 9000))
+    board.settimeout(PATIENCE)
+    lan.ip("link", "set", "eth0", "down")
+    settings = replace(endpoint("board", Address("10.78.1.2", 9000)), kind=EndpointKind.BOARD)
+    sender = stack.enter_context(closing(rover.inside(lambda: make(settings))))
+    kept = fill(sender)
+    assert 16 <= kept <= 24
+    for _ in range(20):
+        assert sender.send_checked(b"brake") == 5
+        with pytest.raises(BlockingIOError):
+            sender.send(b"command too many")
+    lan.ip("link", "set", "eth0", "up")
+    arrived = [board.recv(100) for _ in range(kept + 20)]
+    assert arrived == [b"command %d" % number for number in range(kept)] + 20 * [b"brake"]
+    assert sender.send(b"command") == 7
+
+
+def test_a_burst_of_commands_to_a_board_passes(stack: ExitStack, make: Make, board: socket.socket) -> None:
+    settings = replace(endpoint("board", Address(*board.getsockname())), kind=EndpointKind.BOARD)
+    sender = stack.enter_context(closing(make(settings)))
+    commands = [b"command %d" % number for number in range(64)]
+    for command in commands:
+        sender.send(command)
+    assert [board.recv(100) for _ in commands] == commands
 
 
 def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStack, make: Make) -> None:

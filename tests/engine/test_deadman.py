@@ -167,7 +167,7 @@ def test_one_call_feeds_the_own_deadman_and_disarms_the_others(told: list[str], 
     assert {name for name in told if deadmen[name].next_due is not None} == armed
 
 
-def test_a_command_is_checked_fed_and_sent_under_the_lock() -> None:
+def test_a_command_is_checked_sent_and_fed_under_the_lock_and_one_that_fails_feeds_nothing() -> None:
     watched, taken = Watched(), list[str]()
 
     def locked(timer: Timer, call: Callable[P, R], /) -> Callable[P, R]:
@@ -182,20 +182,25 @@ def test_a_command_is_checked_fed_and_sent_under_the_lock() -> None:
 
     def send(data: bytes) -> int:
         taken.append(f"send, due at {watched.deadman.next_due}")
+        if data == b"fails":
+            raise PermissionError(errno.EPERM, "Operation not permitted")
         return len(data)
 
     command = commander({"board": send}, {"drive": watched.deadman}, locked, lambda: watched.now)
     send_command, send_other = command("board", "drive", ("drive",)), command("board", "status", ())
     assert send_command(b"12", 0) == 2
-    assert taken == ["lock", f"send, due at {TIMEOUT}", "unlock"]
+    assert (taken, watched.deadman.next_due) == (["lock", "send, due at None", "unlock"], TIMEOUT)
     watched.now = 1
     with pytest.raises(Stale):
         send_command(b"12", 0)
     assert (taken[3:], watched.deadman.next_due) == (["lock", "unlock"], TIMEOUT)
+    with pytest.raises(PermissionError):
+        send_command(b"fails", None)
+    assert (taken[5:], watched.deadman.next_due) == (["lock", f"send, due at {TIMEOUT}", "unlock"], TIMEOUT)
     with pytest.raises(Stale):
         send_other(b"12", 0)
     assert send_other(b"123", None) == 3
-    assert taken[5:] == [f"send, due at {TIMEOUT}"]
+    assert taken[8:] == [f"send, due at {TIMEOUT}"]
 
 
 gaps = st.lists(st.integers(0, 5 * TIMEOUT), min_size=1, max_size=30)

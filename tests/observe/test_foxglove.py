@@ -234,7 +234,7 @@ def test_a_fault_is_told_once_and_does_not_end_the_view(
 
     def fail(consumer: Consumer) -> Callable[[], None]:
         faults.release()
-        raise MemoryError
+        raise LookupError
 
     monkeypatch.setattr(foxglove, "LOOK_SECONDS", 0.01)
     with capture_logs() as logs:

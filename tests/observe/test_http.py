@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from router.errors import Code, Diagnostic, RouterError, SourceSpan
 from router.log import logger
@@ -589,3 +590,46 @@ def test_closing_ends_what_is_open(running: FakeRunning) -> None:
         response.read()
     running.mirror.close()
     assert running.failures == []
+
+
+def test_a_connection_without_a_thread_is_closed_and_the_next_is_served(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads are refused, or die before they run; it is no fault of the router, and a flood of it is one line."""
+
+    class NoThread:
+        def __init__(self, *_: object) -> None: ...
+
+        def start(self) -> None:
+            raise RuntimeError("can't start new thread")
+
+    with capture_logs() as logs:
+        with monkeypatch.context() as short:
+            short.setattr(server_module, "REST_S", 0.0)
+            short.setattr(server_module, "Thread", NoThread)
+            for _ in range(2 * MAX_PER_HOST):
+                with pytest.raises((ConnectionError, http.client.RemoteDisconnected)):
+                    ask(server, "/ready")
+        assert ask(server, "/ready").status == 200
+    what = "memory, threads or descriptors have run out, which lost an answer over HTTP: can't start new thread"
+    assert [(each["event"], each["log_level"]) for each in logs] == [(what, "error")]
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EMFILE, "Too many open files"), MemoryError()], ids=["EMFILE", "memory"]
+)
+def test_accepting_goes_on_after_a_shortage(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    failed = threading.Event()
+
+    def fail(_: object) -> None:
+        failed.set()
+        raise error
+
+    with monkeypatch.context() as short:
+        short.setattr(server_module._Server, "_accept", fail)
+        with suppress(ConnectionError, http.client.RemoteDisconnected):
+            ask(server, "/ready")  # the thread waits in the method that it had
+        assert failed.wait(10)
+    assert ask(server, "/ready").status == 200

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+
 import pytest
 
-from router.errors import Code, SourceSpan, TableError
+from router.errors import Code, SourceSpan, StartError, TableError
 from router.types.protobuf import load_protos
 from tests.types.conftest import Refused, Write, proto, settings, with_envelope
 
@@ -29,6 +31,18 @@ def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, m
     monkeypatch.setattr("router.types.protoc._protoc_compiler.get_protos", break_off)  # the first look
     with pytest.raises(TableError, match=r"perhaps they changed meanwhile: try again"):
         load_protos(*settings(root))
+
+
+def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write({"a.proto": proto("message Envelope {}")})
+
+    def refuse() -> None:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/']")
+
+    monkeypatch.setattr("router.types.protoc.tempfile.TemporaryDirectory", refuse)
+    with pytest.raises(StartError, match=r"none can be written to: No usable temporary directory") as refused:
+        load_protos(*settings(root))
+    assert refused.value.hint == "make /tmp writable, or set TMPDIR to a folder that is"
 
 
 @pytest.mark.parametrize(

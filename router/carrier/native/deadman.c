@@ -243,9 +243,11 @@ void deadmen_serve(struct deadmen *deadmen, int64_t now) {
 int command_send_at(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now) {
     if (now > expires) return COMMAND_STALE;
+    int error = sender_send(sender, data, size);
+    if (error || !count) return error;
     for (uint32_t index = 0; index < count; index++) feed_one(deadmen, &feeds[index], now);
-    if (count) note_due(deadmen);
-    return sender_send(sender, data, size);
+    note_due(deadmen);
+    return 0;
 }
 
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,

@@ -40,7 +40,7 @@ struct deadmen {
     struct deadman *first;     /* a linked list */
 };
 
-/* What a command does to a deadman before it is sent. */
+/* What a command does to a deadman once it is sent. */
 struct feed {
     struct deadman *deadman;
     uint32_t disarms; /* 1: the command is of a route that the deadman hands over to */
@@ -75,9 +75,10 @@ void deadmen_serve(struct deadmen *deadmen, int64_t now);
 
 enum { COMMAND_STALE = -1 };
 
-/* Send a command: check that it has not expired (`expires`, boot clock, ns; NEVER: it does not), feed or disarm the
- * deadmen, and send, all under the lock. Return 0, COMMAND_STALE, or an errno of `sender_send`. Without feeds the lock
- * is not taken. */
+/* Send a command: check that it has not expired (`expires`, boot clock, ns; NEVER: it does not), send it, and feed or
+ * disarm the deadmen if that returned no error, all under the lock. Return 0, COMMAND_STALE, or an errno of
+ * `sender_send`. A board that refused an earlier command (ECONNREFUSED) feeds nothing either. Without feeds the lock is
+ * not taken. */
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count);
 

@@ -1,6 +1,7 @@
 #include "sender.h"
 
 #include <errno.h>
+#include <limits.h>
 #include <linux/errqueue.h>
 #include <netinet/ip_icmp.h>
 #include <pthread.h>
@@ -149,6 +150,20 @@ int sender_send(struct sender *sender, const void *data, size_t size) {
     return error ? error : take_refused(sender);
 }
 
+static void ask_for_room(int fd, int bytes) { setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes); }
+
+/* Send though the socket keeps as much as it may. What it keeps still counts: commands are refused as before. Return 0 or an
+ * errno. */
+static int send_beyond_room(struct sender *sender, const void *data, size_t size) {
+    int fd = atomic_load(&sender->fd), room;
+    socklen_t length = sizeof room;
+    if (getsockopt(fd, SOL_SOCKET, SO_SNDBUF, &room, &length)) return errno;
+    ask_for_room(fd, INT_MAX / 2); /* the kernel grants net.core.wmem_max */
+    int error = send_once(sender, data, size);
+    ask_for_room(fd, room / 2); /* the kernel doubles what is asked for, and returns the doubled value */
+    return error;
+}
+
 static void note_errors_of(struct sender *sender) {
     note_own_errors(sender);
     int listener = atomic_load(&sender->listener);
@@ -158,6 +173,7 @@ static void note_errors_of(struct sender *sender) {
 int sender_send_checked(struct sender *sender, const void *data, size_t size) {
     note_errors_of(sender); /* of earlier datagrams: they are not taken for this one's */
     int error = sender_send(sender, data, size);
+    if (error == EAGAIN) error = send_beyond_room(sender, data, size);
     if (error) return error;
     note_errors_of(sender);
     return take_refused(sender);

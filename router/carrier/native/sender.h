@@ -35,8 +35,9 @@ void sender_move(struct sender *sender, int fd, int listener);
  * there (ECONNREFUSED), or its firewall says no. Then this datagram was sent, so the counters balance. */
 int sender_send(struct sender *sender, const void *data, size_t size);
 
-/* As `sender_send`, but also return errors of this datagram that are known at once: no process listens on a local port.
- * With `sender_send`, a later datagram would get that error. */
+/* As `sender_send`, for deadmen. A send buffer that commands have filled does not stop the datagram. Errors of this datagram
+ * that are known at once are returned as well: no process listens on a local port. With `sender_send`, a later datagram
+ * would get that error. One thread at a time may send so. */
 int sender_send_checked(struct sender *sender, const void *data, size_t size);
 
 /* Read the ICMP errors that a listener has, and tell the senders whose datagrams they are about. Return whether there
