@@ -18,6 +18,7 @@ from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
+from tests.carrier.whole import library as clocked_library
 from tests.engine.rig import Rig, program
 
 ROUTES = """\
@@ -378,3 +379,68 @@ def test_messages_without_freshness_are_not_urgent(tmp_path: Path) -> None:
     slowly = program(tmp_path, routes.replace("auto", "{x: x + 1}"))
     executor = slowly.executors["rover_localization", "where", "basestation"]
     assert executor.reason == "`x: x + 1` needs it"
+
+
+class Clocks:
+    """Those of a library with clocks that are set. Waits of its threads end at once when they would by the real one."""
+
+    def __init__(self, clocked: ctypes.CDLL) -> None:
+        self._boot, self._wall = (ctypes.c_int64.in_dll(clocked, name) for name in ("seam_boottime", "seam_wall"))
+        self.now, self.ahead = boottime_ns() + 10**15, wall_ns()
+        self.pass_time(0)
+
+    def pass_time(self, ns: int) -> None:
+        self.now += ns
+        self._boot.value, self._wall.value = self.now, self.wall
+
+    @property
+    def wall(self) -> int:
+        return self.now + self.ahead
+
+
+@pytest.fixture(scope="module")
+def clocked(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return clocked_library(tmp_path_factory.mktemp("clocked") / "clocked.so")
+
+
+@pytest.fixture
+def timed(clocked: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iterator[tuple[Commanding, Clocks]]:
+    with ExitStack() as stack:
+        clocks = Clocks(clocked)
+        commanding = Commanding(clocked, functions, program(tmp_path, ROUTES), stack)
+        commanding.serve()
+        yield commanding, clocks
+
+
+def settle(commanding: Commanding, messages: int) -> None:
+    wait_until(lambda: commanding.ledger().total("messages_received", "drive_motor") == messages)
+
+
+def test_a_publisher_that_goes_on_is_obeyed_at_once_after_its_clock_was_set_back(
+    timed: tuple[Commanding, Clocks],
+) -> None:
+    commanding, clocks = timed
+    board, obeyed = commanding.boards["driving_board"], 0
+    for number in range(1, 301):
+        clocks.pass_time(SECOND // 50)
+        if number == 200:
+            clocks.ahead -= 3 * SECOND
+        clocks.pass_time(0)
+        commanding.subscriptions["drive"].put(drive(number), clocks.wall)
+        settle(commanding, number)
+        obeyed += len(board.received())
+    assert obeyed == 300
+
+
+def test_commands_of_a_stall_stay_stale_whatever_was_done_to_the_clock(timed: tuple[Commanding, Clocks]) -> None:
+    commanding, clocks = timed
+    commanding.subscriptions["drive"].put(drive(1), clocks.wall)
+    settle(commanding, 1)
+    clocks.pass_time(5 * SECOND)
+    stamps = [clocks.wall + age * SECOND // 10 for age in range(20)]
+    clocks.ahead -= 3 * SECOND
+    clocks.pass_time(3 * SECOND)
+    for number, stamp in enumerate(stamps, 2):
+        commanding.subscriptions["drive"].put(drive(number), stamp)
+        settle(commanding, number)
+    assert len(commanding.boards["driving_board"].received()) == 1
