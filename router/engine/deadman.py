@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Command, Feed, Report, Stale
+from router.engine.delivery import Command, EarlierRefused, Feed, Report, Stale
 from router.engine.timers import Locked, Timer
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]
@@ -45,8 +45,9 @@ class Deadman(Timer):
 
     A command that was sent arms the deadman in any state (`feed`); one of a route that it hands over to disarms it
     (`disarm`). Both are called after the sending has succeeded, under the lock that was taken before it, so the deadman
-    sends nothing in between. A command that failed changes nothing: the deadman trips when no other one leaves. Calls
-    of a deadman that was replaced act on its successor: what waits during a reload is sent afterwards.
+    sends nothing in between. A command that failed changes nothing: the deadman trips when no other one leaves. One
+    that was sent though an earlier one was refused arms the deadman and puts off nothing (`arm`). Calls of a deadman
+    that was replaced act on its successor: what waits during a reload is sent afterwards.
 
     `start` and `greet` send the payload when the router starts, without a change of state. `send` is by endpoint and
     may raise OSError, which is counted and reported. `changed` is called with the route and whether the deadman is now
@@ -90,6 +91,15 @@ class Deadman(Timer):
         acting.next_due = now + acting._plan.timeout
         acting._greets_again = False
         acting._release()
+
+    def arm(self, now: int) -> None:
+        """Called when a command was sent at `now`, and the board is said to have refused an earlier one.
+
+        Nobody knows whether the board obeys this one, and the ICMP message may be forged: so nothing is put off.
+        """
+        acting = self._acting[0]
+        if acting.next_due is None or acting._greets_again:
+            acting.next_due, acting._greets_again = now + acting._plan.timeout, False
 
     def disarm(self, now: int) -> None:
         """Called when a command of a route that it hands over to was sent."""
@@ -213,18 +223,27 @@ def commander(
 
             return send_fresh
         feed = _feed(deadmen, route, names)
+        arm = deadmen[route].arm if route in names else _arm_none
 
         def send_fed(data: bytes, expires: int | None) -> int:
             now = clock_ns()
             if expires is not None and now > expires:
                 raise Stale
-            size = send_one(data)
+            try:
+                size = send_one(data)
+            except EarlierRefused:
+                arm(now)
+                raise
             feed(now)
             return size
 
         return locked(deadmen[names[0]], send_fed)
 
     return command
+
+
+def _arm_none(_: int) -> None:
+    """A route that has no deadman only disarms others."""
 
 
 def _feed(deadmen: Mapping[str, Deadman], route: str, names: Sequence[str]) -> Feed:

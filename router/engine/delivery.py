@@ -35,12 +35,17 @@ Command = Callable[[bytes, int | None], int]
 is stale (None: never).
 
 Checks that, sends the command and, if that succeeded, feeds or disarms its deadmen, all under their lock: so no command
-leaves behind the datagram of a deadman that replaces it. Raises Stale or OSError.
+leaves behind the datagram of a deadman that replaces it. Raises Stale or OSError; with EarlierRefused the deadman of
+the route is armed.
 """
 
 
 class Stale(Exception):
     """A message is older than `ttl`, and was not sent."""
+
+
+class EarlierRefused(ConnectionRefusedError):
+    """A datagram was sent, and its receiver is said to have refused an earlier one, which was counted as sent."""
 
 
 class BoardRefuses(OSError):

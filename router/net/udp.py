@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, MutableMapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
+from router.engine.delivery import EarlierRefused
 from router.errors import StartError
 from router.log import logger
 from router.net.kernel import (
@@ -355,8 +356,8 @@ class Sender:
     def send(self, data: bytes) -> int:
         """Send a datagram and return its size, or raise OSError: then exactly one is lost.
 
-        The error may be about an earlier datagram, which was counted as sent and which its receiver has refused. Then
-        this one was sent, so the counters balance.
+        With EarlierRefused that is an earlier datagram, which was counted as sent and which its receiver has refused.
+        This one was sent, so the counters balance.
         """
         try:
             sent = self._send_once(data)
@@ -429,7 +430,7 @@ class Sender:
     def _raise_refused(self) -> None:
         if self._refused:
             refused, self._refused = self._refused, 0
-            raise OSError(refused, os.strerror(refused))
+            raise EarlierRefused(refused, os.strerror(refused))
 
 
 def _open_sending(family: socket.AddressFamily) -> socket.socket:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable
 
@@ -60,7 +61,7 @@ class Reporter:
         )
 
     def _text(self, error: BaseException, target: str) -> str:
-        address = self._address_of(target) if isinstance(error, ConnectionRefusedError) else None
+        address = self._address_of(target) if isinstance(error, OSError) and error.errno == errno.ECONNREFUSED else None
         return str(error) if address is None else nobody_listens(address)
 
     def failed(self, error: Exception) -> None:

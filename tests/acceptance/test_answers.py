@@ -5,13 +5,14 @@ from __future__ import annotations
 import errno
 import signal
 import socket
+import struct
 from functools import partial
 
 import pytest
 
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import RouterProcess, key, wait_until
-from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover
+from tests.acceptance.two_networks import BASESTATION, BOARD, BRAKE, DRIVE, LAN, RADIO, Rover
 from tests.namespaces import Computer
 
 TABLE = """\
@@ -182,6 +183,25 @@ def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover, plane: str
         wait_until(lambda: site.count("messages_dropped_total", **refused) == 1, "the report of what they say")
 
 
+def test_forged_errors_about_the_board_keep_no_brake_away(site: Rover, plane: str) -> None:
+    """Each command leaves, and the board obeys it, though its computer is said to have refused the one before."""
+    text = TABLE.replace(
+        "{{none: a test}}", "{{timeout: 500ms, at_start: silent, send: {{manual_brake: {{brake: true}}}}}}"
+    )
+    with site.router(text, plane), site.radio.inside(raw_icmp) as forging:
+        refused = {"route": "manual_drive", "target": "driving_board", "reason": "send_error"}
+
+        def refusals() -> float:
+            return site.samples().get(key("messages_dropped_total", **refused), 0)
+
+        for sent in range(1, 4):
+            forging.sendto(refusal((LAN[0], 5000), BOARD), (RADIO[0], 0))
+            site.basestation.sendto(DRIVE, RADIO)
+            assert site.board.recv(1000) == DRIVE
+            wait_until(partial(lambda sent: refusals() == sent, sent), "the report of what they say")
+        assert site.board.recv(1000) == BRAKE
+
+
 def raw_icmp() -> socket.socket:
     return socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP)
 
@@ -192,8 +212,13 @@ def _checksum(data: bytes) -> bytes:
     return (0xFFFF - ((total & 0xFFFF) + (total >> 16))).to_bytes(2, "big")
 
 
-_ADDRESSES = socket.inet_aton(RADIO[0]) + socket.inet_aton("10.78.2.10")
-_QUOTED = bytes.fromhex("45000021000040004011 0000") + _ADDRESSES + bytes.fromhex("1388 2328 000d 0000 0000000000")
-_REFUSAL = bytes.fromhex("0303 0000 00000000") + _QUOTED + bytes(1)
-REFUSAL = _REFUSAL[:2] + _checksum(_REFUSAL) + _REFUSAL[4:]
-"""Port unreachable, about a datagram from the rover's port 5000 to the basestation's port 9000."""
+def refusal(sender: tuple[str, int], receiver: tuple[str, int]) -> bytes:
+    """Port unreachable, about a datagram between them."""
+    addresses = socket.inet_aton(sender[0]) + socket.inet_aton(receiver[0])
+    ports = struct.pack("!HH", sender[1], receiver[1])
+    quoted = bytes.fromhex("45000021000040004011 0000") + addresses + ports + bytes.fromhex("000d 0000 0000000000")
+    data = bytes.fromhex("0303 0000 00000000") + quoted + bytes(1)
+    return data[:2] + _checksum(data) + data[4:]
+
+
+REFUSAL = refusal(RADIO, BASESTATION)

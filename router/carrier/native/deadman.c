@@ -122,6 +122,15 @@ static void feed_one(struct deadmen *deadmen, const struct feed *feed, int64_t n
     release(deadmen, deadman);
 }
 
+/* A command has left, and the board is said to have refused an earlier one. Nobody knows whether it obeys this one, and the
+ * ICMP message may be forged: so the deadman is armed, and nothing is put off. */
+static void arm_one(const struct feed *feed, int64_t now) {
+    struct deadman *deadman = feed->deadman->acting;
+    if (feed->disarms || deadman->due != NEVER) return;
+    deadman->is_armed = true;
+    deadman->due = now + deadman->timeout;
+}
+
 static void serve_one(struct deadmen *deadmen, struct deadman *deadman, int64_t now) {
     /* Repetitions that a stalled process has missed are left out. */
     deadman->due += deadman->repeat * ((now - deadman->due) / deadman->repeat + 1);
@@ -243,11 +252,16 @@ void deadmen_serve(struct deadmen *deadmen, int64_t now) {
 int command_send_at(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now) {
     if (now > expires) return COMMAND_STALE;
-    int error = sender_send(sender, data, size);
-    if (error || !count) return error;
-    for (uint32_t index = 0; index < count; index++) feed_one(deadmen, &feeds[index], now);
+    int error = sender_send_only(sender, data, size);
+    if (error) return error;
+    int refused = sender_take_refused(sender);
+    if (!count) return refused;
+    for (uint32_t index = 0; index < count; index++) {
+        if (refused) arm_one(&feeds[index], now);
+        else feed_one(deadmen, &feeds[index], now);
+    }
     note_due(deadmen);
-    return 0;
+    return refused;
 }
 
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,

@@ -77,8 +77,8 @@ enum { COMMAND_STALE = -1 };
 
 /* Send a command: check that it has not expired (`expires`, boot clock, ns; NEVER: it does not), send it, and feed or
  * disarm the deadmen if that returned no error, all under the lock. Return 0, COMMAND_STALE, or an errno of
- * `sender_send`. A board that refused an earlier command (ECONNREFUSED) feeds nothing either. Without feeds the lock is
- * not taken. */
+ * `sender_send`. If that is about an earlier command (ECONNREFUSED), this one arms its deadman where it is unarmed, but
+ * puts off no deadline. Without feeds the lock is not taken. */
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count);
 

@@ -110,7 +110,7 @@ static bool note_own_errors(struct sender *sender) {
     return read;
 }
 
-static int take_refused(struct sender *sender) {
+int sender_take_refused(struct sender *sender) {
     if (!atomic_load_explicit(&sender->refused, memory_order_relaxed)) return 0;
     return atomic_exchange(&sender->refused, 0);
 }
@@ -144,10 +144,14 @@ static int send_again(struct sender *sender, const void *data, size_t size, int 
     return may_lack_address ? send_from_any_address(sender, data, size) : error;
 }
 
-int sender_send(struct sender *sender, const void *data, size_t size) {
+int sender_send_only(struct sender *sender, const void *data, size_t size) {
     int error = send_once(sender, data, size);
-    if (error) error = send_again(sender, data, size, error);
-    return error ? error : take_refused(sender);
+    return error ? send_again(sender, data, size, error) : 0;
+}
+
+int sender_send(struct sender *sender, const void *data, size_t size) {
+    int error = sender_send_only(sender, data, size);
+    return error ? error : sender_take_refused(sender);
 }
 
 static void ask_for_room(int fd, int bytes) { setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes); }
@@ -176,5 +180,5 @@ int sender_send_checked(struct sender *sender, const void *data, size_t size) {
     if (error == EAGAIN) error = send_beyond_room(sender, data, size);
     if (error) return error;
     note_errors_of(sender);
-    return take_refused(sender);
+    return sender_take_refused(sender);
 }

@@ -35,6 +35,10 @@ void sender_move(struct sender *sender, int fd, int listener);
  * there (ECONNREFUSED), or its firewall says no. Then this datagram was sent, so the counters balance. */
 int sender_send(struct sender *sender, const void *data, size_t size);
 
+/* The two steps of `sender_send`: send the datagram and return an errno of its own, then return that of an earlier one. */
+int sender_send_only(struct sender *sender, const void *data, size_t size);
+int sender_take_refused(struct sender *sender);
+
 /* As `sender_send`, for deadmen. A send buffer that commands have filled does not stop the datagram. Errors of this datagram
  * that are known at once are returned as well: no process listens on a local port. With `sender_send`, a later datagram
  * would get that error. One thread at a time may send so. */
