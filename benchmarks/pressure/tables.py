@@ -46,6 +46,7 @@ routes:
     destinations: [arm_board]
     ttl: {ttl}ms
     deadman: {{{deadman}, to: [arm_board]}}
+  manual_arm: {{deadman: {{because: the arm board stands for a second driving board here}}}}
 """
 
 GATEWAY = """\

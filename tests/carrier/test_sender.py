@@ -327,6 +327,7 @@ def test_of_commands_to_a_board_that_is_gone_few_are_kept_and_every_brake_is_sen
     board = stack.enter_context(lan.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
     board.bind(("10.78.1.2", 9000))
     board.settimeout(PATIENCE)
+    rover.run("sysctl", "-qw", "net.ipv4.neigh.lan0.mcast_solicit=60")  # it keeps asking, however slow this test is
     lan.ip("link", "set", "eth0", "down")
     settings = replace(endpoint("board", Address("10.78.1.2", 9000)), kind=EndpointKind.BOARD)
     sender = stack.enter_context(closing(rover.inside(lambda: make(settings))))

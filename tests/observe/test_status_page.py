@@ -441,11 +441,11 @@ routes:
 @pytest.fixture
 def hostile(tmp_path: Path) -> FakeRunning:
     """A router whose table, of a hostile name, has names that JavaScript's objects have, and texts in its payloads."""
-    folder = tmp_path / HOSTILE
-    (folder / "protos").mkdir(parents=True)
-    (folder / "protos" / "hostile.proto").write_text(HOSTILE_PROTO)
-    (folder / "table.yaml").write_text(HOSTILE_TABLE)
-    program = check_table(folder / "table.yaml").program
+    table = tmp_path / HOSTILE
+    (tmp_path / "protos").mkdir()
+    (tmp_path / "protos" / "hostile.proto").write_text(HOSTILE_PROTO)
+    table.write_text(HOSTILE_TABLE)
+    program = check_table(table).program
     assert program is not None
     return FakeRunning(program)
 
