@@ -45,6 +45,7 @@ from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker
+from router.clock import boottime_ns
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import OutboundEngine, PartEngine
@@ -167,7 +168,7 @@ class NativeDatapath:
 
     def start_deadmen(self, program: Program, sockets: SocketChange, states: States) -> None:
         for plan in program.deadmen:
-            log_start(plan.route, self._deadman(plan, program, sockets, states).start())
+            log_start(plan.route, self._deadman(plan, program, sockets, states).start(boottime_ns()))
 
     # wiring
 

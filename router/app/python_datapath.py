@@ -79,7 +79,7 @@ class PythonDatapath:
         locked = self._context.timers.deadman.locked
         for plan in program.deadmen:
             deadman = self._deadman(plan, program, sockets, states[_ALL])
-            log_start(plan.route, locked(deadman, deadman.start)())
+            log_start(plan.route, locked(deadman, deadman.start)(boottime_ns()))
 
     def wire(
         self,

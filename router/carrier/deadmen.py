@@ -29,11 +29,9 @@ class NativeDeadman:
         self._keep = keep
         self._successor: NativeDeadman | None = None
 
-    def start(self) -> list[str]:
+    def start(self, now: int) -> list[str]:
         """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached."""
-        if not self._plan.at_start:
-            return []
-        reached = self._library.deadman_start(self._deadmen, self.address)
+        reached = self._library.deadman_start(self._deadmen, self.address, now)
         return [endpoint for bit, (endpoint, _) in enumerate(self._plan.datagrams) if reached >> bit & 1]
 
     def succeeds(self, earlier: NativeDeadman) -> None:
@@ -77,6 +75,7 @@ class Deadmen:
             self.address,
             plan.timeout,
             plan.repeat,
+            plan.at_start,
             counters.index("deadman_active", plan.route),
             counters.index("deadman_trips", plan.route),
             self._names.number(plan.route),

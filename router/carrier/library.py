@@ -48,10 +48,10 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "deadman_end": (None, (c_void_p, c_void_p)),
     "deadman_open": (
         c_void_p,
-        (c_void_p, c_int64, c_int64, c_uint32, c_uint32, c_uint32, c_void_p, c_uint32),
+        (c_void_p, c_int64, c_int64, c_bool, c_uint32, c_uint32, c_uint32, c_void_p, c_uint32),
     ),
     "deadman_replace": (None, (c_void_p, c_void_p, c_void_p)),
-    "deadman_start": (c_uint64, (c_void_p, c_void_p)),
+    "deadman_start": (c_uint64, (c_void_p, c_void_p, c_int64)),
     "deadmen_close": (None, (c_void_p,)),
     "deadmen_open": (c_void_p, (c_void_p, c_void_p)),
     "deadmen_serve": (None, (c_void_p, c_int64)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,9 @@ _NEVER = 1 << 63
 
 START = 10_000_000_000
 """For so many ns after the start, a new subscriber may be one that was there before: discovery takes less."""
+
+START_AGAIN = 1_000_000_000
+"""ns after which a payload of the start that could not leave is sent again."""
 
 GREETING = 500_000_000
 """ns after which a subscriber that was discovered has discovered the publisher as well."""
@@ -65,7 +69,8 @@ class Deadman(Timer):
     ) -> None:
         self.next_due: int | None = None
         self._greets_until = 0
-        self._greets_again = False  # what is due is not a trip, but the second message to a new subscriber
+        self._greets_again = False  # what is due is not a trip, but another message of the start
+        self._is_kept_back = False  # a datagram that was sent last has not left
         self._acting = [self]  # shared with all that it has replaced
         self._plan = plan
         self._tripped = False
@@ -107,12 +112,19 @@ class Deadman(Timer):
         acting.next_due = None
         acting._release()
 
-    def start(self) -> list[str]:
+    def start(self, now: int) -> list[str]:
         """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached.
 
         What moves may still follow the last command of a router that was killed. To be called before anything is sent.
+        A network that is not there yet keeps the payload back: it is sent again each second, until it has left for all
+        endpoints or a command was sent.
         """
-        return self._send() if self._plan.at_start else []
+        return self._start(now) if self._plan.at_start else []
+
+    def _start(self, now: int) -> list[str]:
+        reached = self._send()
+        self._greets_again, self.next_due = self._is_kept_back, now + START_AGAIN if self._is_kept_back else None
+        return reached
 
     def await_subscribers(self, now: int) -> None:
         """As `start`, for publishing: nobody can be reached before subscribers are discovered."""
@@ -140,6 +152,8 @@ class Deadman(Timer):
         ours = {(each.endpoint, each.send) for each in self._destinations}
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
         if earlier.next_due is None or earlier._greets_again:
+            if earlier._is_kept_back and self.next_due is None and self._plan.at_start:
+                self._greets_again, self.next_due = earlier._greets_again, earlier.next_due
             earlier.next_due = None
             return
         due, earlier.next_due = earlier.next_due, _NEVER  # armed until it ends, so that it sends then
@@ -154,8 +168,7 @@ class Deadman(Timer):
         if due is None or now < due:
             return
         if self._greets_again:
-            self._greets_again, self.next_due = False, None
-            self._send()
+            self._start(now)
             return
         # Set before anything can fail. Repetitions that a stalled process has missed are left out.
         self.next_due = due + repeat * ((now - due) // repeat + 1)
@@ -182,11 +195,13 @@ class Deadman(Timer):
             self._changed(self._plan.route, False)
 
     def _send(self) -> list[str]:
-        sent = []
+        """Whoever refuses a datagram, which has left, obeys no earlier command either."""
+        sent, self._is_kept_back = [], False
         for destination in self._destinations:
             try:
                 destination.send(destination.datagram)
             except OSError as error:
+                self._is_kept_back |= error.errno != errno.ECONNREFUSED
                 self._counts[destination.errors] += 1
                 self._report(Report("deadman", self._plan.route, destination.endpoint, "send_error", error))
             else:

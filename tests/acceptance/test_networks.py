@@ -85,6 +85,17 @@ def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
             assert other.recv(100) == DRIVE
 
 
+def test_a_board_that_the_start_could_not_reach_is_stopped_when_it_can_be_reached(site: Rover, plane: str) -> None:
+    """Nobody commands it, and it may obey a router that was killed."""
+    site.rover.ip("route", "add", "unreachable", "10.78.1.222/32")
+    with site.router(TABLE, plane) as router:
+        wait_until(lambda: router.events(UNREACHABLE), "the warning")
+        site.rover.ip("route", "del", "unreachable", "10.78.1.222/32")
+        assert site.board.recv(100) == BRAKE
+        assert site.count("deadman_trips_total", route="manual_drive") == 0
+        assert site.count("deadman_datagrams_sent_total", route="manual_drive", destination="driving_board") == 1
+
+
 @pytest.mark.parametrize(("route", "why"), FORBIDDEN.values(), ids=FORBIDDEN)
 def test_nor_does_one_that_a_reload_brings(site: Rover, plane: str, route: tuple[str, ...], why: str) -> None:
     if route:

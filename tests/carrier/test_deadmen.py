@@ -279,7 +279,7 @@ class Comparison:
     def do_start(self, arguments: tuple[str, int]) -> None:
         python, native = self._chosen(*arguments)
         if arguments[1] == 0:  # one that was replaced has fewer destinations than its plan
-            assert native.start() == python.start()
+            assert native.start(self._now) == python.start(self._now)
 
     def do_end(self, arguments: tuple[str, int]) -> None:
         python, native = self._chosen(*arguments)
@@ -347,8 +347,8 @@ def test_a_stale_command_feeds_nothing(side: NativeSide, outlet: Outlet) -> None
 
 def test_at_the_start_it_says_whom_it_reached(side: NativeSide) -> None:
     side.breaks("arm", is_broken=True)
-    assert side.add(open_plan()).start() == ["wheels"]
-    assert side.add(open_plan(at_start=False)).start() == []
+    assert side.add(open_plan()).start(0) == ["wheels"]
+    assert side.add(open_plan(at_start=False)).start(0) == []
     assert side.events() == [("error", "drive", "arm", errno.ENOTSOCK)]
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import GREETING, START, Deadman, commander, feeder
+from router.engine.deadman import GREETING, START, START_AGAIN, Deadman, commander, feeder
 from router.engine.delivery import Report, Stale
 from router.engine.timers import Timer
 
@@ -283,19 +283,49 @@ def test_a_command_that_waited_since_before_a_reload_feeds_the_one_that_acts_now
 
 
 def test_at_the_start_it_sends_once_and_is_neither_armed_nor_tripped() -> None:
+    refused = ConnectionRefusedError(errno.ECONNREFUSED, "the board is off")
     watched = Watched()
-    watched.failures["arm_board"] = FAULT
-    assert watched.deadman.start() == ["driving_board"]
+    watched.failures["arm_board"] = refused
+    assert watched.deadman.start(0) == ["driving_board"]
     watched.run(10**12)
     watched.deadman.end(0)
     assert watched.sent == [(0, "driving_board", b"brake")]
-    assert watched.reports == [Report("deadman", "drive", "arm_board", "send_error", FAULT)]
+    assert watched.reports == [Report("deadman", "drive", "arm_board", "send_error", refused)]
     assert (watched.told, watched.deadman.next_due, watched.count("deadman_trips")) == ([], None, 0)
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_what_cannot_leave_at_the_start_is_sent_again_until_it_has_left(is_replaced: bool) -> None:
+    watched = Watched()
+    watched.failures["arm_board"] = FAULT
+    watched.deadman.start(0)
+    if is_replaced:
+        watched = succession(watched, PLAN)
+        watched.failures["arm_board"] = FAULT
+    watched.run(2 * START_AGAIN)
+    del watched.failures["arm_board"]
+    watched.sent.clear()
+    watched.run(10 * START_AGAIN)
+    watched.deadman.end(0)
+    assert watched.times("arm_board") == [3 * START_AGAIN]
+    assert (watched.told, watched.deadman.next_due, watched.count("deadman_trips")) == ([], None, 0)
+
+
+def test_a_command_ends_the_start() -> None:
+    watched = Watched()
+    watched.failures["arm_board"] = FAULT
+    watched.deadman.start(0)
+    watched.feed(1)
+    watched.run(TIMEOUT)
+    assert watched.count("deadman_trips") == 0
+    watched.deadman.disarm(TIMEOUT)
+    watched.run(10 * START_AGAIN)
+    assert watched.times() == [0]
 
 
 def test_one_that_is_silent_at_the_start_sends_nothing() -> None:
     watched = Watched(replace(PLAN, at_start=False))
-    assert watched.deadman.start() == []
+    assert watched.deadman.start(0) == []
     watched.deadman.await_subscribers(0)
     assert watched.deadman.greet(1) == []
     assert (watched.sent, watched.deadman.next_due) == ([], None)

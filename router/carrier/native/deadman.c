@@ -1,5 +1,6 @@
 #include "deadman.h"
 
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/timerfd.h>
@@ -8,14 +9,17 @@
 #include "clock.h"
 
 enum { MOST_REACHED = 64 };
+static const int64_t START_AGAIN = 1000000000; /* ns */
 
 struct deadman {
     struct deadman *next;    /* in the list of all */
     struct deadman *acting;  /* the deadman that has replaced it, with no other one between; or itself */
     int64_t timeout, repeat; /* ns */
-    int64_t due;             /* NEVER while it is unarmed, and once it is replaced */
+    int64_t due;             /* NEVER while it is unarmed, and once it is replaced; of an unarmed one: to start again */
     bool is_armed;           /* or tripped: it sends when it ends */
     bool has_tripped;
+    bool starts;             /* sends when the router starts */
+    bool is_kept_back;       /* a datagram that was sent last has not left */
     uint32_t active, trips, id;
     uint32_t count;
     struct deadman_destination destinations[];
@@ -95,13 +99,16 @@ static void note_due(struct deadmen *deadmen) {
     if (next < deadmen->timer_set_for) set_timer(deadmen, next);
 }
 
-/* Send the datagrams. Return a bit for each of the first 64 destinations reached. */
-static uint64_t send_all(struct deadmen *deadmen, const struct deadman *deadman) {
+/* Send the datagrams. Return a bit for each of the first 64 destinations reached. One that is refused has left: whoever
+ * refuses it obeys no earlier command either. */
+static uint64_t send_all(struct deadmen *deadmen, struct deadman *deadman) {
     uint64_t reached = 0;
+    deadman->is_kept_back = false;
     for (uint32_t index = 0; index < deadman->count; index++) {
         const struct deadman_destination *to = &deadman->destinations[index];
         int error = sender_send_checked(to->sender, to->datagram, to->size);
         counter_add(deadmen->counters, error ? to->send_errors : to->sent, 1);
+        deadman->is_kept_back |= error && error != ECONNREFUSED;
         if (error) report(deadmen, EVENT_DEADMAN_ERROR, deadman, to, error);
         else if (index < MOST_REACHED) reached |= (uint64_t)1 << index;
     }
@@ -126,12 +133,23 @@ static void feed_one(struct deadmen *deadmen, const struct feed *feed, int64_t n
  * ICMP message may be forged: so the deadman is armed, and nothing is put off. */
 static void arm_one(const struct feed *feed, int64_t now) {
     struct deadman *deadman = feed->deadman->acting;
-    if (feed->disarms || deadman->due != NEVER) return;
+    if (feed->disarms || deadman->is_armed) return;
     deadman->is_armed = true;
     deadman->due = now + deadman->timeout;
 }
 
+/* Send what is sent when the router starts. A network that is not there yet keeps it back: then do so again. */
+static uint64_t start(struct deadmen *deadmen, struct deadman *deadman, int64_t now) {
+    uint64_t reached = send_all(deadmen, deadman);
+    deadman->due = deadman->is_kept_back ? now + START_AGAIN : NEVER;
+    return reached;
+}
+
 static void serve_one(struct deadmen *deadmen, struct deadman *deadman, int64_t now) {
+    if (!deadman->is_armed) {
+        start(deadmen, deadman, now);
+        return;
+    }
     /* Repetitions that a stalled process has missed are left out. */
     deadman->due += deadman->repeat * ((now - deadman->due) / deadman->repeat + 1);
     if (deadman->has_tripped) {
@@ -179,6 +197,10 @@ static void take_over(struct deadmen *deadmen, struct deadman *next, struct dead
         release(deadmen, earlier);
         return;
     }
+    if (!earlier->is_armed) {
+        if (next->starts) next->due = due;
+        return;
+    }
     next->is_armed = true;
     next->has_tripped = earlier->has_tripped;
     next->due = due + (next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout);
@@ -186,14 +208,15 @@ static void take_over(struct deadmen *deadmen, struct deadman *next, struct dead
 
 /* ---- public ---- */
 
-struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t repeat, uint32_t active, uint32_t trips,
-                             uint32_t id, const struct deadman_destination *destinations, uint32_t count) {
+struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t repeat, bool starts, uint32_t active,
+                             uint32_t trips, uint32_t id, const struct deadman_destination *destinations,
+                             uint32_t count) {
     size_t datagrams = 0;
     for (uint32_t index = 0; index < count; index++) datagrams += destinations[index].size;
     struct deadman *deadman = calloc(1, sizeof *deadman + count * sizeof *destinations + datagrams);
     if (!deadman) return NULL;
-    *deadman = (struct deadman){.timeout = timeout, .repeat = repeat, .due = NEVER, .active = active, .trips = trips,
-                                .id = id, .count = count};
+    *deadman = (struct deadman){.timeout = timeout, .repeat = repeat, .due = NEVER, .starts = starts, .active = active,
+                                .trips = trips, .id = id, .count = count};
     uint8_t *copy = (uint8_t *)&deadman->destinations[count];
     for (uint32_t index = 0; index < count; index++) {
         deadman->destinations[index] = destinations[index];
@@ -217,9 +240,11 @@ void deadman_close(struct deadmen *deadmen, struct deadman *deadman) {
     free(deadman);
 }
 
-uint64_t deadman_start(struct deadmen *deadmen, struct deadman *deadman) {
+uint64_t deadman_start(struct deadmen *deadmen, struct deadman *deadman, int64_t now) {
+    if (!deadman->starts) return 0;
     pthread_mutex_lock(&deadmen->lock);
-    uint64_t reached = send_all(deadmen, deadman);
+    uint64_t reached = start(deadmen, deadman, now);
+    note_due(deadmen);
     pthread_mutex_unlock(&deadmen->lock);
     return reached;
 }

@@ -51,16 +51,17 @@ struct feed {
 struct deadmen *deadmen_open(counter *counters, struct ring *events);
 void deadmen_close(struct deadmen *deadmen); /* when no thread uses it and it has no deadman left */
 
-/* Add a deadman, with its timeout and repetition in ns. Returns NULL for lack of memory. `active` and `trips` are
- * counters, `id` stands for it in events. It is unarmed, and served from now on. */
-struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t repeat, uint32_t active, uint32_t trips,
-                             uint32_t id, const struct deadman_destination *destinations, uint32_t count);
+/* Add a deadman, with its timeout and repetition in ns. Returns NULL for lack of memory. `starts`: it sends when the router
+ * starts. `active` and `trips` are counters, `id` stands for it in events. It is unarmed, and served from now on. */
+struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t repeat, bool starts, uint32_t active,
+                             uint32_t trips, uint32_t id, const struct deadman_destination *destinations, uint32_t count);
 
 /* Remove a deadman that no program refers to, and nothing that may still feed it. */
 void deadman_close(struct deadmen *deadmen, struct deadman *deadman);
 
-/* Send the datagrams now, without a change of state. Return a bit for each of the first 64 destinations reached. */
-uint64_t deadman_start(struct deadmen *deadmen, struct deadman *deadman);
+/* Send the datagrams when the router starts, if it does so. Return a bit for each of the first 64 destinations reached.
+ * While one of the datagrams does not leave, all are sent again each second, until a command feeds or disarms it. */
+uint64_t deadman_start(struct deadmen *deadmen, struct deadman *deadman, int64_t now);
 
 /* Have `next` take over deadline and state of `earlier`, the deadman of the same route in the previous program.
  * `earlier` keeps only the destinations (by sender) that `next` does not have, and sends to them when it ends. Feeds of

@@ -61,7 +61,7 @@ static void close_board(struct board board) {
 static struct deadman *open_deadman(bool has_spare) {
     struct deadman_destination to[] = {{drive.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 7},
                                        {spare.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 8}};
-    return deadman_open(deadmen, TIMEOUT, REPEAT, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
+    return deadman_open(deadmen, TIMEOUT, REPEAT, true, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
 }
 
 /* Sends commands, most of them at once; a pause now and then lets a deadman trip, or the command get old. */
@@ -167,7 +167,7 @@ int main(int count, char **arguments) {
     drive = open_board();
     spare = open_board();
     atomic_store(&acting, open_deadman(true));
-    takes_over = deadman_open(deadmen, TIMEOUT, REPEAT, 4, 5, 2, NULL, 0);
+    takes_over = deadman_open(deadmen, TIMEOUT, REPEAT, true, 4, 5, 2, NULL, 0);
     void *(*others[])(void *) = {wait_for_timer, look_for_due, replace, read_events, receive};
     void *(*senders[])(void *) = {send_commands, send_commands, send_others};
     enum { OTHERS = 5, SENDERS = 3 };

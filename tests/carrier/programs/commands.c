@@ -51,7 +51,7 @@ int main(void) {
     struct ring *events = ring_open(1 << 12);
     struct deadmen *deadmen = deadmen_open(braked, NULL);
     struct deadman_destination braking = {.sender = sender, .datagram = MESSAGE, .size = 1, .sent = 2, .send_errors = 3};
-    struct deadman *deadman = deadman_open(deadmen, 1000, 1000000, 0, 1, 0, &braking, 1);
+    struct deadman *deadman = deadman_open(deadmen, 1000, 1000000, true, 0, 1, 0, &braking, 1);
     struct feed feed = {deadman, 0, 0};
     struct command_target target = {
         .destination = {.sender = sender, .feeds = &feed, .feed_count = 1, .sent = SENT, .sent_bytes = BYTES,

@@ -147,7 +147,7 @@ static void make_route(struct made *made, int index) {
 
 static struct deadman *open_deadman(void) {
     struct deadman_destination to = {senders[0], (const uint8_t *)"brake", 5, BRAKES, BRAKE_ERRORS, 0};
-    return deadman_open(deadmen, 2000000, 500000, ACTIVE, TRIPS, 1, &to, 1);
+    return deadman_open(deadmen, 2000000, 500000, true, ACTIVE, TRIPS, 1, &to, 1);
 }
 
 /* A program with one, two or three listeners, in turns: each is missing now and then. */
