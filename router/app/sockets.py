@@ -138,7 +138,7 @@ class Sockets:
                 if sender is None or is_new:
                     sender = self._open_sender(to, source, every)
                     opening.callback(sender.close)
-                elif sender.source is not source:
+                elif not sender.is_placed(source, every):
                     opened = sender.open_socket(source, every)
                     opening.callback(opened.close)
                     moves.append((sender, source, opened))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import socket
-from collections.abc import Iterable
+from collections.abc import Collection
 
 from router.net.udp import Listener, Sender
 from router.table.model import Endpoint
@@ -19,7 +19,7 @@ class NativeSender(Sender):
         library: ctypes.CDLL,
         endpoint: Endpoint,
         source: Listener | None = None,
-        listeners: Iterable[Listener] = (),
+        listeners: Collection[Listener] = (),
     ) -> None:
         """Raises OSError, and MemoryError."""
         self.address = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Iterable, Iterator, MutableMapping
+from collections.abc import Collection, Iterable, Iterator, MutableMapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
@@ -313,7 +313,7 @@ class Sender:
     """
 
     def __init__(
-        self, endpoint: model.Endpoint, source: Listener | None = None, listeners: Iterable[Listener] = ()
+        self, endpoint: model.Endpoint, source: Listener | None = None, listeners: Collection[Listener] = ()
     ) -> None:
         self.endpoint = endpoint.name
         self._to = endpoint.address.value
@@ -323,14 +323,14 @@ class Sender:
         self.socket = self.open_socket(source, listeners)
         _open_senders.add(self)
 
-    def open_socket(self, source: Listener | None, listeners: Iterable[Listener]) -> socket.socket:
+    def open_socket(self, source: Listener | None, listeners: Collection[Listener]) -> socket.socket:
         """Open a socket to move to."""
         opened = self._open(source, listeners)
         if self._is_board:
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BOARD_ROOM)
         return opened
 
-    def _open(self, source: Listener | None, listeners: Iterable[Listener]) -> socket.socket:
+    def _open(self, source: Listener | None, listeners: Collection[Listener]) -> socket.socket:
         if source is not None and not source.is_waiting:
             try:
                 return _open_beside(source, listeners)
@@ -347,6 +347,12 @@ class Sender:
         """Send by `opened` from now on. Return the earlier socket, for the caller to close when no thread uses it."""
         left, self.socket, self.source = self.socket, opened, source
         return left
+
+    def is_placed(self, source: Listener | None, listeners: Collection[Listener]) -> bool:
+        """Whether it sends from where one that is opened now would."""
+        if self.source is not source or source is None or not self.is_bound:
+            return self.source is source
+        return str(self.socket.getsockname()[0]) == f"::ffff:{_address_beside(source, listeners).host}"
 
     @property
     def is_bound(self) -> bool:
@@ -442,7 +448,17 @@ def _open_sending(family: socket.AddressFamily) -> socket.socket:
     return opened
 
 
-def _open_beside(listener: Listener, listeners: Iterable[Listener]) -> socket.socket:
+def _address_beside(listener: Listener, listeners: Iterable[Listener]) -> Address:
+    """Where a socket that sends from a listener's port is bound.
+
+    One with an address of its own would get what another listener, at all addresses of another interface, is to
+    receive: Linux looks for such sockets first.
+    """
+    everywhere = Address("0.0.0.0", listener.address.port)
+    return everywhere if any(each.address == everywhere for each in listeners) else listener.address
+
+
+def _open_beside(listener: Listener, listeners: Collection[Listener]) -> socket.socket:
     """A socket that sends from a listener's address and port, while the listener alone receives.
 
     It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
@@ -453,7 +469,7 @@ def _open_beside(listener: Listener, listeners: Iterable[Listener]) -> socket.so
         opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        host, port = listener.address
+        host, port = _address_beside(listener, listeners)
         with ExitStack() as shared:
             for each in listeners:
                 if each.address.port == port:

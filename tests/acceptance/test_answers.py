@@ -113,6 +113,22 @@ def test_of_several_listeners_the_table_chooses(
         assert where_from[1] == leaves_from or (leaves_from is None and where_from[1] not in (5000, 5001))
 
 
+@pytest.mark.parametrize("is_reloaded", [False, True], ids=["at the start", "at a reload"])
+def test_what_is_for_the_address_of_one_listener_and_comes_to_another_is_received(
+    site: Rover, plane: str, is_reloaded: bool
+) -> None:
+    """The sender has the port of `lan`, but the basestation reaches that address by the radio, as by a route."""
+    text = SEVERAL.replace("0.0.0.0:5000, interface: lan0", "10.78.1.1:5000, interface: lan0")
+    text = text.replace("kind: board", "kind: board, listener: lan")
+    site.radio.ip("route", "add", "10.78.1.0/24", "via", RADIO[0])
+    with site.router(text.replace("0.0.0.0:5000", "0.0.0.0:5001") if is_reloaded else text, plane) as router:
+        if is_reloaded:
+            site.table(text)
+            router.process.send_signal(signal.SIGHUP)
+            wait_until(lambda: bool(router.events("table reloaded")), "the reload")
+        assert exchange(site, LAN) == LAN
+
+
 def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
     with site.router(TABLE, plane) as router:
 
