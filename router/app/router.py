@@ -178,7 +178,8 @@ class Router:
 
     def _watch(self) -> None:
         """Watch the table's files if it says so, and the network interfaces that it names."""
-        may_change = any(each.interface or each.is_waiting for each in self.listeners.values())
+        listeners = self.listeners.values()
+        may_change = any(each.interface or each.is_waiting or each.address.host != "0.0.0.0" for each in listeners)
         if self._interfaces is None and may_change:
             self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:

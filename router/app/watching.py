@@ -72,8 +72,8 @@ class InterfaceWatcher:
     """Checks once a second whether `listeners` have their addresses and network interfaces.
 
     A socket stays bound to the old interface when a tunnel is set up again or an adapter plugged in again, and receives
-    nothing; one that is waiting was never bound. Then `reopen` is called in the watcher's thread until it does. `close`
-    does not wait.
+    nothing; one that is waiting was never bound. Then `reopen` is called in the watcher's thread until it does. One
+    whose address has gone receives again when that comes back. `close` does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
@@ -88,12 +88,15 @@ class InterfaceWatcher:
     def _run(self) -> None:
         reported: list[Listener] = []
         while not self._stopped.wait(INTERFACE_PERIOD):
-            lost = [each for each in self._listeners() if each.is_waiting or each.has_lost_interface()]
+            lost = [each for each in self._listeners() if each.lacks_network()]
             for each in lost:
                 if each not in reported and not each.is_waiting:
-                    logger.error("a network interface has gone: nothing comes in by it", listener=each.name)
-            if lost:
+                    what = "a network interface" if each.has_lost_interface() else "the address of a listener"
+                    logger.error(f"{what} has gone: nothing comes in by it", listener=each.name)
+            if any(each.is_waiting or each.has_lost_interface() for each in lost):
                 self._reopen()
+            if back := [each.name for each in reported if each in self._listeners() and each not in lost]:
+                logger.info("listeners receive: their networks are there", listeners=back)
             reported = lost
 
 

@@ -34,6 +34,7 @@ TUNNEL = TABLE.replace(
 ).replace("10.78.2.10:9000, kind: basestation", "10.78.2.10:9000, kind: basestation, listener: tunnel")
 UNREACHABLE = "nothing can be sent to this endpoint now; it is tried with every datagram"
 WAITS = "this listener receives nothing before its network is there; the others do"
+ADDRESS_GONE = "the address of a listener has gone: nothing comes in by it"
 THERE = "listeners receive: their networks are there"
 
 
@@ -225,12 +226,16 @@ def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane
     """The only listener is at the address of a tunnel, by which commands come; the board is in another network."""
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
     site.lan.ip("route", "add", "10.78.2.0/24", "via", LAN[0])
-    with site.router(text, plane):
+    with site.router(text, plane) as router:
         assert site.board.recvfrom(100) == (BRAKE, RADIO)
         drives(site)
         gone_address(site)
         assert site.board.recvfrom(100) == (BRAKE, LAN)
         assert site.count("listener_waiting", listener="rover") == 1
+        wait_until(lambda: bool(router.events(ADDRESS_GONE)), "the loss")
+        new_address(site)
+        wait_until(lambda: bool(router.events(THERE)), "the return")
+        drives(site)
 
 
 def test_a_port_that_is_taken_still_ends_the_start(site: Rover, plane: str) -> None:
