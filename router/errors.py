@@ -112,7 +112,7 @@ class Code(enum.Enum):
     NO_TARGET = ("no-target", "A route that goes nowhere.")
     SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
     NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")
-    DOUBTFUL_DEADMAN = ("doubtful-deadman", "A deadman that may not do what it is for, such as one after 500 s.")
+    DOUBTFUL_DEADMAN = ("doubtful-deadman", "A deadman that may not serve its purpose, such as one that waits 500 s.")
     # the mapping
     DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two fields that exclude each other.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")

@@ -80,7 +80,7 @@ class Reloader:
                 logger.warning("a listener cannot be opened on its network", why=str(error))
             else:
                 names = [each.name for each in replaceable]
-                logger.info("listeners receive: their networks are there", listeners=names)
+                logger.info("these listeners receive now: their networks are there", listeners=names)
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""

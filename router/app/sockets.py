@@ -35,7 +35,7 @@ class SocketChange:
 def _log_absence(listener: model.Listener) -> None:
     host = listener.address.value._replace(port=0)  # the port may be taken, by an inherited socket
     why, remedy = absence(host, listener.interface) or ("its network has gone", "")
-    what = "this listener receives nothing before its network is there; the others do"
+    what = "this listener receives nothing until its network is there; the others work"
     logger.warning(what, listener=listener.name, address=listener.bound_to, why=why, remedy=remedy)
 
 
@@ -50,7 +50,7 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         found = error.what, error.hint
     if found:
         why, remedy = found
-        what = "nothing can be sent to this endpoint now; it is tried with every datagram"
+        what = "nothing can be sent to this endpoint now; the router tries again with every datagram"
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 

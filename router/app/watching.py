@@ -96,7 +96,7 @@ class InterfaceWatcher:
             if any(each.is_waiting or each.has_lost_interface() for each in lost):
                 self._reopen()
             if back := [each.name for each in reported if each in self._listeners() and each not in lost]:
-                logger.info("listeners receive: their networks are there", listeners=back)
+                logger.info("these listeners receive now: their networks are there", listeners=back)
             reported = lost
 
 

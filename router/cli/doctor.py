@@ -30,7 +30,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--pre-start",
         action="store_true",
-        help="only what would make a start fail, and networks that are not there; nothing if all is well",
+        help="only what would make a start fail, and missing networks; nothing if all is well",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object per line and result")
 

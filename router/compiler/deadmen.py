@@ -116,15 +116,19 @@ def _doubtful_times(
     timeout, repeat = deadman.timeout, deadman.repeat
     time = duration(timeout.value)
     if timeout.value > LONGEST_TIMEOUT:
-        yield timeout.span, f"what moves goes on for {time} after the last command", "say for example `timeout: 500ms`"
+        yield (
+            timeout.span,
+            f"what moves keeps moving for {time} after the last command",
+            "say for example `timeout: 500ms`",
+        )
     elif timeout.value < SHORTEST_TIMEOUT:
-        message = f"it trips between commands unless they come faster than every {time}"
+        message = f"it trips between commands unless they come more often than every {time}"
         yield timeout.span, message, "say `timeout: 20ms` at least"
     if repeat.value > max(2 * timeout.value, DEFAULT_REPEAT.value):
-        message = f"when its datagram is lost, the next one follows {duration(repeat.value)} later"
+        message = f"if its datagram is lost, the next one follows {duration(repeat.value)} later"
         yield repeat.span, message, f"repeat it within the timeout of {time}"
     if ttl is not None and ttl.value > timeout.value:
-        message = f"a command that comes {duration(ttl.value)} late would undo the deadman, which trips after {time}"
+        message = f"a command that comes {duration(ttl.value)} late would release the deadman, which trips after {time}"
         yield ttl.span, message, f"say `ttl: {time.replace(' ', '')}` at most"
 
 
@@ -157,7 +161,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
     message = f"it would cut into commands of '{case}', which '{board}' gets too"
-    alternative = "`because: why`" if named else "`disarmed_by: []` if it is to"
+    alternative = "`because: why`" if named else "`disarmed_by: []` if that is intended"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
     hint = f"say `disarmed_by: {value}`, or {alternative}"

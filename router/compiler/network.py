@@ -37,7 +37,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     yield from _listener_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
-            message = f"'{endpoint.name}' is no board, and gets NaN and infinities anyway"
+            message = f"'{endpoint.name}' is not a board, and gets NaN and infinity in any case"
             yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "leave `allow_non_finite` out")
     yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}

@@ -95,7 +95,7 @@ def _bound_to(held: socket.socket) -> str:
 
 
 _ABSENT = {
-    errno.ENODEV: ("there is no such network interface now", "`ip link` lists those that there are"),
+    errno.ENODEV: ("there is no such network interface", "`ip link` lists those that there are"),
     errno.EADDRNOTAVAIL: ("no network interface of this computer has that address", "0.0.0.0 listens on all of them"),
     errno.ENETDOWN: ("the network is down", "`ip link` shows which interface is"),
 }
@@ -290,7 +290,7 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
             if error.errno == errno.ENETUNREACH:
                 return "no network leads there", "does `ip address` show an interface in its network? is the cable in?"
             why = error.strerror.lower() if error.strerror else str(error)
-            return f"the kernel refuses it: {why}", f"`ip route get {address.host}` shows the route that does"
+            return f"the kernel refuses it: {why}", f"`ip route get {address.host}` shows the route that refuses it"
     return None
 
 
@@ -336,7 +336,7 @@ class Sender:
                 return _open_beside(source, listeners)
             except OSError as error:
                 logger.warning(
-                    "datagrams to this endpoint leave from another port than its listener's, and answers are lost",
+                    "datagrams to this endpoint leave from a port that is not its listener's; answers to them are lost",
                     endpoint=self.endpoint,
                     listener=source.name,
                     why=error.strerror,

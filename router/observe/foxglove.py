@@ -105,7 +105,7 @@ class FoxgloveServer(ServerListener):
                 self._attach_while_subscribed()
             except StartError as error:
                 if is_well:
-                    logger.error("the view for Foxglove is closed: trying on", why=str(error))
+                    logger.error("the view for Foxglove is closed; the router tries to open it again", why=str(error))
                 is_well = False
             except Exception as error:  # noqa: BLE001 a fault of the router, reported once; it may be over next time
                 if is_well:
@@ -121,7 +121,7 @@ class FoxgloveServer(ServerListener):
             self._server.stop()
             self._subscribed.clear()
             self._server = _started(self._address, self._running.program.table.node.name, self._context, self)
-            logger.warning("Foxglove could not connect any more, and can again", address=str(self.address))
+            logger.warning("Foxglove can connect again", address=str(self.address))
 
     def _attach_while_subscribed(self) -> None:
         if not self._subscribed:

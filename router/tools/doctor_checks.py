@@ -200,8 +200,8 @@ def listeners(program: Program) -> Iterator[CheckResult]:
         about = f"listener '{listener.name}'"
         if (found := _absence(listener)) is not None:
             why, remedy = found
-            remedy += "; what comes up after the start, as a tunnel does, is waited for"
-            yield warning("listeners", f"{about} cannot have {listener.bound_to} now: {why}", remedy)
+            remedy += "; the router waits for what comes up later, such as a tunnel"
+            yield warning("listeners", f"{about} cannot use {listener.bound_to}: {why}", remedy)
         elif listener.interface is not None and interface_is_up(listener.interface):
             yield fine("listeners", f"{about}: network interface {listener.interface} is up")
         elif listener.interface is not None:

@@ -32,10 +32,10 @@ TUNNEL = TABLE.replace(
   rover: {{address: 10.78.1.1:5000}}
   tunnel: {tunnel}""",
 ).replace("10.78.2.10:9000, kind: basestation", "10.78.2.10:9000, kind: basestation, listener: tunnel")
-UNREACHABLE = "nothing can be sent to this endpoint now; it is tried with every datagram"
-WAITS = "this listener receives nothing before its network is there; the others do"
+UNREACHABLE = "nothing can be sent to this endpoint now; the router tries again with every datagram"
+WAITS = "this listener receives nothing until its network is there; the others work"
 ADDRESS_GONE = "the address of a listener has gone: nothing comes in by it"
-THERE = "listeners receive: their networks are there"
+THERE = "these listeners receive now: their networks are there"
 
 
 def reload(site: Rover, router: RouterProcess, text: str) -> str:
@@ -142,7 +142,7 @@ ABSENT = {
     "interface": (
         "{{address: 0.0.0.0:5001, interface: radio0}}",
         gone_interface,
-        "there is no such network interface now",
+        "there is no such network interface",
         new_interface,
     ),
     "address": (
@@ -154,7 +154,7 @@ ABSENT = {
     "interface and port of another one": (
         "{{address: 10.78.2.1:5000, interface: radio0}}",
         gone_interface,
-        "there is no such network interface now",
+        "there is no such network interface",
         new_interface,
     ),
 }

@@ -158,7 +158,7 @@ def test_a_tunnel_that_is_set_up_again_needs_no_new_router(site: Rover) -> None:
         site.rover.run("wg-quick", "down", site.folder / "wg0.conf")
         wait_until(lambda: bool(router.events("a network interface has gone: nothing comes in by it")), "the loss")
         site.rover.run("wg-quick", "up", site.folder / "wg0.conf")
-        wait_until(lambda: bool(router.events("listeners receive: their networks are there")), "the return")
+        wait_until(lambda: bool(router.events("these listeners receive now: their networks are there")), "the return")
 
         def drives() -> bool:
             station.sendto(DRIVE, ROVER)

@@ -375,7 +375,7 @@ def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
     ("settings", "why"),
     [
         (plan(host="192.0.2.77", port=5000), "no network interface of this computer has that address"),
-        (replace(plan(), interface="nowhere0"), "there is no such network interface now"),
+        (replace(plan(), interface="nowhere0"), "there is no such network interface"),
     ],
 )
 def test_an_address_or_interface_that_is_not_there_is_waited_for(

@@ -231,7 +231,7 @@ def test_the_interface_of_a_listener_is_looked_at(table: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
-        ("receive_buffer:", "interface: nowhere0, receive_buffer:", "there is no such network interface now"),
+        ("receive_buffer:", "interface: nowhere0, receive_buffer:", "there is no such network interface"),
         ('address: "127.0.0.1:', 'address: "192.0.2.1:', "no network interface of this computer has that address"),
     ],
 )
@@ -240,7 +240,7 @@ def test_what_a_listener_waits_for_is_a_warning(table: Path, look: type, old: st
     [listener] = rewritten(table, old, new).listeners
     found = [finding for finding in look(table, {}) if finding.about in ("listeners", "ports")]
     assert [(each.grade, each.text) for each in found if each.about == "listeners"] == [
-        (Grade.WARNING, f"listener 'rover' cannot have {listener.bound_to} now: {why}")
+        (Grade.WARNING, f"listener 'rover' cannot use {listener.bound_to}: {why}")
     ]
     assert all(listener.bound_to not in each.text for each in found if each.about == "ports")
 
