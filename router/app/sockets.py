@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from router.compiler.network import sent_from
+from router.compiler.network import LOOPBACK, WILDCARD, sent_from
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.udp import Listener, Sender, absence, why_unreachable
+from router.net.udp import Listener, Sender, absence, usual_source, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 
@@ -52,6 +52,20 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         why, remedy = found
         what = "nothing can be sent to this endpoint now; the router tries again with every datagram"
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
+
+
+def _check_source(endpoint: model.Endpoint, sender: Sender) -> None:
+    """Warn of datagrams that are sent from an address which their route does not lead back to."""
+    own, usual = sender.leaves_from, usual_source(endpoint.address.value)
+    if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
+        return
+    logger.warning(
+        "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them",
+        endpoint=endpoint.name,
+        address=own,
+        route=usual,
+        remedy="`send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
+    )
 
 
 def _source(name: str | None, listeners: Mapping[str, Listener]) -> Listener | None:
@@ -142,6 +156,7 @@ class Sockets:
                     opened = sender.open_socket(source, every)
                     opening.callback(opened.close)
                     moves.append((sender, source, opened))
+                _check_source(to, sender)
                 senders[to.name] = sender
             return SocketChange(program, listeners, senders, moves, opening.pop_all())
 

@@ -294,6 +294,12 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
     return None
 
 
+def usual_source(address: Address) -> str | None:
+    """The address of this computer that the route to an address has; None if no route leads there."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        return str(probe.getsockname()[0]) if probe.connect_ex(address) == 0 else None
+
+
 def _is_broadcast(address: Address) -> bool:
     """Whether the kernel takes the address where broadcast is allowed; it also refuses what a route prohibits."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -352,7 +358,12 @@ class Sender:
         """Whether it sends from where one that is opened now would."""
         if self.source is not source or source is None or not self.is_bound:
             return self.source is source
-        return str(self.socket.getsockname()[0]) == f"::ffff:{_address_beside(source, listeners).host}"
+        return self.leaves_from == _address_beside(source, listeners).host
+
+    @property
+    def leaves_from(self) -> str:
+        """The address that the socket is bound to; 0.0.0.0 if the kernel chooses one for each datagram."""
+        return str(self.socket.getsockname()[0]).removeprefix("::ffff:")
 
     @property
     def is_bound(self) -> bool:

@@ -129,6 +129,18 @@ def test_what_is_for_the_address_of_one_listener_and_comes_to_another_is_receive
         assert exchange(site, LAN) == LAN
 
 
+def test_the_log_warns_of_a_listener_in_another_network_than_a_board(site: Rover, plane: str) -> None:
+    """A board, or a router on the way, may drop what comes from an address that no route leads back to."""
+    warning = "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them"
+    text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
+    with site.router(text, plane) as router:
+        assert [(line["endpoint"], line["address"], line["route"]) for line in router.events(warning)] == [
+            ("driving_board", RADIO[0], LAN[0])
+        ]
+    with site.router(text.replace("kind: board", "kind: board, send_from: ephemeral"), plane) as router:
+        assert not router.events(warning)
+
+
 def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
     with site.router(TABLE, plane) as router:
 

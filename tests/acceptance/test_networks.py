@@ -90,7 +90,7 @@ def test_a_board_that_the_start_could_not_reach_is_stopped_when_it_can_be_reache
     """Nobody commands it, and it may obey a router that was killed."""
     site.rover.ip("route", "add", "unreachable", "10.78.1.222/32")
     with site.router(TABLE, plane) as router:
-        wait_until(lambda: router.events(UNREACHABLE), "the warning")
+        wait_until(lambda: bool(router.events(UNREACHABLE)), "the warning")
         site.rover.ip("route", "del", "unreachable", "10.78.1.222/32")
         assert site.board.recv(100) == BRAKE
         assert site.count("deadman_trips_total", route="manual_drive") == 0

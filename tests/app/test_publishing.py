@@ -50,6 +50,12 @@ def await_subscriber(router: Router, subscriber: Subscriber) -> None:
     wait_until(lambda: ros.wanted["published_ph"][0])
 
 
+def next_number(subscriber: Subscriber) -> float:
+    while (line := subscriber.line()) == "matched":
+        pass  # a publisher of an earlier test, which has not gone yet
+    return number(line)
+
+
 def number(line: str) -> float:
     (found,) = struct.unpack("<xxxxf", bytes.fromhex(line))
     return float(found)
@@ -116,7 +122,7 @@ def test_python_publishes_where_rcl_is_not_as_expected(
         await_subscriber(router, subscriber)
         for turn in range(3):
             site.send(*(numbered(10 * turn + each) for each in range(10)))
-            assert [number(subscriber.line()) for _ in range(10)] == [10 * turn + each for each in range(10)]
+            assert [next_number(subscriber) for _ in range(10)] == [10 * turn + each for each in range(10)]
             site.write(ROUTES + f"    ttl: {turn + 1}s\n")
             assert router.reload().ok
         wait_until(lambda: router.total("messages_published") == 30)
