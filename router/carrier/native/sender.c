@@ -56,9 +56,11 @@ static bool is_refusal(const struct sock_extended_err *error) {
  * `address` that of the datagram, if the socket is an IPv4 one. */
 static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
     union { struct cmsghdr aligned; char bytes[256]; } control;
-    struct msghdr message = {.msg_name = address, .msg_namelen = sizeof *address, .msg_control = &control,
+    union { struct sockaddr_in v4; struct sockaddr_storage any; } name;
+    struct msghdr message = {.msg_name = &name, .msg_namelen = sizeof name, .msg_control = &control,
                              .msg_controllen = sizeof control};
     if (recvmsg(fd, &message, MSG_ERRQUEUE | MSG_DONTWAIT) < 0) return false;
+    *address = name.v4;
     *refused = 0;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(&message); each; each = CMSG_NXTHDR(&message, each)) {
         bool is_v4 = each->cmsg_level == IPPROTO_IP && each->cmsg_type == IP_RECVERR;
