@@ -35,8 +35,10 @@ class NativeBoards:
         trees: dict[int, _Tree] = {}  # boards with the same firmware share one
         self._boards: dict[str, c.Board] = {}
         for name, limits in boards.items():
-            tree = trees.setdefault(id(limits.fields), _Tree(limits.fields))
-            self._boards[name] = c.Board(tree.messages, limits.longest, limits.allows_non_finite)
+            key = id(limits.fields)
+            if key not in trees:
+                trees[key] = _Tree(limits.fields)
+            self._boards[name] = c.Board(trees[key].messages, limits.longest, limits.allows_non_finite)
         self._trees = trees
 
     def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
