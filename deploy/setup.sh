@@ -116,12 +116,7 @@ check_tools() {
 
 make_environment() {
   "$base" -m venv ${ros:+--system-site-packages} "$venv"
-  # What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere.
-  if [ -n "$ros" ]; then
-    printf '. "%s/setup.sh"\n. "%s/share/comms/local_setup.sh"\n' "$ros" "$venv" >"$venv/env.sh"
-  else
-    printf '# Nothing to set: the wheels find their libraries themselves.\n' >"$venv/env.sh"
-  fi
+  printf '%s\n' "${to_source:-# Nothing to set: the wheels find their libraries themselves.}" >"$venv/env.sh"
   printf '%s' "$ros" >"$made/ros"
 }
 
@@ -179,7 +174,12 @@ flock 9
 
 remembered=$(cat "$made/ros" 2>/dev/null || find_sourced_ros)
 ros=${ROS:-$remembered}
-environment=$(printf '%s\n' "$root" "$ros" | checksum)
+# What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere. ROS's script leaves
+# AMENT_CURRENT_PREFIX behind, which that of the interfaces would take for where they are.
+to_source=${ros:+. \"$ros/setup.sh\"
+unset AMENT_CURRENT_PREFIX
+. \"$venv/share/comms/local_setup.sh\"}
+environment=$(printf '%s\n' "$root" "$to_source" | checksum)
 packages=$(cat pyproject.toml constraints.txt | checksum)
 carrier=library  # which has the checksum of its sources in it
 "$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"

@@ -1,0 +1,128 @@
+"""deploy/setup.sh: which steps it takes, what it remembers, and what it leaves to be sourced.
+
+pip, cmake and the C compiler are stand-ins that only note how they were called: what the steps make is tested by
+everything else in tests/, which runs in an environment that it has made. The scripts of the installed ROS are ament's.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 120.0
+
+NOTE = 'printf "%s\\n" "$(basename "$0") $*" >> "$CALLS"\n'
+CMAKE = f"""#!/bin/sh
+{NOTE}if [ "$1" = --install ]; then mkdir -p .venv/share && cp -r "$INTERFACES" .venv/share/comms; fi
+"""
+CC = f"""#!/bin/sh
+{NOTE}all="$*"
+while [ "$1" != -o ]; do shift; done
+echo "$all" > "$2"  # with the checksum, as the library
+"""
+PIP = 'import os, sys\nprint("pip", *sys.argv[1:], file=open(os.environ["CALLS"], "a"))\n'
+
+
+def script(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def ament(template: str, prefix: Path, **filled: str) -> str:
+    """A script of ament's, as a build fills it in."""
+    templates = pytest.importorskip("ament_package.templates")
+    level, name = template.split("/")
+    text: str = Path(getattr(templates, f"get_{level}_template_path")(name)).read_text()
+    for key, value in {"CMAKE_INSTALL_PREFIX": str(prefix), "SKIP_PARENT_PREFIX_PATH": "1", **filled}.items():
+        text = text.replace(f"@{key}@", value)
+    return text
+
+
+class Checkout:
+    """What setup.sh reads of this checkout, in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / "router"
+        self.ros = folder / "jazzy"
+        self._stubs = folder / "stubs"
+        self._calls = folder / "calls"
+        for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", "router/carrier/build.py"):
+            (self.root / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / file, self.root / file)
+        shutil.copytree(ROOT / "schemas" / "comms", self.root / "schemas" / "comms")
+        (self.root / "router" / "carrier" / "native").mkdir()
+        script(self._stubs / "cmake", CMAKE)
+        script(self._stubs / "cc", CC)
+        script(self._stubs / "pip" / "__init__.py", "")
+        script(self._stubs / "pip" / "__main__.py", PIP)
+        self._prepare_interfaces(self._stubs / "comms")
+        self._install_ros()
+
+    def _prepare_interfaces(self, share: Path) -> None:
+        """What building the interfaces leaves to be sourced."""
+        hook = 'ament_append_value AMENT_ENVIRONMENT_HOOKS "$AMENT_CURRENT_PREFIX/share/comms/prefix.sh"'
+        text = ament("package_level/local_setup.sh.in", self.root / ".venv", ENVIRONMENT_HOOKS=hook)
+        script(share / "local_setup.sh", text)
+        script(share / "prefix.sh", ament("environment_hook/ament_prefix_path.sh", self.root / ".venv"))
+
+    def _install_ros(self) -> None:
+        """What setup.sh needs of an installed Jazzy."""
+        for folder in (f"lib/python3.{sys.version_info[1]}", "share/rclpy", "share/rosidl_default_generators"):
+            (self.ros / folder).mkdir(parents=True)
+        filled = {"ament_package_PYTHON_EXECUTABLE": sys.executable}
+        script(self.ros / "setup.sh", ament("prefix_level/setup.sh.in", self.ros))
+        script(self.ros / "local_setup.sh", ament("prefix_level/local_setup.sh.in", self.ros, **filled))
+        script(self.ros / "_local_setup_util.py", ament("prefix_level/_local_setup_util.py", self.ros))
+        script(self.ros / "setup.bash", ". $(dirname ${BASH_SOURCE[0]})/setup.sh\n")
+
+    def set_up(self, **variables: str) -> list[str]:
+        """Run setup.sh; return what it printed and the programs that it called, with their arguments."""
+        self._calls.write_text("")
+        environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith(("AMENT_", "ROS"))},
+            "PATH": f"{self._stubs}:{os.environ['PATH']}",
+            "PYTHONPATH": str(self._stubs),
+            "PYTHON": sys.executable,
+            "CALLS": str(self._calls),
+            "INTERFACES": str(self._stubs / "comms"),
+            **variables,
+        }
+        done = subprocess.run(
+            [self.root / "deploy" / "setup.sh"],
+            env=environment,
+            cwd=self.root,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return [*done.stdout.splitlines(), *self._calls.read_text().splitlines()]
+
+    def sourced(self, name: str) -> str:
+        """The environment variable in a shell that has sourced env.sh, and nothing before."""
+        command = ["sh", "-c", f'. .venv/env.sh; printf %s "${name}"']
+        return subprocess.check_output(command, env={"PATH": os.environ["PATH"]}, cwd=self.root, text=True)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def test_interfaces_are_found_beside_an_installed_ros(checkout: Checkout) -> None:
+    """ROS's setup.sh leaves a variable that the interfaces' script takes for where they are."""
+    checkout.set_up(ROS=str(checkout.ros))
+    assert checkout.sourced("AMENT_PREFIX_PATH").split(":")[0] == f"{checkout.root}/.venv"
+
+
+def test_second_run_calls_nothing(checkout: Checkout) -> None:
+    checkout.set_up(ROS=str(checkout.ros))
+    assert checkout.set_up() == ["setup: .venv is up to date"]
