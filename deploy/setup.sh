@@ -139,13 +139,13 @@ build_carrier() {
 
 build_comms() (
   build=$venv/build/comms
-  names=$(ls schemas/comms/msg)
-  if [ "$names" != "$(cat "$build/names" 2>/dev/null)" ]; then
-    # The generators keep what they made for a message that is no more.
+  makes=$(ls schemas/comms/msg; checksum <deploy/interfaces.cmake)
+  if [ "$makes" != "$(cat "$build/makes" 2>/dev/null)" ]; then
+    # What was made for a message that is no more, or in another language, would stay.
     if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
     rm -rf "$build"
     mkdir -p "$build"
-    printf '%s' "$names" >"$build/names"
+    printf '%s' "$makes" >"$build/makes"
   fi
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
@@ -157,7 +157,7 @@ build_comms() (
     export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv LD_LIBRARY_PATH=$venv/lib$libraries
   fi
   cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
-    -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF
+    -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF -DCMAKE_PROJECT_comms_INCLUDE="$root/deploy/interfaces.cmake"
   cmake --build "$build" --parallel "$(nproc)"
   cmake --install "$build"
 )
@@ -184,7 +184,7 @@ packages=$(cat pyproject.toml constraints.txt | checksum)
 carrier=library  # which has the checksum of its sources in it
 "$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"
 # The pins of what the generated code is compiled against belong to it as much as the messages.
-comms=$({ find schemas/comms -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
+comms=$({ find schemas/comms deploy/interfaces.cmake -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
 
 if is_usable && is_made packages "$packages" && is_made carrier "$carrier" && is_made comms "$comms"; then
   echo "setup: .venv is up to date"

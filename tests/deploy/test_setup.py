@@ -7,14 +7,19 @@ everything else in tests/, which runs in an environment that it has made. The sc
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from tests.compiler.interface_package import environment, is_buildable
+
 ROOT = Path(__file__).parents[2]
+ONLY_NEEDED = "deploy/interfaces.cmake"
 PATIENCE = 120.0
 
 NOTE = 'printf "%s\\n" "$(basename "$0") $*" >> "$CALLS"\n'
@@ -53,7 +58,7 @@ class Checkout:
         self.ros = folder / "jazzy"
         self._stubs = folder / "stubs"
         self._calls = folder / "calls"
-        for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", "router/carrier/build.py"):
+        for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", ONLY_NEEDED, "router/carrier/build.py"):
             (self.root / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / file, self.root / file)
         shutil.copytree(ROOT / "schemas" / "comms", self.root / "schemas" / "comms")
@@ -106,6 +111,10 @@ class Checkout:
         assert done.returncode == 0, done.stdout + done.stderr
         return [*done.stdout.splitlines(), *self._calls.read_text().splitlines()]
 
+    def files(self) -> dict[Path, int]:
+        """All of the checkout, with the times of their last changes."""
+        return {path: path.lstat().st_mtime_ns for path in self.root.rglob("*")}
+
     def sourced(self, name: str) -> str:
         """The environment variable in a shell that has sourced env.sh, and nothing before."""
         command = ["sh", "-c", f'. .venv/env.sh; printf %s "${name}"']
@@ -123,6 +132,34 @@ def test_interfaces_are_found_beside_an_installed_ros(checkout: Checkout) -> Non
     assert checkout.sourced("AMENT_PREFIX_PATH").split(":")[0] == f"{checkout.root}/.venv"
 
 
-def test_second_run_calls_nothing(checkout: Checkout) -> None:
+def test_second_run_calls_nothing_and_changes_nothing(checkout: Checkout) -> None:
     checkout.set_up(ROS=str(checkout.ros))
+    before = checkout.files()
     assert checkout.set_up() == ["setup: .venv is up to date"]
+    assert checkout.files() == before
+
+
+def test_interfaces_are_built_again_after_a_change_of_how(checkout: Checkout) -> None:
+    checkout.set_up(ROS=str(checkout.ros))
+    with (checkout.root / ONLY_NEEDED).open("a") as file:
+        file.write("# changed\n")
+    said = checkout.set_up()
+    assert [line.split()[0] for line in said[1:]] == ["cmake"] * 3
+    assert f"-DCMAKE_PROJECT_comms_INCLUDE={checkout.root / ONLY_NEEDED}" in said[1].split()
+
+
+@pytest.mark.skipif(not is_buildable(), reason="ROS's generators or cmake are not installed")
+@pytest.mark.parametrize("options", [(), (f"-DCMAKE_PROJECT_comms_INCLUDE={ROOT / ONLY_NEEDED}",)])
+def test_only_a_workspace_builds_the_interfaces_for_cpp(options: Sequence[str], tmp_path: Path) -> None:
+    source, build = str(ROOT / "schemas" / "comms"), str(tmp_path)
+    command = ["cmake", "-S", source, "-B", build, f"-DPython3_EXECUTABLE={sys.executable}"]
+    listing = ["cmake", "--build", build, "--target", "help"]
+    subprocess.run([*command, *options], env=environment(), capture_output=True, timeout=PATIENCE, check=True)
+    targets = subprocess.check_output(listing, text=True, timeout=PATIENCE)
+    made = set(re.findall(r"comms__rosidl_(\w+)$", targets, re.MULTILINE))
+    assert any(name.endswith("_cpp") for name in made) == (not options)
+    assert made > {
+        "generator_py",
+        "typesupport_fastrtps_c",
+        "typesupport_introspection_c",
+    }  # for Fast DDS, for other middlewares
