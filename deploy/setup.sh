@@ -4,9 +4,10 @@
 #
 #   PYTHON=...  the interpreter to use, 3.10 to 3.13; found without it
 #   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; a sourced one is found without it
+#   DEV=no      leave out what only developers need, for tests, lint and documentation; DEV=yes brings it back
 #
 # Each step leaves the checksum of what it was made from in .venv/.made and is repeated when that changes.
-# Both choices are remembered there. Details of each step are in .venv/setup.log.
+# These choices are remembered there. Details of each step are in .venv/setup.log.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -118,19 +119,21 @@ make_environment() {
   "$base" -m venv ${ros:+--system-site-packages} "$venv"
   printf '%s\n' "${to_source:-# Nothing to set: the wheels find their libraries themselves.}" >"$venv/env.sh"
   printf '%s' "$ros" >"$made/ros"
+  printf '%s' "$dev" >"$made/dev"
 }
 
 install_packages() {
-  local extras=ros,dev constraints=$root/constraints.txt
+  local extras=ros constraints=$root/constraints.txt
   if [ -n "$ros" ]; then
-    extras=dev
+    extras=
     # The distribution's rclpy is built for the distribution's numpy.
     constraints=$made/constraints.txt
     grep -v '^numpy==' "$root/constraints.txt" >"$constraints"
   fi
+  if [ "$dev" = yes ]; then extras=${extras:+$extras,}dev; fi
   # The variable, unlike pip's option, also holds for what pip fetches to build this package.
   PIP_CONSTRAINT=$constraints PIP_DISABLE_PIP_VERSION_CHECK=1 \
-    "$python" -m pip install --no-input --editable "$root[$extras]"
+    "$python" -m pip install --no-input --editable "$root${extras:+[$extras]}"
 }
 
 build_carrier() {
@@ -179,7 +182,9 @@ ros=${ROS:-$remembered}
 to_source=${ros:+. \"$ros/setup.sh\"
 unset AMENT_CURRENT_PREFIX
 . \"$venv/share/comms/local_setup.sh\"}
-environment=$(printf '%s\n' "$root" "$to_source" | checksum)
+dev=${DEV:-$(cat "$made/dev" 2>/dev/null || echo yes)}
+[[ $dev =~ ^(yes|no)$ ]] || die "DEV=$dev is neither yes nor no"
+environment=$(printf '%s\n' "$root" "$to_source" "$dev" | checksum)
 packages=$(cat pyproject.toml constraints.txt | checksum)
 carrier=library  # which has the checksum of its sources in it
 "$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"

@@ -31,6 +31,10 @@ CC = f"""#!/bin/sh
 while [ "$1" != -o ]; do shift; done
 echo "$all" > "$2"  # with the checksum, as the library
 """
+PYTHON = f"""#!/bin/sh
+[ "$1 $2" != "-m venv" ] || {{ shift 2; set -- -m venv --without-pip "$@"; }}  # without, it is ten times as fast
+exec {sys.executable} "$@"
+"""
 PIP = 'import os, sys\nprint("pip", *sys.argv[1:], file=open(os.environ["CALLS"], "a"))\n'
 
 
@@ -63,6 +67,7 @@ class Checkout:
             shutil.copy(ROOT / file, self.root / file)
         shutil.copytree(ROOT / "schemas" / "comms", self.root / "schemas" / "comms")
         (self.root / "router" / "carrier" / "native").mkdir()
+        script(self._stubs / "python", PYTHON)
         script(self._stubs / "cmake", CMAKE)
         script(self._stubs / "cc", CC)
         script(self._stubs / "pip" / "__init__.py", "")
@@ -94,7 +99,7 @@ class Checkout:
             **{name: value for name, value in os.environ.items() if not name.startswith(("AMENT_", "ROS"))},
             "PATH": f"{self._stubs}:{os.environ['PATH']}",
             "PYTHONPATH": str(self._stubs),
-            "PYTHON": sys.executable,
+            "PYTHON": str(self._stubs / "python"),
             "CALLS": str(self._calls),
             "INTERFACES": str(self._stubs / "comms"),
             **variables,
@@ -110,6 +115,11 @@ class Checkout:
         )
         assert done.returncode == 0, done.stdout + done.stderr
         return [*done.stdout.splitlines(), *self._calls.read_text().splitlines()]
+
+    def installed(self, said: Sequence[str]) -> str:
+        """The extras of the package that were installed, from what `set_up` returns."""
+        [pip] = [line for line in said if line.startswith("pip")]
+        return pip.removeprefix(f"pip install --no-input --editable {self.root}")
 
     def files(self) -> dict[Path, int]:
         """All of the checkout, with the times of their last changes."""
@@ -146,6 +156,23 @@ def test_interfaces_are_built_again_after_a_change_of_how(checkout: Checkout) ->
     said = checkout.set_up()
     assert [line.split()[0] for line in said[1:]] == ["cmake"] * 3
     assert f"-DCMAKE_PROJECT_comms_INCLUDE={checkout.root / ONLY_NEEDED}" in said[1].split()
+
+
+@pytest.mark.parametrize(("apt", "with_tools", "without"), [(False, "[ros,dev]", "[ros]"), (True, "[dev]", "")])
+def test_tools_for_developers_can_be_left_out(checkout: Checkout, apt: bool, with_tools: str, without: str) -> None:
+    ros = {"ROS": str(checkout.ros)} if apt else {}
+    assert checkout.installed(checkout.set_up(DEV="no", **ros)) == without
+    assert checkout.set_up() == ["setup: .venv is up to date"]  # it is remembered
+    assert checkout.installed(checkout.set_up(DEV="yes")) == with_tools
+
+
+def test_make_says_how_to_get_the_tools_that_tests_need(checkout: Checkout) -> None:
+    shutil.copy(ROOT / "Makefile", checkout.root)
+    (checkout.root / "deploy" / "setup.sh").write_text("#!/bin/sh\n")
+    command = [str(shutil.which("make")), "test"]
+    done = subprocess.run(command, cwd=checkout.root, capture_output=True, text=True, check=False)
+    assert done.stderr.startswith("make: tools for developers are missing: run 'make setup DEV=yes'\n")
+    assert done.returncode
 
 
 @pytest.mark.skipif(not is_buildable(), reason="ROS's generators or cmake are not installed")
