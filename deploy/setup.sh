@@ -142,14 +142,8 @@ build_carrier() {
 
 build_comms() (
   build=$venv/build/comms
-  makes=$(ls schemas/comms/msg; checksum <deploy/interfaces.cmake)
-  if [ "$makes" != "$(cat "$build/makes" 2>/dev/null)" ]; then
-    # What was made for a message that is no more, or in another language, would stay.
-    if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
-    rm -rf "$build"
-    mkdir -p "$build"
-    printf '%s' "$makes" >"$build/makes"
-  fi
+  installed=$made/comms.files
+  rm -rf "$build"  # of a failed build; keeping one saves no time, because the generators write every file anew
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
     # shellcheck disable=SC1091
@@ -162,7 +156,11 @@ build_comms() (
   cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
     -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF -DCMAKE_PROJECT_comms_INCLUDE="$root/deploy/interfaces.cmake"
   cmake --build "$build" --parallel "$(nproc)"
+  # Only now, so that a failed build leaves the old ones: also the files of messages that are no more.
+  if [ -f "$installed" ]; then xargs -d '\n' rm -f <"$installed"; fi
   cmake --install "$build"
+  mv "$build/install_manifest.txt" "$installed"
+  rm -r "$build"
 )
 
 is_usable() {  # the environment: made here, its interpreter still there, and the one asked for

@@ -24,7 +24,15 @@ PATIENCE = 120.0
 
 NOTE = 'printf "%s\\n" "$(basename "$0") $*" >> "$CALLS"\n'
 CMAKE = f"""#!/bin/sh
-{NOTE}if [ "$1" = --install ]; then mkdir -p .venv/share && cp -r "$INTERFACES" .venv/share/comms; fi
+set -e
+{NOTE}case $1 in
+  -S) mkdir -p "$4" ;;
+  --build) ! [ -e "$INTERFACES/broken" ] ;;
+  --install)
+    mkdir -p .venv/share/comms
+    cp -r "$INTERFACES"/* .venv/share/comms
+    find "$PWD/.venv/share/comms" -type f > "$2/install_manifest.txt" ;;
+esac
 """
 CC = f"""#!/bin/sh
 {NOTE}all="$*"
@@ -60,6 +68,7 @@ class Checkout:
     def __init__(self, folder: Path) -> None:
         self.root = folder / "router"
         self.ros = folder / "jazzy"
+        self.interfaces = folder / "comms"
         self._stubs = folder / "stubs"
         self._calls = folder / "calls"
         for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", ONLY_NEEDED, "router/carrier/build.py"):
@@ -72,7 +81,7 @@ class Checkout:
         script(self._stubs / "cc", CC)
         script(self._stubs / "pip" / "__init__.py", "")
         script(self._stubs / "pip" / "__main__.py", PIP)
-        self._prepare_interfaces(self._stubs / "comms")
+        self._prepare_interfaces(self.interfaces)
         self._install_ros()
 
     def _prepare_interfaces(self, share: Path) -> None:
@@ -92,7 +101,7 @@ class Checkout:
         script(self.ros / "_local_setup_util.py", ament("prefix_level/_local_setup_util.py", self.ros))
         script(self.ros / "setup.bash", ". $(dirname ${BASH_SOURCE[0]})/setup.sh\n")
 
-    def set_up(self, **variables: str) -> list[str]:
+    def set_up(self, *, fails: bool = False, **variables: str) -> list[str]:
         """Run setup.sh; return what it printed and the programs that it called, with their arguments."""
         self._calls.write_text("")
         environment = {
@@ -101,7 +110,7 @@ class Checkout:
             "PYTHONPATH": str(self._stubs),
             "PYTHON": str(self._stubs / "python"),
             "CALLS": str(self._calls),
-            "INTERFACES": str(self._stubs / "comms"),
+            "INTERFACES": str(self.interfaces),
             **variables,
         }
         done = subprocess.run(
@@ -113,7 +122,7 @@ class Checkout:
             timeout=PATIENCE,
             check=False,
         )
-        assert done.returncode == 0, done.stdout + done.stderr
+        assert (done.returncode != 0) == fails, done.stdout + done.stderr
         return [*done.stdout.splitlines(), *self._calls.read_text().splitlines()]
 
     def installed(self, said: Sequence[str]) -> str:
@@ -156,6 +165,23 @@ def test_interfaces_are_built_again_after_a_change_of_how(checkout: Checkout) ->
     said = checkout.set_up()
     assert [line.split()[0] for line in said[1:]] == ["cmake"] * 3
     assert f"-DCMAKE_PROJECT_comms_INCLUDE={checkout.root / ONLY_NEEDED}" in said[1].split()
+
+
+def test_interfaces_that_are_no_more_go_when_the_new_ones_are_built(checkout: Checkout) -> None:
+    message, built = checkout.root / "schemas" / "comms" / "msg" / "Gone.msg", checkout.root / ".venv/share/comms/Gone"
+    broken = checkout.interfaces / "broken"
+    message.write_text("")
+    (checkout.interfaces / "Gone").write_text("")
+    checkout.set_up()
+    message.unlink()
+    (checkout.interfaces / "Gone").unlink()
+    broken.write_text("")
+    checkout.set_up(fails=True)
+    assert built.exists()  # a service that starts meanwhile finds all it had
+    broken.unlink()
+    checkout.set_up()
+    assert not built.exists()
+    assert built.with_name("local_setup.sh").exists()
 
 
 @pytest.mark.parametrize(("apt", "with_tools", "without"), [(False, "[ros,dev]", "[ros]"), (True, "[dev]", "")])
