@@ -4,9 +4,10 @@
 #
 #   PYTHON=...  the interpreter to use, 3.10 to 3.13; found without it
 #   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; a sourced one is found without it
+#   DEV=no      leave out what only developers need, for tests, lint and documentation; DEV=yes brings it back
 #
 # Each step leaves the checksum of what it was made from in .venv/.made and is repeated when that changes.
-# Both choices are remembered there. Details of each step are in .venv/setup.log.
+# These choices are remembered there. Details of each step are in .venv/setup.log.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -116,26 +117,23 @@ check_tools() {
 
 make_environment() {
   "$base" -m venv ${ros:+--system-site-packages} "$venv"
-  # What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere.
-  if [ -n "$ros" ]; then
-    printf '. "%s/setup.sh"\n. "%s/share/comms/local_setup.sh"\n' "$ros" "$venv" >"$venv/env.sh"
-  else
-    printf '# Nothing to set: the wheels find their libraries themselves.\n' >"$venv/env.sh"
-  fi
+  printf '%s\n' "${to_source:-# Nothing to set: the wheels find their libraries themselves.}" >"$venv/env.sh"
   printf '%s' "$ros" >"$made/ros"
+  printf '%s' "$dev" >"$made/dev"
 }
 
 install_packages() {
-  local extras=ros,dev constraints=$root/constraints.txt
+  local extras=ros constraints=$root/constraints.txt
   if [ -n "$ros" ]; then
-    extras=dev
+    extras=
     # The distribution's rclpy is built for the distribution's numpy.
     constraints=$made/constraints.txt
     grep -v '^numpy==' "$root/constraints.txt" >"$constraints"
   fi
+  if [ "$dev" = yes ]; then extras=${extras:+$extras,}dev; fi
   # The variable, unlike pip's option, also holds for what pip fetches to build this package.
   PIP_CONSTRAINT=$constraints PIP_DISABLE_PIP_VERSION_CHECK=1 \
-    "$python" -m pip install --no-input --editable "$root[$extras]"
+    "$python" -m pip install --no-input --editable "$root${extras:+[$extras]}"
 }
 
 build_carrier() {
@@ -144,14 +142,8 @@ build_carrier() {
 
 build_comms() (
   build=$venv/build/comms
-  names=$(ls schemas/comms/msg)
-  if [ "$names" != "$(cat "$build/names" 2>/dev/null)" ]; then
-    # The generators keep what they made for a message that is no more.
-    if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
-    rm -rf "$build"
-    mkdir -p "$build"
-    printf '%s' "$names" >"$build/names"
-  fi
+  installed=$made/comms.files
+  rm -rf "$build"  # of a failed build; keeping one saves no time, because the generators write every file anew
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
     # shellcheck disable=SC1091
@@ -162,9 +154,13 @@ build_comms() (
     export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv LD_LIBRARY_PATH=$venv/lib$libraries
   fi
   cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
-    -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF
+    -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF -DCMAKE_PROJECT_comms_INCLUDE="$root/deploy/interfaces.cmake"
   cmake --build "$build" --parallel "$(nproc)"
+  # Only now, so that a failed build leaves the old ones: also the files of messages that are no more.
+  if [ -f "$installed" ]; then xargs -d '\n' rm -f <"$installed"; fi
   cmake --install "$build"
+  mv "$build/install_manifest.txt" "$installed"
+  rm -r "$build"
 )
 
 is_usable() {  # the environment: made here, its interpreter still there, and the one asked for
@@ -179,12 +175,19 @@ flock 9
 
 remembered=$(cat "$made/ros" 2>/dev/null || find_sourced_ros)
 ros=${ROS:-$remembered}
-environment=$(printf '%s\n' "$root" "$ros" | checksum)
+# What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere. ROS's script leaves
+# AMENT_CURRENT_PREFIX behind, which that of the interfaces would take for where they are.
+to_source=${ros:+. \"$ros/setup.sh\"
+unset AMENT_CURRENT_PREFIX
+. \"$venv/share/comms/local_setup.sh\"}
+dev=${DEV:-$(cat "$made/dev" 2>/dev/null || echo yes)}
+[[ $dev =~ ^(yes|no)$ ]] || die "DEV=$dev is neither yes nor no"
+environment=$(printf '%s\n' "$root" "$to_source" "$dev" | checksum)
 packages=$(cat pyproject.toml constraints.txt | checksum)
 carrier=library  # which has the checksum of its sources in it
 "$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"
 # The pins of what the generated code is compiled against belong to it as much as the messages.
-comms=$({ find schemas/comms -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
+comms=$({ find schemas/comms deploy/interfaces.cmake -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
 
 if is_usable && is_made packages "$packages" && is_made carrier "$carrier" && is_made comms "$comms"; then
   echo "setup: .venv is up to date"

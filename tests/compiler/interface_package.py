@@ -19,6 +19,7 @@ from typing import Any
 from router.types.model import MessageType
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces
 
+ROOT = Path(__file__).parents[2]
 NAME = "nasty"
 MESSAGES: Mapping[str, str] = {
     "Empty": "",
@@ -57,18 +58,16 @@ _PACKAGE = f"""<package format="3">
   <member_of_group>rosidl_interface_packages</member_of_group>
 </package>
 """
-# What Python takes to speak through Fast DDS, and no more: the default generators take twice as long.
 _CMAKE = f"""
 cmake_minimum_required(VERSION 3.12)
-project({NAME} C CXX)
-foreach(package ament_cmake rosidl_cmake rosidl_generator_c rosidl_typesupport_c rosidl_typesupport_fastrtps_c
-        rosidl_generator_py)
-  find_package(${{package}} REQUIRED)
-endforeach()
+project({NAME})
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
 file(GLOB messages RELATIVE ${{CMAKE_CURRENT_SOURCE_DIR}} msg/*.msg)
 rosidl_generate_interfaces(${{PROJECT_NAME}} ${{messages}})
 ament_package()
 """
+_ONLY_NEEDED = ROOT / "deploy" / "interfaces.cmake"
 
 
 class InterfacePackage:
@@ -79,7 +78,7 @@ class InterfacePackage:
         program = Path(__file__).with_name("ros_objects.py")
         self._process = subprocess.Popen(
             [sys.executable, str(program)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=_environment(install),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(install),
         )  # fmt: skip
 
     def ask(self, name: str, value: object, data: bytes) -> tuple[bytes, dict[str, Any]]:
@@ -103,7 +102,8 @@ def is_buildable() -> bool:
 
 def built() -> Path:
     """The installation; made when these messages have not been built here before, which takes about 15 s."""
-    key = hashlib.sha256(f"{sys.version}{MESSAGES}{_PACKAGE}{_CMAKE}".encode()).hexdigest()[:12]
+    made_from = f"{sys.version}{MESSAGES}{_PACKAGE}{_CMAKE}{_ONLY_NEEDED.read_text()}"
+    key = hashlib.sha256(made_from.encode()).hexdigest()[:12]
     folder = Path(sys.prefix, "build", f"{NAME}-{key}")
     folder.mkdir(parents=True, exist_ok=True)
     done = folder / "done"
@@ -115,22 +115,26 @@ def built() -> Path:
     return folder / "install"
 
 
+def write_sources(folder: Path) -> None:
+    (folder / "msg").mkdir(parents=True, exist_ok=True)
+    (folder / "package.xml").write_text(_PACKAGE)
+    (folder / "CMakeLists.txt").write_text(_CMAKE)
+    for name, text in MESSAGES.items():
+        (folder / "msg" / f"{name}.msg").write_text(text + "\n")
+
+
 def _build(folder: Path) -> None:
     source = folder / "source"
-    (source / "msg").mkdir(parents=True, exist_ok=True)
-    (source / "package.xml").write_text(_PACKAGE)
-    (source / "CMakeLists.txt").write_text(_CMAKE)
-    for name, text in MESSAGES.items():
-        (source / "msg" / f"{name}.msg").write_text(text + "\n")
+    write_sources(source)
     options = ["-DCMAKE_BUILD_TYPE=Debug", f"-DCMAKE_INSTALL_PREFIX={folder}/install", "-DBUILD_TESTING=OFF",
-               f"-DPython3_EXECUTABLE={sys.executable}"]  # fmt: skip
+               f"-DPython3_EXECUTABLE={sys.executable}", f"-DCMAKE_PROJECT_{NAME}_INCLUDE={_ONLY_NEEDED}"]  # fmt: skip
     commands = [
         ["cmake", "-S", str(source), "-B", str(folder / "build"), *options],
         ["cmake", "--build", str(folder / "build"), "--parallel", str(os.cpu_count())],
         ["cmake", "--install", str(folder / "build")],
     ]
     for command in commands:
-        ran = subprocess.run(command, env=_environment(), capture_output=True, text=True, check=False)
+        ran = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
         assert ran.returncode == 0, f"{' '.join(command)}:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}"
 
 
@@ -139,7 +143,7 @@ def _prefixes() -> list[Path]:
     return [*map(Path, named), Path(sys.prefix)]
 
 
-def _environment(*installs: Path) -> dict[str, str]:
+def environment(*installs: Path) -> dict[str, str]:
     """What a ROS set-up script would set, for wheels as for an installed ROS."""
     prefixes = [*installs, *_prefixes()]
     site_packages = f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"

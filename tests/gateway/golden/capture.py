@@ -2,9 +2,9 @@
 
     make setup && .venv/bin/python -m tests.gateway.golden.capture
 
-Takes two minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, for C++,
-the nasty messages of tests/compiler/interface_package.py. Each case of cases.py is published on a topic of its own;
-the packets come by UDP. The file has one line for each case:
+Takes some minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, with C++,
+the nasty messages of tests/compiler/interface_package.py and the rover's of schemas/comms. Each case of cases.py is
+published on a topic of its own; the packets come by UDP. The file has one line for each case:
 
     case        its name; the topic is /golden/CASE
     type        pkg/msg/Type
@@ -33,7 +33,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.compiler.interface_package import MESSAGES, NAME
+from tests.compiler.interface_package import write_sources
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = Path(__file__).with_name("packets.jsonl")
@@ -53,23 +53,6 @@ STAMP = 8
 SHORT = 400
 """Bytes up to which a compressed packet is kept."""
 
-_PACKAGE = f"""<package format="3">
-  <name>{NAME}</name> <version>0.0.0</version> <description>For tests.</description>
-  <maintainer email="nobody@example.org">nobody</maintainer> <license>MIT</license>
-  <buildtool_depend>ament_cmake</buildtool_depend>
-  <member_of_group>rosidl_interface_packages</member_of_group>
-</package>
-"""
-_CMAKE = f"""
-cmake_minimum_required(VERSION 3.12)
-project({NAME} C CXX)
-find_package(ament_cmake REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
-file(GLOB messages RELATIVE ${{CMAKE_CURRENT_SOURCE_DIR}} msg/*.msg)
-rosidl_generate_interfaces(${{PROJECT_NAME}} ${{messages}})
-ament_package()
-"""
-
 
 def environment(*installs: Path) -> dict[str, str]:
     """What a ROS set-up script would set."""
@@ -87,21 +70,19 @@ def environment(*installs: Path) -> dict[str, str]:
     }
 
 
-def build_nasty(folder: Path) -> Path:
-    """The nasty messages with all that C, C++ and Python need of them; where they are installed."""
-    (folder / "msg").mkdir(parents=True)
-    (folder / "package.xml").write_text(_PACKAGE)
-    (folder / "CMakeLists.txt").write_text(_CMAKE)
-    for name, text in MESSAGES.items():
-        (folder / "msg" / f"{name}.msg").write_text(text + "\n")
+def build_interfaces(folder: Path) -> Path:
+    """The nasty messages and those of the rover, with their C++; where they are installed."""
+    write_sources(folder / "nasty")
     install = folder / "install"
     options = [f"-DCMAKE_INSTALL_PREFIX={install}", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"]
-    for command in (
-        ["cmake", "-S", folder, "-B", folder / "build", *options],
-        ["cmake", "--build", folder / "build", "--parallel", "2"],
-        ["cmake", "--install", folder / "build"],
-    ):
-        subprocess.run([*map(str, command)], env=environment(), stdout=subprocess.DEVNULL, check=True)
+    for source in (folder / "nasty", ROOT / "schemas" / "comms"):
+        build = folder / "build" / source.name
+        for command in (
+            ["cmake", "-S", source, "-B", build, *options],
+            ["cmake", "--build", build, "--parallel", "2"],
+            ["cmake", "--install", build],
+        ):
+            subprocess.run([*map(str, command)], env=environment(), stdout=subprocess.DEVNULL, check=True)
     return install
 
 
@@ -230,7 +211,7 @@ def main() -> None:
     try:
         # The loader reads its search path when a process begins.
         words = [sys.executable, "-m", __spec__.name, str(peer)]
-        subprocess.run(words, env=environment(build_nasty(folder)), check=True)
+        subprocess.run(words, env=environment(build_interfaces(folder)), check=True)
     finally:
         shutil.rmtree(folder)
 
