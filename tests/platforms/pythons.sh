@@ -3,11 +3,11 @@
 #
 #   tests/platforms/pythons.sh [VARIABLE=VALUE...]   variables for make, such as TESTS=tests/wire
 #
-# Each tests the last commit, in a clone with a .venv of its own in ~/.cache/rover-router; PYTHONS=FOLDER for another
-# folder. Clones and logs stay there, so that the next run is set up in seconds.
+# Each tests the last commit, in a clone with a .venv of its own. Clones and logs lie in $ROUTER_PYTHONS,
+# ~/.cache/rover-router/pythons unless said, and stay there, so that the next run is set up in seconds.
 set -euo pipefail
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
-folder=${PYTHONS:-${XDG_CACHE_HOME:-$HOME/.cache}/rover-router}
+folder=${ROUTER_PYTHONS:-$HOME/.cache/rover-router/pythons}
 
 find_python() {  # VERSION: prints the path of such an interpreter, on PATH or pyenv's
   local candidate
