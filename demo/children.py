@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import IO, Any
 
 PATIENCE = 5.0
@@ -32,13 +33,14 @@ class Child:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "demo.tied", *module],
             env=dict(env),
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             start_new_session=True,
         )
-        if self._process.stdout is None:
-            raise AssertionError("a pipe was asked for")
+        if self._process.stdin is None or self._process.stdout is None:
+            raise AssertionError("pipes were asked for")
+        self._stdin = self._process.stdin
         self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
         self._reader.start()
 
@@ -47,6 +49,12 @@ class Child:
             for line in lines:
                 if line.startswith(b"{"):
                     self.latest = json.loads(line)
+
+    def tell(self, line: str) -> None:
+        """Write a line to its stdin. Nothing happens if it has ended."""
+        with suppress(BrokenPipeError):
+            self._stdin.write(line.encode() + b"\n")
+            self._stdin.flush()
 
     @property
     def exit_code(self) -> int | None:
@@ -66,6 +74,8 @@ class Child:
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         self._reader.join(PATIENCE)
+        with suppress(BrokenPipeError):
+            self._stdin.close()
 
     def last_words(self) -> str:
         """The end of what it wrote to stderr, read beside the child's own position in the file."""

@@ -10,8 +10,9 @@ from router.errors import TableError
 from router.table.addresses import Address
 from router.table.model import EndpointKind, GatewayFormat, Route, RouteTable, Transport
 
-LOST, FOUND = 5.0, 8.0
-"""Seconds after the simulator's start at which the link to all basestations is lost and found again."""
+COMMANDED, LOST, FOUND = 3.0, 5.0, 8.0
+"""Seconds by the simulator's clock: until when the rover's software commands the boards, and when the link to all
+basestations is lost and found again. A command of the software after LOST would disarm the operator's deadmen."""
 
 
 def checked_table(path: Path) -> RouteTable:

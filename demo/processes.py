@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from demo.children import Child
-from demo.expected import FOUND, LOST, basestations, page_of, shown_topics
+from demo.expected import COMMANDED, FOUND, LOST, basestations, page_of, shown_topics
 from demo.page import Shown, look
 from demo.places import free_ros_domain
 from demo.recorded import first_of, recordings
@@ -28,7 +28,7 @@ START_PATIENCE = 30.0
 """Seconds within which a process must be up; a cold start reads a lot from disk."""
 
 MATCHING = 0.5
-"""Seconds after the listener has found the router until the router has found the listener."""
+"""Seconds after the ROS nodes have found the router until the router has found them."""
 
 REFRESH = 0.5
 DRAINING = 0.5
@@ -43,7 +43,7 @@ class DemoError(RouterError):
 
 
 class Demo:
-    """The four processes and what they say. Router and ROS listener start first, the others when those are up."""
+    """The four processes and what they say. The simulator starts when the others are up; then its clock counts."""
 
     def __init__(self, table: RouteTable) -> None:
         if table.http is None:
@@ -71,11 +71,12 @@ class Demo:
         before = recordings(self._table)
         listener = self._start("listener", "demo.ros_listener", str(TABLE))
         self._start("router", "router", "run", str(TABLE))
-        self._wait_until_up(listener)
+        talker = self._start("talker", "demo.ros_talker", str(TABLE))
+        self._wait_until_up(listener, talker)
         cut_off = [word for name in basestations(self._table) for word in ("--silent", f"{name}:{LOST}-{FOUND}")]
         simulator = self._start("simulator", "router", "sim", "-t", str(TABLE), "--json", *cut_off)
         self._wait_until(lambda: bool(simulator.latest), "the simulator did not start")
-        talker = self._start("talker", "demo.ros_talker", str(TABLE))
+        talker.tell(str(time.monotonic() - simulator.latest["seconds"] + COMMANDED))
         window = Window()
         with open_screen(console, self._table, DURATION) as screen:
             while simulator.latest["seconds"] < DURATION:
@@ -96,12 +97,13 @@ class Demo:
         address = page_of(self._table)
         return look(address, shown_topics(self._table)) if address else None
 
-    def _wait_until_up(self, listener: Child) -> None:
-        """Until the ROS listener has found the router's topics: before that, the router withholds messages."""
+    def _wait_until_up(self, listener: Child, talker: Child) -> None:
+        """Until the ROS nodes have found the router's topics: before that, the router withholds messages."""
         self._wait_until(
             lambda: bool(listener.latest) and all(topic["publishers"] for topic in listener.latest["topics"].values()),
             "router and ROS listener did not find each other",
         )
+        self._wait_until(lambda: bool(talker.latest), "router and ROS talker did not find each other")
         time.sleep(MATCHING)
 
     def _wait_until(self, holds: Callable[[], bool], complaint: str) -> None:

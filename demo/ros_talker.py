@@ -1,20 +1,23 @@
 """The rover's software, as far as the router can tell: publishes every topic that the table takes from ROS.
 
-It commands the boards for some seconds, then leaves them to the operator.
-
-`python -m demo.ros_talker TABLE`
+`python -m demo.ros_talker TABLE` prints {"ready": true} when the router has subscribed to all of them. Then it reads
+from stdin until when it commands the boards, a time of CLOCK_MONOTONIC in seconds, and begins. Later it leaves the
+boards to the operator.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import rclpy
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
@@ -24,33 +27,38 @@ from demo.ros_messages import filled, message_class
 INTERVAL = 0.1
 """Seconds."""
 
-COMMANDING = 3.0
-"""Seconds after the start, in which it commands the boards: less than until the operator is cut off."""
-
 ANY_SUBSCRIBER = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Reliable and kept: what a subscriber may ask for at most."""
 
 
-def talk(node: Node, topics: dict[str, str], commands: set[str], ended: threading.Event) -> None:
-    """One message on each topic in every INTERVAL, on those of `commands` while COMMANDING."""
-    classes = {topic: message_class(name) for topic, name in topics.items()}
-    publishers = {topic: node.create_publisher(kind, topic, ANY_SUBSCRIBER) for topic, kind in classes.items()}
+def talk(
+    node: Node, publishers: dict[str, Publisher], commands: set[str], until: float, ended: threading.Event
+) -> None:
+    """Publish one message per INTERVAL on each topic, on those of `commands` only `until` then."""
     for number in itertools.count():
         stamp = node.get_clock().now().to_msg()
         for topic, publisher in publishers.items():
-            if topic not in commands or number * INTERVAL < COMMANDING:
-                publisher.publish(filled(classes[topic], number, stamp))
+            if topic not in commands or time.monotonic() < until:
+                publisher.publish(filled(publisher.msg_type, number, stamp))
         if ended.wait(INTERVAL):
             return
 
 
 def main() -> int:
     table = checked_table(Path(sys.argv[1]))
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # which would end ROS between two publishers
     node = rclpy.create_node("demo_talker", namespace=table.node.namespace)
-    talk(node, outbound_topics(table), command_topics(table), ended)
+    publishers = {
+        topic: node.create_publisher(message_class(name), topic, ANY_SUBSCRIBER)
+        for topic, name in outbound_topics(table).items()
+    }
+    while not all(publisher.get_subscription_count() for publisher in publishers.values()):
+        time.sleep(INTERVAL)
+    print(json.dumps({"ready": True}), flush=True)
+    until = float(sys.stdin.readline())
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())  # until here it ends the process
+    talk(node, publishers, command_topics(table), until, ended)
     rclpy.shutdown()
     return 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import logging
+import os
 import select
 import sys
 import threading
@@ -86,7 +87,8 @@ def configure_log(level: str = "info", *, coloured: bool = False) -> None:
 class _NonBlockingStream:
     """A stream that drops lines if its reader is gone or slow, or its disk is full; it never blocks or raises.
 
-    The counters have what the lines would have said. Lines are written whole, when flushed.
+    The counters have what the lines would have said. Lines are written whole, when flushed. They bypass the stream's
+    buffer, which would keep a line that cannot be written until Python exits, and fails because of it (code 120).
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -102,10 +104,12 @@ class _NonBlockingStream:
 
     def flush(self) -> None:
         line, self._line = self._line, ""
+        if not self._is_file:
+            self._stream.write(line)
+            return
         with suppress(OSError):
-            if not self._is_file or self._room.poll(0):
-                self._stream.write(line)
-                self._stream.flush()
+            if self._room.poll(0):
+                os.write(self._stream.fileno(), line.encode(self._stream.encoding, "backslashreplace"))
 
 
 def _is_file(stream: TextIO) -> bool:

@@ -137,8 +137,10 @@ class Rover:
             "PYTHONUNBUFFERED": "1",
         }
 
-    def start(self, name: str, *module: str) -> None:
-        self._running.append(Child(name, self._env, *module))
+    def start(self, name: str, *module: str) -> Child:
+        child = Child(name, self._env, *module)
+        self._running.append(child)
+        return child
 
     def stop(self) -> None:
         for child in self._running:
@@ -166,6 +168,10 @@ class Rover:
                 raise PictureError(f"not within {patience:.0f} s: {what}")
             time.sleep(0.5)
 
+    def until_said(self, child: Child, what: str) -> None:
+        """Until a child has printed a line."""
+        self.until(lambda _: bool(child.latest), what)
+
 
 @contextmanager
 def rover(scratch: Path, table: RouteTable, well: float) -> Iterator[Rover]:
@@ -175,10 +181,12 @@ def rover(scratch: Path, table: RouteTable, well: float) -> Iterator[Rover]:
         try:
             running.start("listener", "demo.ros_listener", str(TABLE))
             running.start("router", "router", "run", str(TABLE))
-            running.until(lambda _: True, "the router answers")
+            talker = running.start("talker", "demo.ros_talker", str(TABLE))
+            running.until_said(talker, "the router answers, and subscribes to topics")
             cut_off = f"{BASESTATION}:{well:g}-"
-            running.start("simulator", "router", "sim", "-t", str(TABLE), "--json", "--silent", cut_off)
-            running.start("talker", "demo.ros_talker", str(TABLE))
+            simulator = running.start("simulator", "router", "sim", "-t", str(TABLE), "--json", "--silent", cut_off)
+            running.until_said(simulator, "the simulator sends")
+            talker.tell(str(time.monotonic() + COMMANDED))
             running.until(_flows, "all endpoints send, and topics have subscribers")
             time.sleep(COMMANDED)
             seen = running.look()

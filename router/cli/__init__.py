@@ -17,10 +17,13 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeAlias
 
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -102,6 +105,15 @@ class _Completion(argparse.Action):
 
 
 class _Parser(argparse.ArgumentParser):
+    """Fails if its help cannot be written. argparse ignores that, and the buffer of stdout is not there to fail later
+    if Python writes without one (PYTHONUNBUFFERED).
+    """
+
+    def print_help(self, file: SupportsWrite[str] | None = None) -> None:
+        print(self.format_help(), end="", file=file)
+
+
+class _MainParser(_Parser):
     """The verbs in groups, in place of one long list."""
 
     def format_help(self) -> str:
@@ -117,7 +129,7 @@ class _Parser(argparse.ArgumentParser):
         return "\n".join([*lines, ""])
 
 
-class _VerbParser(argparse.ArgumentParser):
+class _VerbParser(_Parser):
     """Takes `--for -1s` for a value that its option can refuse, not for an unknown option."""
 
     def __init__(self, **settings: Any) -> None:
@@ -168,13 +180,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:  # argparse prints, and exits
             sys.stdout.flush()
     except BrokenPipeError:
-        _leave_stdout()
+        _leave(sys.stdout, sys.stderr)
         return BROKEN_PIPE
     except KeyboardInterrupt:
         return INTERRUPTED
     except (MemoryError, ImportError, OSError, RuntimeError) as error:
         if isinstance(error, OSError) and error.errno in _UNWRITTEN and error.filename is None:
-            _leave_stdout()
+            _leave(sys.stdout)
             print(f"router {_verb(arguments) or ''}".rstrip() + f": stdout: {error.strerror}", file=sys.stderr)
             return UNWRITTEN
         # Each of them may say that memory could not be had.
@@ -190,9 +202,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _leave_stdout() -> None:
-    """Have nothing written any more, or Python complains when it flushes at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _leave(*streams: TextIO) -> None:
+    """Discard what is still buffered, or Python fails when it flushes at exit."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in streams:
+        os.dup2(nowhere, stream.fileno())
 
 
 def _verb(arguments: Sequence[str]) -> str | None:
@@ -208,7 +222,7 @@ def _open_what_is_closed() -> None:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    parser = _Parser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
+    parser = _MainParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
     subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_VerbParser)

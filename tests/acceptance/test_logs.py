@@ -10,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.acceptance.payloads import generated
 from tests.acceptance.site import ROOT, RouterProcess, site, total
 
@@ -47,7 +49,11 @@ def test_a_person_at_a_terminal_reads_lines(tmp_path: Path) -> None:
     assert not any(line.startswith("{") for line in shown.decode().splitlines())
 
 
-def test_a_log_that_nobody_reads_any_more_does_not_stop_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_log_that_nobody_reads_any_more_does_not_stop_it(
+    tmp_path: Path, unbuffered: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     good = next(generated("ph_info")).datagram
     with site(tmp_path) as place:
         command = [sys.executable, "-m", "router", "run", str(place.table())]

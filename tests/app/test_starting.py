@@ -92,12 +92,12 @@ def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> list[st
     return [json.loads(line)["event"] for line in log.splitlines()]
 
 
-def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path) -> subprocess.Popen[str]:
+def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path, **options: object) -> subprocess.Popen[str]:
     """Before it imports anything that takes long. It goes on after a line."""
     folder = tmp_path / "halting"
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(HALTING)
-    process = start(how, *arguments, path=str(folder))
+    process = start(how, *arguments, path=str(folder), **options)
     assert process.stdout
     assert process.stdout.readline() == "importing\n"
     return process
@@ -267,7 +267,10 @@ def test_signals_that_come_before_it_routes_are_served_when_it_does(
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGUSR1])
 def test_other_verbs_end_by_them(table: Path, tmp_path: Path, number: signal.Signals) -> None:
-    process = halted(MODULE, tmp_path, "validate", table)
+    def heed() -> None:
+        signal.signal(number, signal.SIG_DFL)  # nohup has what it runs ignore SIGHUP
+
+    process = halted(MODULE, tmp_path, "validate", table, preexec_fn=heed)
     process.send_signal(number)
     process.communicate(timeout=20)
     assert process.returncode == -number

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -94,7 +95,9 @@ def test_a_table_as_an_argument_of_a_verb_that_takes_none_names_the_option(
 
 
 @pytest.mark.parametrize("words", ["--help", "--version", "--completion bash", "status --url http://127.0.0.1:1"])
-def test_a_full_disk_below_stdout_is_a_line(words: str) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_below_stdout_is_a_line(words: str, unbuffered: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     router = f"exec {sys.executable} -m router {words} >/dev/full"
     done = subprocess.run(["/bin/sh", "-c", router], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == UNWRITTEN
@@ -135,6 +138,16 @@ def test_what_a_verb_raises_becomes_an_exit_code(
     monkeypatch.setattr(validate, "run", fail)
     assert main(["validate", "x.yaml"]) == code
     assert shown in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_findings_that_nobody_reads_end_it_as_output_does(unbuffered: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing) as stderr:
+        done = subprocess.run([sys.executable, "-m", "router", "valdate"], cwd=REPOSITORY, stderr=stderr, check=False)
+    assert done.returncode == BROKEN_PIPE
 
 
 def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:

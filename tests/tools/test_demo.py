@@ -1,4 +1,4 @@
-"""The demo's judgement and its processes; that it runs as a whole is what `make demo` shows."""
+"""The demo's judgement and its processes, and the demo as a whole where one of these is slow."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from demo.expected import (
     shown_topics,
 )
 from demo.page import Shown, look
-from demo.places import free_ros_domain, taken_places
+from demo.places import alone, free_ros_domain, taken_places
 from demo.recorded import Recorded, first_of
 from demo.verdict import judge
 from router.errors import Located
@@ -49,6 +50,21 @@ endpoints:
   stands: {{address: "127.0.0.13:29000", kind: basestation}}
 routes: {{manual_arm: {{source: [pit]}}}}
 gateways: {{laptop: {{transport: {{tcp: "127.0.0.1:28766"}}}}}}
+"""
+SLOW_TALKER = """\
+import sys, time
+if "demo.ros_talker" in sys.orig_argv:
+    time.sleep(1.5)
+"""
+"""A `sitecustomize`. If commands were timed from the talker's start, they would last into the lost link by so much."""
+
+WHOLE = """\
+import sys
+from pathlib import Path
+import demo.processes
+demo.processes.TABLE = Path("tests/rover/routes/sim.yaml")
+from demo.__main__ import main
+sys.exit(main())
 """
 LASTING = "import time\nprint('{\"ready\": true}', flush=True)\ntime.sleep(60)\n"
 
@@ -277,3 +293,28 @@ def test_what_came_before_the_boards_were_halted_has_to_be_there(
     [missing] = [finding.text for finding in judge(*everything, recorded) if not finding.ok]
     assert missing == "what came before the boards were halted was not recorded"
     assert first_of([]) is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rclpy") is None or find_spec("comms") is None, reason="needs ROS 2 and comms")
+def test_a_slow_start_of_the_software_changes_nothing(tmp_path: Path) -> None:
+    if (wrapper := alone()) is None:
+        pytest.skip("needs a network namespace")
+    (tmp_path / "sitecustomize.py").write_text(SLOW_TALKER)
+    folders = (str(tmp_path), os.environ.get("PYTHONPATH"))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, folders)), "RECORDINGS": str(tmp_path)}
+    command = [*wrapper, sys.executable, "-c", WHOLE]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_child_reads_what_it_is_told(tmp_path: Path) -> None:
+    (tmp_path / "echoing.py").write_text("import json\nprint(json.dumps({'told': input()}), flush=True)\n")
+    child = Child("echoing", os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}"}, "echoing")
+    child.tell("12.5")
+    wait_until(lambda: bool(child.latest))
+    assert child.latest == {"told": "12.5"}
+    wait_until(lambda: child.exit_code is not None)
+    child.tell("nobody reads this")
+    child.end()
+    assert child.exit_code == 0

@@ -72,6 +72,19 @@ def wrap(x: int, low: int, high: int) -> int:
     return (x - low) % (high - low + 1) + low
 
 
+def atan2(y: float, x: float) -> float:
+    return _with_one_nan(math.atan2(y, x))
+
+
+def hypot(x: float, y: float) -> float:
+    return _with_one_nan(math.hypot(x, y))
+
+
+def _with_one_nan(x: float) -> float:
+    """Python 3.10 makes a NaN of its own from any, with the sign that the processor gives it."""
+    return math.nan if x != x else x  # noqa: PLR0124 - NaN alone differs from itself
+
+
 def to_float32(x: float) -> float:
     if math.isinf(x) or abs(x) < FLOAT32_END or math.isnan(x):
         return float(x)
@@ -225,8 +238,10 @@ def _whole(name: str = "x") -> Parameter:
     return Parameter(name, (IntKind, EnumKind), "an integer")
 
 
-def _math(name: str, summary: str, *examples: tuple[str, object], parameters: tuple[str, ...] = ("x",)) -> Function:
-    return Function(name, tuple(map(_number, parameters)), _double, getattr(math, name), summary, examples)
+def _real(
+    implementation: Callable[..., float], summary: str, *examples: tuple[str, object], names: tuple[str, ...] = ("x",)
+) -> Function:
+    return Function(implementation.__name__, tuple(map(_number, names)), _double, implementation, summary, examples)
 
 
 _SIZED = (StringKind, BytesKind, ListKind)
@@ -249,16 +264,16 @@ _DECLARED = (
              "The integer, counted on from the low bound when it passes the high one; without bounds, those of "
              "the integer field that it fills.",
              (("wrap(256, 0, 255)", 0), ("wrap(-1, 0, 255)", 255), ("wrap(190, -180, 179)", -170)), optional=2),
-    _math("radians", "Degrees to radians.", ("radians(180)", math.pi)),
-    _math("degrees", "Radians to degrees.", ("degrees(0.0)", 0.0)),
-    _math("sqrt", "The square root; of a negative number there is none, and the target is dropped.",
+    _real(math.radians, "Degrees to radians.", ("radians(180)", math.pi)),
+    _real(math.degrees, "Radians to degrees.", ("degrees(0.0)", 0.0)),
+    _real(math.sqrt, "The square root; of a negative number there is none, and the target is dropped.",
           ("sqrt(9)", 3.0)),
-    _math("sin", "The sine of an angle in radians.", ("sin(0)", 0.0)),
-    _math("cos", "The cosine of an angle in radians.", ("cos(0)", 1.0)),
-    _math("tan", "The tangent of an angle in radians.", ("tan(0)", 0.0)),
-    _math("atan2", "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
-          parameters=("y", "x")),
-    _math("hypot", "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), parameters=("x", "y")),
+    _real(math.sin, "The sine of an angle in radians.", ("sin(0)", 0.0)),
+    _real(math.cos, "The cosine of an angle in radians.", ("cos(0)", 1.0)),
+    _real(math.tan, "The tangent of an angle in radians.", ("tan(0)", 0.0)),
+    _real(atan2, "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
+          names=("y", "x")),
+    _real(hypot, "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), names=("x", "y")),
     Function("float32", (_number(),), _always(FloatKind(32)), to_float32,
              "Says that a double, or a large integer, may lose digits in a float32.", (("float32(0.5)", 0.5),)),
     Function("float64", (_number(),), _always(FloatKind(64)), float,

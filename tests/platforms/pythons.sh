@@ -1,0 +1,47 @@
+#!/usr/bin/env bash
+# Runs `make test` with each Python from 3.10 to 3.13 that is found here, and says which passed, failed or are missing.
+#
+#   tests/platforms/pythons.sh [VARIABLE=VALUE...]   variables for make, such as TESTS=tests/wire
+#
+# Each tests the last commit, in a clone with a .venv of its own. Clones and logs lie in $ROUTER_PYTHONS,
+# ~/.cache/rover-router/pythons unless said, and stay there, so that the next run is set up in seconds.
+set -euo pipefail
+repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+folder=${ROUTER_PYTHONS:-$HOME/.cache/rover-router/pythons}
+
+find_python() {  # VERSION: prints the path of such an interpreter, on PATH or pyenv's
+  local candidate
+  for candidate in "$(command -v "python$1")" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$1".*/bin/python; do
+    if "$candidate" -c "import sys; sys.exit('%d.%d' % sys.version_info[:2] != '$1')" 2>/dev/null; then
+      printf '%s' "$candidate"
+      return
+    fi
+  done
+}
+
+test_with() {  # VERSION PYTHON VARIABLE=VALUE...
+  local clone=$folder/python$1 python=$2
+  shift 2
+  { [ -d "$clone" ] || git clone --quiet --no-checkout "$repository" "$clone"; } \
+    && git -C "$clone" fetch --quiet "$repository" HEAD \
+    && git -C "$clone" checkout --quiet --force --detach FETCH_HEAD \
+    && make -C "$clone" test PYTHON="$python" "$@"
+}
+
+mkdir -p "$folder"
+results=()
+status=0
+for version in 3.10 3.11 3.12 3.13; do
+  python=$(find_python $version)
+  if [ -z "$python" ]; then
+    results+=("Python $version: not found")
+    continue
+  fi
+  log=$folder/python$version.log
+  printf 'Python %s: %s, writing to %s ...\n' $version "$python" "$log"
+  if test_with $version "$python" "$@" >"$log" 2>&1; then outcome=passed; else outcome=FAILED status=1; fi
+  summary=$(grep -E '[0-9]+ (passed|failed|errors?)' "$log" | tail -n 1) || true
+  results+=("Python $version: $outcome: ${summary:-$(tail -n 1 "$log")}")
+done
+printf '%s\n' "${results[@]}"
+exit $status
