@@ -40,7 +40,7 @@ WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstr
 
 
 class BuildError(Exception):
-    """There is no compiler, or it refuses the sources; says what it said."""
+    """There is no compiler, or it refuses the sources, and says what it said; or the processor has no 64 bits."""
 
 
 def sources() -> list[Path]:
@@ -77,6 +77,8 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 
     Raises BuildError.
     """
+    if sys.maxsize < 2**32:
+        raise BuildError("the carrier is for 64-bit processors only, and this Python is one for 32 bits")
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
         made = Path(folder) / output.name
         compile_c([*map(str, sources()), "-fPIC", "-shared", *rcl_headers(), *flags, "-o", str(made)], compiler)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import os
 import socket
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
+
+from router.clock import wall_ns
+from router.log import logger
 
 # Linux constants that the socket module does not name.
 SO_ATTACH_FILTER = 26
@@ -30,6 +35,8 @@ _IFREQ = struct.Struct("16s24s")
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
+_INODE = 9
+"""The column of /proc/net/udp and /proc/net/tcp."""
 
 _EXTENDED_ERROR = struct.Struct("@IBBB")
 """The beginning of struct sock_extended_err: errno, origin, ICMP type and code."""
@@ -40,11 +47,23 @@ _BOUND = {"udp": "07", "tcp": "0A"}
 """The state of a socket that receives from anybody, in /proc/net."""
 
 
+def send_arrivals(opened: socket.socket, *, wanted: bool) -> None:
+    """Have the kernel send the time of its arrival with each datagram, or only tell it when asked, as by `arrivals`."""
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, wanted)
+    except OSError as error:
+        if error.errno != errno.ENOPROTOOPT:
+            raise
+        if wanted:
+            _warn_once("the kernel sends no arrival times with datagrams: each takes one more system call")
+
+
 def arrivals(opened: socket.socket) -> Callable[[], int]:
     """Have the kernel stamp datagrams. Return a function: when the last received one arrived, in ns of the wall clock.
 
-    That is before it waited in the receive buffer. The function makes one system call and is for the receiving thread;
-    it raises FileNotFoundError before the first datagram.
+    That is before it waited in the receive buffer, unless the kernel cannot stamp: then it is the present time. The
+    function makes one system call and is for the receiving thread; it raises FileNotFoundError before the first
+    datagram.
     """
     stamp = bytearray(_TIMESPEC.size)
 
@@ -53,15 +72,29 @@ def arrivals(opened: socket.socket) -> Callable[[], int]:
         seconds, nanoseconds = _TIMESPEC.unpack(stamp)
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
-    with suppress(FileNotFoundError):  # raised as nothing was received; stamping begins all the same
+    try:
         arrived_at()
+    except FileNotFoundError:  # nothing was received; stamping begins all the same
+        pass
+    except OSError:
+        _warn_once("the kernel has no arrival times: 'ttl' does not see how long datagrams wait in the receive buffer")
+        return wall_ns
     return arrived_at
+
+
+@cache
+def _warn_once(event: str) -> None:
+    logger.warning(event)
 
 
 def drops(opened: socket.socket) -> int:
     """Datagrams that the kernel dropped before they were received, since the socket was opened."""
-    words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
-    return int(words[_MEMINFO_DROPS])
+    # Not before Linux 4.12, and qemu-user returns one word: then they stand in a table of all sockets.
+    with suppress(OSError, struct.error):
+        words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
+        return int(words[_MEMINFO_DROPS])
+    inode = str(os.fstat(opened.fileno()).st_ino)
+    return next((int(row[-1]) for row in _rows(Path("/proc/net/udp")) if row[_INODE] == inode), 0)
 
 
 def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
@@ -172,13 +205,15 @@ def _process(protocol: str, port: int) -> Path | None:
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:
     for table in (Path("/proc/net", protocol), Path("/proc/net", f"{protocol}6")):
-        if not table.exists():
-            continue
-        for line in table.read_text().splitlines()[1:]:
-            columns = line.split()
-            local, state, inode = columns[1], columns[3], columns[9]
+        for row in _rows(table) if table.exists() else ():
+            local, state, inode = row[1], row[3], row[_INODE]
             if state == _BOUND[protocol] and int(local.rpartition(":")[2], 16) == port:
                 yield inode
+
+
+def _rows(table: Path) -> Iterator[list[str]]:
+    """Those of a table in /proc/net, each as its columns."""
+    return (line.split() for line in table.read_text().splitlines()[1:])
 
 
 def _open_files(process: Path) -> Iterator[str]:

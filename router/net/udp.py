@@ -16,7 +16,6 @@ from router.net.kernel import (
     IP_FREEBIND,
     IP_PKTINFO,
     PKTINFO_SIZE,
-    SO_TIMESTAMPNS,
     arrivals,
     ask_for_receive_buffer,
     bound_interface,
@@ -25,6 +24,7 @@ from router.net.kernel import (
     receive_buffer,
     refuse_input,
     report_sending_errors,
+    send_arrivals,
     sending_errors,
 )
 from router.table import model
@@ -60,7 +60,7 @@ class Inherited:
             return None
         self._taken.add(bound)
         # Without the option, stamps are read by `arrivals`, and no longer come with each datagram.
-        held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
+        send_arrivals(held, wanted=False)
         held.setblocking(True)
         return held.dup()
 
@@ -140,7 +140,7 @@ class Listener:
         self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if is_stamped:
-                self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+                send_arrivals(self.socket, wanted=True)
             # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
             # would steal the port unnoticed.
             with self.shared() if has_senders else nullcontext():

@@ -76,6 +76,12 @@ def test_a_function_that_nobody_wrote_is_found_when_it_is_built(made: Path, nati
         build.build(made)
 
 
+def test_it_is_for_64_bit_processors_only(native: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "maxsize", 2**31 - 1)
+    with pytest.raises(build.BuildError, match="the carrier is for 64-bit processors only"):
+        build.build(native / "libcarrier.so")
+
+
 def test_everyone_may_read_it(made: Path) -> None:
     """The service runs as a user of its own."""
     assert made.stat().st_mode & 0o444 == 0o444

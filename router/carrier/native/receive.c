@@ -2,8 +2,10 @@
 #include "carrier_internal.h"
 
 #include <errno.h>
+#include <linux/sockios.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
@@ -199,15 +201,18 @@ static void handle(struct carrier *carrier, struct received *received, int64_t a
 
 /* ---- receiving ---- */
 
-/* The time at which the kernel got a datagram, by the wall clock; 0 if it does not say. */
-static int64_t arrival(struct msghdr *message) {
+static int64_t nanoseconds(struct timespec time) { return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec; }
+
+/* The time at which the kernel got the datagram that was just received, by the wall clock; 0 if it does not say. Where the
+ * time does not come with each datagram, as in qemu-user, the kernel is asked. */
+static int64_t arrival(int fd, struct msghdr *message) {
+    struct timespec stamp;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(message); each; each = CMSG_NXTHDR(message, each))
         if (each->cmsg_level == SOL_SOCKET && each->cmsg_type == SCM_TIMESTAMPNS) {
-            struct timespec stamp;
             memcpy(&stamp, CMSG_DATA(each), sizeof stamp);
-            return (int64_t)stamp.tv_sec * 1000000000 + stamp.tv_nsec;
+            return nanoseconds(stamp);
         }
-    return 0;
+    return ioctl(fd, SIOCGSTAMPNS, &stamp) ? 0 : nanoseconds(stamp);
 }
 
 /* As recvmsg, but errors about datagrams that were sent from the listener's port go to their senders, and keep no datagram
@@ -248,7 +253,7 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
     struct received received = {.listener = listener, .length = (size_t)length,
                                 .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
     edition_begin(&carrier->edition);
-    handle(carrier, &received, arrival(&message));
+    handle(carrier, &received, arrival(listener->fd, &message));
     edition_end(&carrier->edition);
     share_processor(&carrier->share, received.now);
     return RECEIVED;

@@ -47,10 +47,14 @@ static uint32_t size_at(struct ring *ring, uint64_t position) {
     return head.size;
 }
 
-/* Wake the reader, if it sleeps or is going to, once for all that is written until then. */
+/* Wake the reader, if it sleeps or is going to, once for all that is written until then. The full fences here and in
+ * `ring_take` stand between what either side stores and what it loads then: either the reader sees the record or the
+ * request, or we see that it waits. Sequentially consistent stores and loads would do on a processor, but qemu-user for
+ * aarch64 reorders them. */
 static void wake_reader(struct ring *ring) {
+    atomic_thread_fence(memory_order_seq_cst);
     if (atomic_load_explicit(&ring->is_watched, memory_order_relaxed)) eventfd_write(ring->wake, 1);
-    if (atomic_load(&ring->is_waited_for) && atomic_exchange(&ring->is_waited_for, 0))
+    if (atomic_load_explicit(&ring->is_waited_for, memory_order_relaxed) && atomic_exchange(&ring->is_waited_for, 0))
         syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAKE_PRIVATE, 1, NULL, NULL, 0);
 }
 
@@ -63,8 +67,7 @@ bool ring_put(struct ring *ring, const void *record, uint32_t size) {
     atomic_thread_fence(memory_order_release);
     for (uint32_t done = 0; done < size; done += WORD)
         atomic_store_explicit(word_at(ring, written + done), *words++, memory_order_relaxed);
-    /* Sequentially consistent, as is `is_waited_for`: either the reader sees the record, or we see that it waits. */
-    atomic_store(&ring->written, written + size);
+    atomic_store_explicit(&ring->written, written + size, memory_order_release);
     wake_reader(ring);
     return true;
 }
@@ -98,7 +101,7 @@ static size_t take_ready(struct ring *ring, void *records, size_t limit) {
     size_t copied = 0;
     for (;;) {
         uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
-        if (atomic_load(&ring->written) == taken) return copied;
+        if (atomic_load_explicit(&ring->written, memory_order_acquire) == taken) return copied;
         uint32_t size = record_at(ring, taken);
         if (size > limit - copied) {
             if (is_oldest(ring, taken)) return copied;
@@ -118,7 +121,8 @@ static void sleep_until_woken(struct ring *ring, int timeout_ms) {
 size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms) {
     size_t copied = take_ready(ring, records, limit);
     if (copied || !timeout_ms) return copied;
-    atomic_store(&ring->is_waited_for, 1);
+    atomic_store_explicit(&ring->is_waited_for, 1, memory_order_relaxed);
+    atomic_thread_fence(memory_order_seq_cst);
     copied = take_ready(ring, records, limit);
     if (!copied && !atomic_exchange(&ring->is_woken, false)) {
         sleep_until_woken(ring, timeout_ms);
@@ -129,7 +133,7 @@ size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms)
 }
 
 void ring_wake(struct ring *ring) {
-    atomic_store(&ring->is_woken, true);
+    atomic_store_explicit(&ring->is_woken, true, memory_order_release);
     wake_reader(ring);
 }
 

@@ -57,8 +57,10 @@ static bool is_refusal(const struct sock_extended_err *error) {
 static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
     union { struct cmsghdr aligned; char bytes[256]; } control;
     union { struct sockaddr_in v4; struct sockaddr_storage any; } name;
-    struct msghdr message = {.msg_name = &name, .msg_namelen = sizeof name, .msg_control = &control,
-                             .msg_controllen = sizeof control};
+    char byte; /* of the datagram: without room for any, qemu-user reads nothing and says that it did */
+    struct iovec into = {&byte, sizeof byte};
+    struct msghdr message = {.msg_name = &name, .msg_namelen = sizeof name, .msg_iov = &into, .msg_iovlen = 1,
+                             .msg_control = &control, .msg_controllen = sizeof control};
     if (recvmsg(fd, &message, MSG_ERRQUEUE | MSG_DONTWAIT) < 0) return false;
     *address = name.v4;
     *refused = 0;

@@ -15,18 +15,18 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from router.carrier.build import NATIVE, compile_c, sources
+from router.carrier.build import sources
 from router.carrier.schema import WireSchema, wire_schema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table
+from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 
-HERE = Path(__file__).parent
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
 SEEDS_OF_A_SCHEMA = 300
 TARGETS = ("envelope_fuzz", "handle_fuzz")
 
 
-def build(folder: Path, name: str = "envelope_fuzz") -> Path:
+def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_libfuzzer) -> Path:
     """Return the program. `folder` gets it, `schemas.h` and `corpus`."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
@@ -48,11 +48,10 @@ def build(folder: Path, name: str = "envelope_fuzz") -> Path:
     )
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")
-    flags = ["-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
     # A target that includes a source stands in its place.
     files = [HERE / f"{name}.c", *(path for path in sources() if name != "handle_fuzz" or path.name != "receive.c")]
     program = folder / name
-    compile_c([*flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
+    compile_(files, program)
     return program
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router.carrier.build import NATIVE, compile_c
+from router.carrier.build import NATIVE
 from router.compiler import check_table
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.expressions import ParsedReads, Scope, check
@@ -27,11 +27,11 @@ from router.table.model import FieldMap
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import Envelope
 from tests.carrier.datagrams import Maker
+from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 from tests.compiler.compiling import AUTO, SPAN, field_map, written
 from tests.compiler.payloads import made_wire
 from tests.tables import ROUTES
 
-HERE = Path(__file__).parent
 SEEDS = 40
 
 U8, I32, U32, I64, U64, F32, F64 = (
@@ -97,7 +97,7 @@ def compositions() -> Iterator[Composition]:
                     yield lowered, topic, rover.envelope, handler.case.name
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, compile_: Compile = for_libfuzzer) -> Path:
     """Return the program. `folder` gets it, `compositions.h` and `corpus`."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
@@ -123,10 +123,8 @@ def build(folder: Path) -> Path:
     declarations.append(f"enum {{ COMPOSITION_COUNT = {len(rows)} }};")
     declarations.append(f"static const struct composition compositions[] = {{{', '.join(rows)}}};")
     (folder / "compositions.h").write_text("\n".join(declarations) + "\n")
-    flags = ["-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
-    files = [HERE / "compose_fuzz.c", NATIVE / "compose.c", NATIVE / "fields.c"]
     program = folder / "compose_fuzz"
-    compile_c([*flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
+    compile_([HERE / "compose_fuzz.c", NATIVE / "compose.c", NATIVE / "fields.c"], program)
     return program
 
 

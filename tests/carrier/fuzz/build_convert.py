@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import random
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,10 @@ from router.rehearsal.cdr import serialize
 from router.table.model import FieldMap
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from tests.carrier.conversions import lowered
+from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 from tests.compiler.compiling import AUTO, field_map
 from tests.compiler.payloads import made_wire
 
-HERE = Path(__file__).parent
 SEEDS = 100
 
 U8, I32, I64, F32, F64 = Int(8, False), Int(32, True), Int(64, True), Float(32), Float(64)
@@ -50,7 +49,7 @@ CONVERSIONS: list[tuple[str, FieldMap, MessageType]] = [
 """Payload case, mapping and source of each program."""
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, compile_: Compile = for_libfuzzer) -> Path:
     """Return the program. `folder` gets it, `conversions.h` and `corpus`."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
@@ -67,10 +66,8 @@ def build(folder: Path) -> Path:
     declarations.append(f"enum {{ CONVERSION_COUNT = {len(CONVERSIONS)} }};")
     declarations.append(f"static const struct conversion conversions[] = {{{rows}}};")
     (folder / "conversions.h").write_text("\n".join(declarations) + "\n")
-    command = ["clang", "-std=c11", "-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
-    sources = [HERE / "convert_fuzz.c", NATIVE / "convert.c"]
     program = folder / "convert_fuzz"
-    subprocess.run([*command, "-I", NATIVE, "-I", folder, *sources, "-o", program], check=True)
+    compile_([HERE / "convert_fuzz.c", NATIVE / "convert.c"], program)
     return program
 
 

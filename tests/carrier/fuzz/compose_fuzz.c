@@ -8,6 +8,7 @@
 #include "compose.h"
 #include "publishing.h"
 #include "compositions.h"
+#include "outcome.h"
 
 static struct composer composer;
 
@@ -58,7 +59,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     memcpy(data, input + 2, size);
     int outcome = run(chosen, is_envelope, data, size);
     demand(outcome == COMPOSED || outcome == LOSS_MAPPING_ERROR || outcome == LOSS_NON_FINITE);
+    note_outcome(&outcome, sizeof outcome);
     if (outcome == COMPOSED) {
+        note_outcome(composer.message.data, composer.message.size);
         size_t made = composer.message.size;
         uint8_t *first = malloc(made);
         memcpy(first, composer.message.data, made);

@@ -6,6 +6,7 @@
 
 #include "convert.h"
 #include "conversions.h"
+#include "outcome.h"
 
 static void demand(bool condition) {
     if (!condition) abort();
@@ -26,6 +27,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
         if (datagram_write(chosen->writes, chosen->write_count, chosen->literals, message, slots, datagram, &written)) {
             demand(written <= MOST_CONVERTED);
             demand(written == MOST_CONVERTED || datagram[MOST_CONVERTED - written] != 0); /* the first byte of a tag */
+            note_outcome(datagram + MOST_CONVERTED - written, written);
         }
     }
     free(message);

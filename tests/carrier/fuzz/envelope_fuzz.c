@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "envelope.h"
+#include "outcome.h"
 #include "schemas.h"
 
 static void demand(bool condition) {
@@ -25,12 +26,15 @@ static void check(const struct wire_schema *schema, uint8_t *data, const uint8_t
     struct envelope envelope;
     int reason = envelope_read(schema, data, size, repairs, &envelope);
     demand(reason >= -1 && reason <= UNKNOWN_CASE);
+    note_outcome(&reason, sizeof reason);
     demand((reason == TRUNCATED) == (size > MAX_DATAGRAM));
     demand((reason == EMPTY) == (size == 0));
     demand(repairs || !envelope.is_repaired);
     if (reason == -1) {
         demand(envelope.case_number != 0);
         check_envelope(&envelope, data, sent, size);
+        uint32_t found[] = {envelope.case_number, envelope.start, envelope.length, envelope.size, envelope.is_single};
+        note_outcome(found, sizeof found);
     } else {
         demand(!envelope.is_single);
     }
