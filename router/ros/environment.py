@@ -62,10 +62,10 @@ def ros_remedy() -> str:
 
 
 def ros_package_remedy(package: str) -> str:
-    """The remedy if a ROS package is missing, or differs from what the table was compiled for."""
+    """The remedy if a ROS package is missing, cannot be loaded, or differs from what the table was compiled for."""
     ours = asset("schemas")
     if not is_installed(ours):
-        return f"run 'make setup', or install the ROS package '{package}'"
+        return f"run 'make setup' and `. .venv/env.sh`, or install the ROS package '{package}'"
     source = f"source the workspace that has the ROS package '{package}'"
     if not (ours / package).is_dir():
         return f"{source}, or install it"

@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 from router.errors import StartError, TransportError
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import Arrivals, RawSubscription
-from router.ros.types import Definition, installed_class, installed_type, usable_class
+from router.ros.types import Definition, installed_type, loaded_class, usable_class
 from router.types.model import MessageType
 
 DEPTH = 100
@@ -169,7 +169,7 @@ class TopicListener:
                 if type_name is None and not publishers:
                     raise TransportError(f"topic '{topic}' has no publisher")
                 self.type_name = type_name or publishers[0].type_name
-                self._message_class = installed_class(self.type_name)
+                self._message_class = loaded_class(self.type_name)
                 self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
                 self._arrivals = Arrivals([self._subscription])
             except (*RCL_ERRORS, ValueError) as error:

@@ -38,15 +38,15 @@ _BASIC: dict[str, Type] = {
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
-    """As `matching_class`; the StartError has the position `span`."""
+    """As `usable_class`; the StartError has the position `span`."""
     try:
-        return matching_class(name, definitions)
+        return usable_class(name, definitions)
     except StartError as error:
         raise StartError(f"{span}: {error.what}", error.hint) from error
 
 
-def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """Return the class `name` if it and all types in it are installed as in `definitions`. Raises StartError."""
+def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
+    """As `loaded_class`, if the class and all types in it are installed as in `definitions`. Raises StartError."""
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
@@ -54,7 +54,18 @@ def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
                 f"{part} as installed is not what the table was compiled for; {_remedy(part)}\n"
                 f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
             )
-    return installed_class(name)
+    return loaded_class(name)
+
+
+def loaded_class(name: str) -> Any:
+    """As `installed_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
+    message_class = installed_class(name)
+    try:
+        check_is_valid_msg_type(message_class)
+    except Exception as error:  # a library that cannot be loaded, or anything else
+        why = f"{error}: {error.__context__}" if error.__context__ else str(error)  # the latter names the library
+        raise StartError(f"{name} cannot be used: {why}", _remedy(name)) from error
+    return message_class
 
 
 def installed_class(name: str) -> Any:
@@ -97,16 +108,6 @@ def _remedy(name: str) -> str:
 
 def _fields(definition: Definition) -> str:
     return ", ".join(f"{kind} {name}" for name, kind in definition)
-
-
-def usable_class(type_name: str, definitions: Mapping[str, Definition]) -> Any:
-    """As `matching_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
-    message_class = matching_class(type_name, definitions)
-    try:
-        check_is_valid_msg_type(message_class)
-    except Exception as error:  # a library that cannot be loaded, or anything else
-        raise StartError(f"{type_name} cannot be used: {error}") from error
-    return message_class
 
 
 def installed_type(name: str) -> MessageType:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from itertools import dropwhile
 from pathlib import Path
 
@@ -175,6 +176,27 @@ def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -
         f"router run: {table} has topics, and ROS 2 cannot be loaded: No module named 'rclpy'\nhelp: "
         "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
     )
+
+
+@pytest.mark.parametrize(("verb", "expected"), [("run", 78), ("listen", 2)])
+def test_a_type_support_that_cannot_be_loaded_is_told(table: Path, tmp_path: Path, verb: str, expected: int) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    package = find_spec("comms")
+    assert package is not None
+    assert package.origin is not None
+    broken = shutil.copytree(Path(package.origin).parent, tmp_path / "broken" / "comms")
+    library = broken / "comms_s__rosidl_typesupport_c.so"
+    library.write_text("what is this")
+    table.write_text(table.read_text() + TOPIC)
+    what = [table] if verb == "run" else ["topic:///ph", "--type", "comms/msg/SensorBoardPHInfo"]
+    code, said = ended(verb, *what, path=str(broken.parent))
+    assert code == expected
+    where = f"{table}:12:22: " if verb == "run" else ""
+    why = f"Could not import 'rosidl_typesupport_c' for package 'comms': {library}: file too short"
+    assert said == [
+        f"router {verb}: {where}comms/msg/SensorBoardPHInfo cannot be used: {why}",
+        "help: run 'make setup' and `. .venv/env.sh`, or install the ROS package 'comms'",
+    ]
 
 
 def test_a_table_with_errors_is_told_and_ends_with_78(table: Path) -> None:

@@ -243,7 +243,7 @@ def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
         open_ros(TopicPlan("greeting", "greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
     assert str(refused.value) == (
         "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
-        "run 'make setup', or install the ROS package 'std_msgs'\n"
+        "run 'make setup' and `. .venv/env.sh`, or install the ROS package 'std_msgs'\n"
         "  installed: string data\n"
         "  compiled:  string data, uint8 more"
     )

@@ -28,7 +28,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 from router.compiler.lookup import layout
 from router.errors import StartError
 from router.ros import types as ros_types
-from router.ros.types import installed_class, installed_type, matching_class
+from router.ros.types import installed_class, installed_type, usable_class
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
 
@@ -164,7 +164,7 @@ def test_what_belongs_to_a_service_is_named_so_and_its_class_matches() -> None:
             1,
         ),
     )
-    assert matching_class(event.name, layout(event)) is installed_class(event.name)
+    assert usable_class(event.name, layout(event)) is installed_class(event.name)
 
 
 def test_a_request_without_fields_has_none() -> None:
