@@ -45,8 +45,10 @@ facts=$(
   # shellcheck disable=SC1090
   if [ -e "$settings" ]; then . "$settings"; fi
   ROUTER_TABLE=${chosen:-$ROUTER_TABLE}
+  set +u  # ROS's script reads variables that nobody set
   # shellcheck disable=SC1091
   . "$root/.venv/env.sh"
+  set -u
   "$root/.venv/bin/python" - "$root" <<'END'
 import os, sys
 from pathlib import Path
@@ -67,7 +69,10 @@ for folder in sorted(read):
     if folder.parts[:2] in (("/", "home"), ("/", "root")) and read.isdisjoint(folder.parents):
         print("read", folder)
 END
-) || die "nothing was changed: the table has errors, or cannot be read"
+) || case $? in
+  78) die "nothing was changed: the table has errors" ;;
+  *) die "nothing was changed: the table could not be checked" ;;
+esac
 
 id "$user" >/dev/null 2>&1 || useradd --system --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin "$user"
 

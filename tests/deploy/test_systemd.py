@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -67,6 +68,45 @@ def test_a_place_that_units_or_settings_would_garble_is_refused(tmp_path: Path, 
     assert finished.stderr == (
         f"install-service: '{tmp_path / name}' has characters that systemd or a shell would misread: move it\n"
     )
+
+
+@pytest.fixture
+def refusing(tmp_path: Path) -> Path:
+    """A checkout in which install-service.sh comes as far as its table, which has errors, and changes nothing."""
+    if os.geteuid() != 0 or shutil.which("systemctl") is None:
+        pytest.skip("needs root and systemctl")
+    for folder in ("deploy", ".venv/bin", "routes"):
+        (tmp_path / folder).mkdir(parents=True)
+    shutil.copy(ROOT / "deploy" / "install-service.sh", tmp_path / "deploy")
+    for program in ("router", "python"):
+        path = tmp_path / ".venv" / "bin" / program
+        path.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+        path.chmod(0o755)
+    (tmp_path / ".venv" / "env.sh").touch()
+    (tmp_path / "routes" / "rover.yaml").write_text("version: 7\n")
+    return tmp_path
+
+
+def refusal(checkout: Path) -> str:
+    command = [checkout / "deploy" / "install-service.sh", checkout / "routes" / "rover.yaml"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert finished.returncode == 1
+    return finished.stderr
+
+
+def test_an_environment_that_reads_unset_variables_is_sourced(refusing: Path) -> None:
+    """As ROS's setup.sh does."""
+    (refusing / ".venv" / "env.sh").write_text('[ -z "$NOBODY_SET_IT" ] && echo sourced >&2\n')
+    said = refusal(refusing).splitlines()
+    assert said[0] == "sourced"
+    assert "error[missing-key]" in said[1]
+    assert said[-1] == "install-service: nothing was changed: the table has errors"
+
+
+def test_an_environment_that_is_broken_is_no_error_of_the_table(refusing: Path) -> None:
+    (refusing / ".venv" / "env.sh").write_text("exit 1\n")
+    assert refusal(refusing) == "install-service: nothing was changed: the table could not be checked\n"
 
 
 @pytest.fixture(scope="module")
