@@ -62,7 +62,7 @@ docs: tools  ## build the documentation into build/docs; a dead link or a page w
 
 lint: tools  ## ruff, mypy, and what the C compiler warns of
 	@.venv/bin/ruff check
-	@.venv/bin/python router/carrier/build.py --lint
+	@$(ENV) .venv/bin/python router/carrier/build.py --rcl --lint
 	@$(ENV) .venv/bin/mypy
 
 clean:  ## remove .venv and what tools left behind

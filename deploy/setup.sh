@@ -137,7 +137,7 @@ install_packages() {
 }
 
 build_carrier() {
-  "$python" router/carrier/build.py
+  AMENT_PREFIX_PATH=$ros "$python" router/carrier/build.py --rcl
 }
 
 build_comms() (

@@ -2,6 +2,7 @@
 
 python router/carrier/build.py              compile it; `$CC` is the compiler, `cc` unless set
 python router/carrier/build.py --output F   to another file
+python router/carrier/build.py --rcl        fail without headers of rcl to check rcl_types.h with
 python router/carrier/build.py --check      exit with 0 if it is up to date, else with 1
 python router/carrier/build.py --lint       exit with 0 if the compiler has nothing to warn of
 """
@@ -49,10 +50,17 @@ def sources() -> list[Path]:
 
 
 def rcl_headers() -> list[str]:
-    """Options by which the compiler finds the headers of rcl: of the wheels in this environment, or of ROS from apt."""
-    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
-    folders = [Path(prefix, "include", package) for prefix in prefixes if prefix for package in _RCL]
-    return [f"-isystem{folder}" for folder in folders if folder.is_dir()]
+    """Options by which the compiler finds the headers of rcl: of the wheels in this environment, or of ROS from apt.
+
+    None where there is no rcl.
+    """
+    folders = [Path(prefix, "include", package) for prefix in _prefixes() for package in _RCL]
+    is_there = any((folder / "rcl" / "types.h").exists() for folder in folders)
+    return [f"-isystem{folder}" for folder in folders if folder.is_dir()] if is_there else []
+
+
+def _prefixes() -> list[str]:
+    return [sys.prefix, *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))]
 
 
 def checksum() -> str:
@@ -102,12 +110,17 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile the carrier's library.")
     parser.add_argument("--output", type=Path, default=LIBRARY)
+    parser.add_argument("--rcl", action="store_true", help="fail without headers of rcl to check rcl_types.h with")
     parser.add_argument("--check", action="store_true", help="only say by the exit code whether it is up to date")
     parser.add_argument("--lint", action="store_true", help="only compile, with warnings as errors")
     args = parser.parse_args()
     if args.check:
         return 0 if is_current(args.output) else 1
+    places = " or ".join(f"{prefix}/include" for prefix in _prefixes())
+    unchecked = "" if rcl_headers() else f"rcl_types.h was not checked: there are no headers of rcl in {places}"
     try:
+        if args.rcl and unchecked:
+            raise BuildError(unchecked)
         if args.lint:
             compile_c([*map(str, sources()), *rcl_headers(), *WARNINGS, "-fsyntax-only"])
         else:
@@ -115,6 +128,8 @@ def main() -> int:
     except BuildError as error:
         print(f"build: {error}", file=sys.stderr)
         return 1
+    if unchecked:
+        print(f"build: {unchecked}", file=sys.stderr)
     return 0
 
 

@@ -97,3 +97,24 @@ def test_it_is_built_where_no_package_is_installed_and_tells_of_a_missing_compil
         1,
         "build: the C compiler 'no-compiler' cannot be run: No such file or directory\n",
     )
+
+
+def test_a_build_without_headers_of_rcl_says_so(
+    native: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ros = native.parent / "jazzy"
+    monkeypatch.setattr(sys, "prefix", str(native.parent))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(ros))
+
+    def run(*options: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["build.py", "--output", str(native / "libcarrier.so"), *options])
+        return build.main(), capsys.readouterr().err
+
+    (ros / "include" / "rmw").mkdir(parents=True)
+    warning = "build: rcl_types.h was not checked: there are no headers of rcl in "
+    said = f"{warning}{native.parent}/include or {ros}/include\n"
+    assert run() == (0, said)
+    assert run("--rcl") == (1, said)
+    (ros / "include" / "rcl" / "rcl").mkdir(parents=True)
+    (ros / "include" / "rcl" / "rcl" / "types.h").touch()
+    assert run("--rcl") == (0, "")

@@ -43,7 +43,15 @@ PYTHON = f"""#!/bin/sh
 [ "$1 $2" != "-m venv" ] || {{ shift 2; set -- -m venv --without-pip "$@"; }}  # without, it is ten times as fast
 exec {sys.executable} "$@"
 """
-PIP = 'import os, sys\nprint("pip", *sys.argv[1:], file=open(os.environ["CALLS"], "a"))\n'
+PIP = """\
+import os, pathlib, sys
+print("pip", *sys.argv[1:], file=open(os.environ["CALLS"], "a"))
+if "[ros" in sys.argv[-1]:
+    headers = pathlib.Path(sys.prefix, "include", "rcl", "rcl")
+    headers.mkdir(parents=True, exist_ok=True)
+    (headers / "types.h").touch()
+"""
+RCL = Path("include", "rcl", "rcl", "types.h")
 
 
 def script(path: Path, text: str) -> None:
@@ -95,6 +103,8 @@ class Checkout:
         """What setup.sh needs of an installed Jazzy."""
         for folder in (f"lib/python3.{sys.version_info[1]}", "share/rclpy", "share/rosidl_default_generators"):
             (self.ros / folder).mkdir(parents=True)
+        (self.ros / RCL).parent.mkdir(parents=True)
+        (self.ros / RCL).touch()
         filled = {"ament_package_PYTHON_EXECUTABLE": sys.executable}
         script(self.ros / "setup.sh", ament("prefix_level/setup.sh.in", self.ros))
         script(self.ros / "local_setup.sh", ament("prefix_level/local_setup.sh.in", self.ros, **filled))
@@ -149,6 +159,15 @@ def test_interfaces_are_found_beside_an_installed_ros(checkout: Checkout) -> Non
     """ROS's setup.sh leaves a variable that the interfaces' script takes for where they are."""
     checkout.set_up(ROS=str(checkout.ros))
     assert checkout.sourced("AMENT_PREFIX_PATH").split(":")[0] == f"{checkout.root}/.venv"
+
+
+def test_carrier_is_compared_with_an_installed_ros(checkout: Checkout) -> None:
+    said = checkout.set_up(ROS=str(checkout.ros))
+    [compiled] = [line for line in said if line.startswith("cc")]
+    assert f"-isystem{checkout.ros}/include/rcl" in compiled.split()
+    (checkout.ros / RCL).unlink()
+    (checkout.root / "router" / "carrier" / "native" / "changed.c").touch()
+    assert "setup: carrier ... failed" in checkout.set_up(fails=True)
 
 
 def test_second_run_calls_nothing_and_changes_nothing(checkout: Checkout) -> None:
