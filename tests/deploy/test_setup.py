@@ -205,8 +205,7 @@ def test_interfaces_that_are_no_more_go_when_the_new_ones_are_built(checkout: Ch
 
 @pytest.mark.parametrize(("apt", "with_tools", "without"), [(False, "[ros,dev]", "[ros]"), (True, "[dev]", "")])
 def test_tools_for_developers_can_be_left_out(checkout: Checkout, apt: bool, with_tools: str, without: str) -> None:
-    ros = {"ROS": str(checkout.ros)} if apt else {}
-    assert checkout.installed(checkout.set_up(DEV="no", **ros)) == without
+    assert checkout.installed(checkout.set_up(DEV="no", ROS=str(checkout.ros) if apt else "")) == without
     assert checkout.set_up() == ["setup: .venv is up to date"]  # it is remembered
     assert checkout.installed(checkout.set_up(DEV="yes")) == with_tools
 
