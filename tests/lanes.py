@@ -1,28 +1,33 @@
-"""A lane for each process that runs tests: a ROS domain and ports that no other test process on this machine uses."""
+"""A lane for each process that runs tests: a ROS domain and ports that no other test process on this network uses."""
 
 from __future__ import annotations
 
-import fcntl
-import tempfile
-from pathlib import Path
+import errno
+import socket
 
 LANES = 50
 
 
 def _claim() -> int:
-    """Lock the first free lane for as long as this process lives."""
+    """Bind the name of the first free lane for as long as this process lives.
+
+    A name in Linux's abstract namespace belongs to the network namespace, as domains and ports do: a container that
+    shares the network, but no file, sees it.
+    """
     for lane in range(LANES):
-        file = Path(tempfile.gettempdir(), f"router-tests-lane-{lane}").open("w", encoding="utf-8")  # noqa: SIM115
+        held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.close()
+            held.bind(f"\0router-tests-lane-{lane}")
+        except OSError as error:
+            held.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
         else:
-            _held.append(file)
+            _held.append(held)
             return lane
-    raise RuntimeError(f"{LANES} processes run tests on this machine already")
+    raise RuntimeError(f"{LANES} processes run tests on this network already")
 
 
-_held: list[object] = []
+_held: list[socket.socket] = []
 LANE = _claim()
 """From 0 up to `LANES`, exclusive."""
