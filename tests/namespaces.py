@@ -35,6 +35,12 @@ class Computer:
     def ip(self, *arguments: object) -> str:
         return _run("ip", "-n", self.namespace, *arguments)
 
+    def nft(self, *arguments: object) -> str:
+        """Changes the firewall; skips the test where there is no `nft`."""
+        if shutil.which("nft") is None:
+            pytest.skip("needs nft (nftables)")
+        return self.run("nft", *arguments)
+
     def inside(self, call: Callable[[], T]) -> T:
         """What `call` returns in a thread that is there."""
 

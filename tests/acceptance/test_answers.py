@@ -82,7 +82,7 @@ table inet filter {
   }
 }
 """
-    rover.run("nft", rules)
+    rover.nft(rules)
 
 
 @pytest.mark.parametrize(

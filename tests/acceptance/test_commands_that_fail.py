@@ -70,9 +70,9 @@ def trips(site: Rover) -> float:
 
 def refuse_long_datagrams(site: Rover) -> None:
     """The firewall lets the brake pass, which is shorter."""
-    site.rover.run("nft", "add table ip filter")
-    site.rover.run("nft", "add chain ip filter output { type filter hook output priority 0; }")
-    site.rover.run("nft", f"add rule ip filter output udp dport 8 udp length > {8 + len(BRAKE)} drop")
+    site.rover.nft("add table ip filter")
+    site.rover.nft("add chain ip filter output { type filter hook output priority 0; }")
+    site.rover.nft(f"add rule ip filter output udp dport 8 udp length > {8 + len(BRAKE)} drop")
 
 
 @pytest.mark.parametrize("bandwidth", ["", ", bandwidth: 100kB/s"], ids=["at once", "paced"])
@@ -83,7 +83,7 @@ def test_a_firewall_that_refuses_commands_lets_the_brake_pass(site: Rover, bandw
             pass
         assert [site.board.recv(1000) for _ in range(3)] == 3 * [BRAKE]
         assert trips(site) == 1
-        site.rover.run("nft", "flush ruleset")
+        site.rover.nft("flush ruleset")
         while site.board.recv(1000) != DRIVE:
             pass
 
