@@ -50,7 +50,6 @@ find_ubuntus_keys() {  # Debian has them in a package; where this computer's doe
 }
 
 build() {
-  mkdir -p "$roots"
   rm -rf --one-file-system "$root.new"
   # A mirror that is not said is the distribution's own.
   debootstrap --variant=minbase --arch=$architecture --include=$packages "${more[@]}" "$suite" "$root.new" '' $script \
@@ -63,7 +62,8 @@ if [ -n "$script" ] && [ ! -d "$root" ]; then
   find_ubuntus_keys
   more+=("--keyring=$keys")
 fi
-exec 9>>"$roots.lock"
+mkdir -p "$roots"
+exec 9>>"$root.lock"
 flock 9
 [ -d "$root" ] || build
 exec 9>&-
