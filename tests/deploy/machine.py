@@ -42,7 +42,7 @@ cd etc/systemd/system
 ln -s /lib/systemd/system/basic.target default.target
 for unit in systemd-udevd systemd-udev-trigger systemd-tmpfiles-setup systemd-tmpfiles-setup-dev systemd-sysctl \
   systemd-modules-load systemd-random-seed systemd-update-utmp systemd-remount-fs systemd-sysusers ldconfig \
-  systemd-network-generator networking systemd-pstore; do ln -s /dev/null $unit.service; done
+  systemd-network-generator networking systemd-pstore systemd-binfmt; do ln -s /dev/null $unit.service; done
 for unit in dev-hugepages dev-mqueue sys-kernel-debug sys-kernel-tracing sys-kernel-config sys-fs-fuse-connections tmp
 do ln -s /dev/null $unit.mount; done
 cd "$base"/root

@@ -130,6 +130,11 @@ def running(rover: Machine) -> Machine:
     return rover
 
 
+def test_the_machine_leaves_formats_of_programs_to_this_computer(rover: Machine) -> None:
+    """The kernel has one list for all: systemd would drop emulators that somebody has registered."""
+    assert rover.state("systemd-binfmt") == "inactive"
+
+
 def test_installing_starts_it_at_once_and_at_boot(running: Machine) -> None:
     assert running.state() == running.state("rover-router.socket") == "active"
     assert running.run("systemctl", "is-enabled", "rover-router.service", "rover-router.socket").stdout.split() == [
