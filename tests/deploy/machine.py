@@ -35,7 +35,8 @@ for folder in "${@:2}"; do mount -t tmpfs -o mode=1777 tmpfs $folder; done
 chmod 755 run var/lib/systemd
 ip link set lo up
 # Of what this computer starts at boot, nothing.
-rm -rf etc/systemd/system etc/systemd/journald.conf.d etc/machine-id
+rm -rf etc/systemd/system etc/systemd/journald.conf.d
+: > etc/machine-id  # without the file it would be the first boot, which enables what was just removed
 mkdir -p etc/systemd/system etc/systemd/journald.conf.d
 printf '[Journal]\nStorage=volatile\nReadKMsg=no\nAudit=no\n' > etc/systemd/journald.conf.d/test.conf
 cd etc/systemd/system
@@ -58,7 +59,8 @@ class Machine:
     """`run` runs a command there, as root."""
 
     def __init__(self, init: int) -> None:
-        self._enter = ["nsenter", "-t", str(init), "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup"]
+        places = ("--root", "--wd", "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup")
+        self._enter = ["nsenter", "-t", str(init), *places]
 
     def run(self, *command: object, check: bool = True, **more: str) -> subprocess.CompletedProcess[str]:
         finished = subprocess.run(
@@ -85,6 +87,10 @@ class Machine:
 
     def show(self, name: str, unit: str = "rover-router") -> str:
         return self.run("systemctl", "show", "--property", name, "--value", unit).stdout.strip()
+
+    def environment(self, unit: str = "rover-router") -> set[str]:
+        """Of the unit's main process, as NAME=VALUE."""
+        return set(self.run("cat", f"/proc/{self.show('MainPID', unit)}/environ").stdout.split("\0"))
 
     def wait_for(self, script: str) -> None:
         deadline = monotonic() + PATIENCE

@@ -22,6 +22,7 @@ ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "deploy" / "systemd"
 NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service")
 MOST_EXPOSED = 2.0
+ENVIRONMENT = f". {ROOT}/.venv/env.sh"
 ROUTER = f"{ROOT}/.venv/bin/router"
 SIM = f"{ROUTES}/sim.yaml"
 METRICS = "curl -s 127.0.0.1:29108/metrics"
@@ -162,8 +163,7 @@ def test_a_table_is_chosen_also_where_the_settings_name_none(running: Machine) -
     running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
     assert running.shell(f"grep ^ROUTER_TABLE= {settings}").strip() == f"ROUTER_TABLE={SIM}"
     assert "A=b\n" in running.shell(f"cat {settings}")
-    environment = running.shell("xargs -0 -n 1 < /proc/$(systemctl show -P MainPID rover-router)/environ")
-    assert f"ROUTER_TABLE={SIM}" in environment.splitlines()
+    assert f"ROUTER_TABLE={SIM}" in running.environment()
     running.shell(f"cp /opt/settings {settings}; systemctl restart rover-router")
 
 
@@ -174,6 +174,10 @@ def test_a_table_with_errors_is_not_installed(running: Machine) -> None:
     assert "bad.yaml:1:1: error[missing-key]" in finished.stderr
     running.shell("cmp /etc/default/rover-router /opt/settings")
     assert running.state() == "active"
+
+
+def test_no_other_computer_is_looked_for_whatever_is_sourced(running: Machine) -> None:
+    assert {"ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"} <= running.environment()
 
 
 def test_its_listener_is_systemds_socket(running: Machine) -> None:
@@ -216,7 +220,7 @@ def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
         running.run("chmod", "o+x", *place.parents)
     heard = running.shell(
         f"(for i in $(seq 100); do {SEND}; sleep 0.1; done) >/dev/null 2>&1 & sending=$!\n"
-        f"HOME=/tmp setpriv --reuid=65534 --regid=65534 --clear-groups "
+        f"{ENVIRONMENT}; HOME=/tmp setpriv --reuid=65534 --regid=65534 --clear-groups "
         f"{ROUTER} listen topic://ph_data --type comms/msg/SensorBoardPHInfo --count 2; kill $sending"
     )
     assert heard.count("ph_value=7") == 2
