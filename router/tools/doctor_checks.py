@@ -402,8 +402,8 @@ def _priority() -> Iterator[CheckResult]:
         yield warning(
             "carrier",
             "it may not run at a real-time priority: other programs can delay commands and brakes by some 0.5 ms",
-            f"'{_user(os.geteuid())} - rtprio 1' in /etc/security/limits.d/60-rover-router.conf, and log in again; the "
-            "service of `make install-service` need not be told",
+            f"'{_user(os.geteuid())} - rtprio 1' in /etc/security/limits.d/60-rover-router.conf, and log in again; a "
+            "container needs deploy/container/realtime.yaml; the service of `make install-service` need not be told",
         )
     else:
         os.sched_setscheduler(0, policy, os.sched_param(0))

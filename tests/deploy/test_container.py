@@ -42,13 +42,13 @@ def test_what_is_copied_exists_and_reaches_the_build() -> None:
     assert all(any(Path(file).is_relative_to(folder) for file in files) for folder in allowed)
 
 
-def test_the_entry_point_is_a_program_that_bash_can_read() -> None:
+def test_router_in_the_container_is_a_program_that_bash_can_read() -> None:
     bash = shutil.which("bash")
     assert bash
-    entry = FOLDER / "entrypoint.sh"
+    entry = FOLDER / "router.sh"
     assert entry.stat().st_mode & 0o111 == 0o111
     assert subprocess.run([bash, "-n", entry], check=False).returncode == 0
-    assert f'ENTRYPOINT ["/opt/rover_router/{entry.name}"]' in DOCKERFILE
+    assert f"COPY deploy/container/{entry.name} /opt/rover_router/bin/router\n" in DOCKERFILE
 
 
 def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
