@@ -99,6 +99,7 @@ fi
 new=$(mktemp -d)
 trap 'rm -r "$new"' EXIT
 sockets=()
+rm -f "$units"/*.device.d/rover-router.conf  # of a table before
 while read -r interface; do
   on=${interface:+-$interface}
   sockets+=("rover-router$on.socket")
@@ -107,7 +108,14 @@ while read -r interface; do
       "$root/deploy/systemd/$unit" >"$new/${unit%.*}$on.${unit##*.}"
   done
   addresses=$(printf '%s\n' "$facts" | awk -v on="${interface:--}" '$1 == "socket" && $3 == on { print "ListenDatagram=" $2 }')
-  if [ -n "$interface" ]; then addresses+=$'\n'"BindToDevice=$interface"; fi
+  if [ -n "$interface" ]; then
+    addresses+=$'\n'"BindToDevice=$interface"
+    # systemd waits for it at each start of the service, also after a crash: not for 90 s, since the router takes it
+    # when it comes.
+    device=$units/$(systemd-escape --path --suffix=device "/sys/subsystem/net/devices/$interface").d
+    mkdir -p "$device"
+    printf '# Written by deploy/install-service.sh.\n[Unit]\nJobRunningTimeoutSec=10s\n' >"$device/rover-router.conf"
+  fi
   awk -v addresses="$addresses" '/^ListenDatagram=/ { print addresses; next } { print }' \
     "$new/rover-router$on.socket" >"$new/filled"
   mv "$new/filled" "$new/rover-router$on.socket"
@@ -130,14 +138,13 @@ for socket in "${sockets[@]}"; do cmp -s "$new/$socket" "$units/$socket" || same
 for unit in "$units"/rover-router*.socket "$units"/rover-router-hold*.service; do  # of a table before
   if [ -e "$unit" ] && [ ! -e "$new/${unit##*/}" ]; then
     same_sockets=no
-    systemctl disable --quiet --now "${unit##*/}"
+    systemctl stop "${unit##*/}"
     rm "$unit"
   fi
 done
 install -m 644 "$new"/* "$units"
 systemctl daemon-reload
 if [ $same_sockets = no ]; then systemctl stop rover-router.service "${sockets[@]}"; fi
-systemctl enable --quiet "${sockets[@]}" rover-router.service
-[ ${#sockets[@]} = 0 ] || systemctl start "${sockets[@]}"
+systemctl enable --quiet rover-router.service
 systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"
 echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"

@@ -138,16 +138,46 @@ def test_the_machine_leaves_formats_of_programs_to_this_computer(rover: Machine)
 
 def test_installing_starts_it_at_once_and_at_boot(running: Machine) -> None:
     assert running.state() == running.state("rover-router.socket") == "active"
-    assert running.run("systemctl", "is-enabled", "rover-router.service", "rover-router.socket").stdout.split() == [
-        "enabled",
-        "enabled",
-    ]
+    assert running.show("UnitFileState") == "enabled"
     assert running.show("User") == "rover-router"
 
 
 def test_it_runs_on_the_carrier(running: Machine) -> None:
     pid = running.show("MainPID")
     assert f"{ROOT}/router/carrier/native/libcarrier.so" in running.shell(f"cat /proc/{pid}/maps")
+
+
+def test_what_receives_and_brakes_runs_at_a_real_time_priority(running: Machine) -> None:
+    if running.run("prlimit", "--rtprio=1", "true", check=False).returncode:
+        pytest.skip("systemd may not raise limits here; tests/platforms/systemd.sh boots one that may")
+    threads = running.shell("ps -L -o cls=,rtprio=,comm= -p $(systemctl show -P MainPID rover-router)").splitlines()
+    first = {tuple(line.split(maxsplit=2)) for line in threads if line.split()[0] == "FF"}
+    assert first == {("FF", "1", name) for name in ("receive", "brakes", "ros commands")}
+
+
+def test_nothing_else_waits_for_its_sockets_at_boot(running: Machine) -> None:
+    """Or what makes the interface of a listener, such as a tunnel, would wait until systemd no longer does."""
+    for relation in ("Before", "WantedBy", "RequiredBy"):
+        assert set(running.show(relation, "rover-router.socket").split()) <= {
+            "rover-router.service", "rover-router-hold.service", "shutdown.target",
+        }  # fmt: skip
+
+
+def test_an_interface_that_is_not_there_is_not_waited_for_and_taken_when_it_comes(running: Machine) -> None:
+    if running.state("systemd-udevd") != "active":
+        pytest.skip("systemd waits for an interface only with udev; tests/platforms/systemd.sh boots both")
+    table = f"""version: 1
+extends: {SIM}
+listen: {{radio: {{address: 127.0.0.6:25000, interface: late0}}}}
+"""
+    running.shell(f"printf '%s' '{table}' > /opt/late.yaml; {ROOT}/deploy/install-service.sh /opt/late.yaml")
+    assert running.state() == "active"
+    running.shell("ip link add late0 type dummy; ip link set late0 up")
+    running.wait_for("ss -lunpH | grep 127.0.0.6%late0:25000 | grep -q python")
+    running.shell("systemctl restart rover-router")
+    assert '"systemd"' in running.shell("ss -lunpH | grep 127.0.0.6%late0:25000")
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}; ip link del late0; ls /etc/systemd/system")
+    assert running.shell("ls /etc/systemd/system/*.device.d").strip() == ""
 
 
 def test_installing_again_changes_nothing_and_restarts_it(running: Machine) -> None:
