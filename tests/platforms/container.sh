@@ -31,7 +31,7 @@ make_base() {
 FROM rover-test/noble
 RUN printf '[global]\ncert = /etc/ssl/certs/ca-certificates.crt\n' >/etc/pip.conf && apt-get update -qq \
     && apt-get install -qq -y --no-install-recommends python3-catkin-pkg python3-empy python3-lark python3-numpy \
-       python3-packaging python3-pip python3-setuptools python3-venv python3-yaml >/dev/null \
+       python3-packaging python3-pip python3-psutil python3-setuptools python3-venv python3-yaml >/dev/null \
     && pip install -q --no-cache-dir --break-system-packages colcon-common-extensions
 COPY . /src
 RUN python3 /src/tests/platforms/ros_prefix.py && rm -rf /src
