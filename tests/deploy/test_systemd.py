@@ -243,6 +243,14 @@ listen:
     assert running.state() == running.state("rover-router.socket") == "active"
 
 
+def test_errors_of_dead_boards_leave_the_socket_as_it_is(running: Machine) -> None:
+    """Nobody listens where the deadmen send; the kernel says so by an error at the socket, which systemd has as well."""
+    running.wait_for("journalctl --unit rover-router | grep -q 'nobody listens at'")
+    running.shell("sleep 1")
+    assert running.state("rover-router.socket") == running.state("rover-router-hold.service") == "active"
+    assert running.show("Result", "rover-router.socket") == "success"
+
+
 def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
     """Under all of its restrictions, and past the memory that Fast DDS shares among one user's processes only."""
     # The checkout, or its interpreter, may be in a home that nobody else can enter.

@@ -60,7 +60,7 @@ mkdir -p etc/systemd/system/multi-user.target.wants
 ln -s ../command.service etc/systemd/system/multi-user.target.wants
 ln -sf /lib/systemd/system/multi-user.target etc/systemd/system/default.target
 echo $name >etc/hostname
-rm -f etc/machine-id
+: >etc/machine-id  # without the file it would be the first boot, which enables everything
 umount /proc
 pivot_root . old
 exec /lib/systemd/systemd --show-status=0
