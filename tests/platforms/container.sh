@@ -22,7 +22,7 @@ make_base() {
   local folder
   [ -d "$roots/noble" ] || "$here/root.sh" noble true
   tar -C "$roots/noble" --one-file-system --exclude='./srv/*' --exclude='./root/*' --exclude='./tmp/*' \
-    --exclude='./var/cache/apt/*' --exclude='./var/lib/apt/lists/*' -c . | podman import --quiet - rover-test/noble >/dev/null
+    --exclude='./home/*' --exclude='./opt/*' --exclude='./var/cache/apt/*' --exclude='./var/lib/apt/lists/*' -c . | podman import --quiet - rover-test/noble >/dev/null
   folder=$(mktemp -d)
   cp "$checkout/pyproject.toml" "$checkout/constraints.txt" "$folder"
   mkdir -p "$folder/tests/platforms"
