@@ -244,7 +244,7 @@ listen:
 
 
 def test_errors_of_dead_boards_leave_the_socket_as_it_is(running: Machine) -> None:
-    """Nobody listens where the deadmen send; the kernel says so by an error at the socket, which systemd has as well."""
+    """Nobody listens where the deadmen send; the kernel reports it at the socket, which systemd holds, too."""
     running.wait_for("journalctl --unit rover-router | grep -q 'nobody listens at'")
     running.shell("sleep 1")
     assert running.state("rover-router.socket") == running.state("rover-router-hold.service") == "active"
