@@ -21,8 +21,8 @@ die() {
 make_base() {
   local folder
   [ -d "$roots/noble" ] || "$here/root.sh" noble true
-  tar -C "$roots/noble" --one-file-system --exclude='./srv/*' --exclude='./root/*' --exclude='./tmp/*' \
-    --exclude='./home/*' --exclude='./opt/*' --exclude='./var/cache/apt/*' --exclude='./var/lib/apt/lists/*' -c . | podman import --quiet - rover-test/noble >/dev/null
+  tar -C "$roots/noble" --one-file-system --exclude={./srv,./root,./tmp,./home,./opt,./var/cache/apt,./var/lib/apt/lists}'/*' \
+    -c . | podman import --quiet - rover-test/noble >/dev/null
   folder=$(mktemp -d)
   cp "$checkout/pyproject.toml" "$checkout/constraints.txt" "$folder"
   mkdir -p "$folder/tests/platforms"
@@ -44,7 +44,8 @@ build() {
   podman build --network host --ulimit "nofile=$(ulimit -Hn)" --ulimit nproc=4096 "$@"
 }
 
-# In mounts of its own: podman uses no hybrid hierarchy of control groups. An engine that may not raise limits keeps them.
+# In mounts of its own: podman uses no hybrid hierarchy of control groups. Limits stay, since it may not raise them where
+# this is a container itself.
 if [ "${1:-}" != inside ] && [ "${1:-}" != running ]; then
   [ "$(id -u)" = 0 ] || die "needs root"
   command -v podman >/dev/null || die "needs podman: apt-get install podman"
@@ -69,7 +70,12 @@ fi
 ip link set lo up
 for address in 192.168.0.{1,10,30,40,50,222}; do ip address add "$address/24" dev lo; done
 work=$(mktemp -d)
-trap 'podman rm --force --ignore "$container" >/dev/null 2>&1; podman volume rm --force rover_recordings >/dev/null; rm -rf "$work"' EXIT
+clean() {
+  podman rm --force --ignore "$container" >/dev/null 2>&1
+  podman volume rm --force rover_recordings >/dev/null
+  rm -rf "$work"
+}
+trap clean EXIT
 cp -r tests/rover/routes deploy "$work"
 cp -r tests/rover/protos "$work"
 compose=(podman-compose -f "$work/deploy/container/compose.yaml")
@@ -83,7 +89,11 @@ tell() { printf '%-60s %s\n' "$1" "${2:-yes}"; }
 look() {  # WHAT COMMAND...: ends the script where it fails
   local what=$1
   shift
-  "$@" >"$work/output" 2>&1 || { podman logs "$container" 2>&1 | tail -n 20; cat "$work/output" "$work/compose.log"; die "not so: $what"; }
+  if ! "$@" >"$work/output" 2>&1; then
+    podman logs "$container" 2>&1 | tail -n 20
+    cat "$work/output" "$work/compose.log"
+    die "not so: $what"
+  fi
   tell "$what"
 }
 
@@ -91,8 +101,8 @@ eventually() { for _ in $(seq 120); do ! "$@" || return 0; sleep 0.5; done; retu
 inside() { podman exec "$container" "$@"; }
 logs() { podman logs "$container" 2>&1 | grep -q "$1"; }
 has_exited_with() { [ "$(podman inspect "$container" --format '{{.State.ExitCode}}')" = "$1" ]; }
-may_do_nothing() { inside grep -qE '^CapEff:\s0{16}$' /proc/1/status && inside grep -qE '^CapBnd:\s0{16}$' /proc/1/status; }
-is_first_process() { [ "$(inside cat /proc/1/comm)" = python ] || inside cat /proc/1/cmdline | grep -q router; }
+may_do_nothing() { [ "$(inside grep -cE '^Cap(Eff|Bnd):\s0{16}$' /proc/1/status)" = 2 ]; }
+is_first_process() { inside readlink /proc/1/exe | grep -q python; }
 
 podman --version
 podman-compose --version 2>/dev/null | head -n 1
