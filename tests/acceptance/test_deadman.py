@@ -73,16 +73,19 @@ class Driver:
     def drive(self) -> None:
         """Gives commands until the board gets them and not what the deadman sends.
 
-        Those that the talker publishes before it is discovered come seconds later, and are stale.
+        Those that the talker publishes before it is discovered come seconds later, and are stale. When this returns,
+        none is on its way: the talker may be slow.
         """
-        before = self.sent()
+        before, taken, given = self.sent(), self.taken(), self._given
 
         def driven() -> bool:
             self.give()
             return self.sent() > before and not self.is_active()
 
         wait_until(driven, "the release")
-        self.await_next(self.datagram)
+        wait_until(lambda: self.taken() - taken >= self._given - given, "the last command")
+        for _ in range(int(self.sent() - before)):
+            self.await_next(self.datagram)
 
     def await_next(self, datagram: bytes) -> None:
         """Whatever came before it."""
@@ -97,7 +100,10 @@ class Driver:
 
     def all_taken(self) -> bool:
         """Whether the router has taken all commands that were given."""
-        return total(self.place.scrape(), "messages_received", route=self.route) == self._given
+        return self.taken() == self._given
+
+    def taken(self) -> float:
+        return total(self.place.scrape(), "messages_received", route=self.route)
 
     def sent(self) -> float:
         return total(self.place.scrape(), "datagrams_sent", route=self.route)
