@@ -6,7 +6,8 @@
 #                                         checkout's place
 #
 # It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, /etc/default/rover-router once, and
-# makes the user rover-router. Listeners on an interface, wg0, get rover-router-wg0.socket. docs/guides/deploy.md tells how to live with the service, and how to remove it.
+# makes the user rover-router. Listeners on an interface, wg0, get rover-router-wg0.socket, and the interface's device
+# unit a shorter timeout. docs/guides/deploy.md tells how to live with the service, and how to remove it.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 units=/etc/systemd/system
