@@ -1,0 +1,219 @@
+"""The typed tree of a checked expression: what it means, decided once, for whoever executes or shows it.
+
+Each node has the kind of its value (`kinds`) and the place in the table that it comes from. Names are resolved: what a
+node reads is a variable, or a field of a message that is one. Lists are computed element by element: an Each says for
+which lists, and what is made of their elements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum as Enumeration
+from typing import Union
+
+from router.compiler.expressions.kinds import Kind, ListKind
+from router.errors import SourceSpan
+from router.types.model import Field
+
+MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
+"""Variables that every expression can name beside the fields; a field of the same name wins."""
+
+ITEM, INDEX, COUNT, ITEMS = "item", "index", "count", "items"
+"""Variables of `for_each` (the first three) and of `collect` (the last two)."""
+
+
+class Operator(Enumeration):
+    """Operators of one and two operands; the value is how the table spells them."""
+
+    NOT = "not"
+    NEGATE = "-x"
+    ADD = "+"
+    SUBTRACT = "-"
+    MULTIPLY = "*"
+    DIVIDE = "/"
+    FLOOR_DIVIDE = "//"
+    MODULO = "%"
+    POWER = "**"
+
+
+class Relation(Enumeration):
+    EQUAL = "=="
+    UNEQUAL = "!="
+    LESS = "<"
+    LESS_OR_EQUAL = "<="
+    MORE = ">"
+    MORE_OR_EQUAL = ">="
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A literal, a name of an enum, a constant of a ROS type, or what two of them give. Times are integers (ns)."""
+
+    kind: Kind
+    span: SourceSpan
+    value: bool | int | float | str
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """The source message (MESSAGE), what stands beside it, or an element of an Each (`item_1`, ...)."""
+
+    kind: Kind
+    span: SourceSpan
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A field of the message that `holder` is: a Variable, another Read, or an Element."""
+
+    kind: Kind
+    span: SourceSpan
+    holder: Node
+    field: Field
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """Whether a payload has a field that can be missing."""
+
+    kind: Kind
+    span: SourceSpan
+    holder: Node
+    field: Field
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """An element of a list, by a constant index. Refused at run time if there is none."""
+
+    kind: Kind
+    span: SourceSpan
+    values: Node
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A list literal."""
+
+    kind: ListKind
+    span: SourceSpan
+    items: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Each:
+    """A list computed element by element: `element`, for each element of `lists`, which are taken side by side.
+
+    `lists` have the variable that an element of each is bound to. None of them is an Each itself. Lists of different
+    length are refused at run time.
+    """
+
+    kind: ListKind
+    span: SourceSpan
+    lists: tuple[tuple[str, Node], ...]
+    element: Node
+
+
+@dataclass(frozen=True, slots=True)
+class Unary:
+    """NOT or NEGATE. `is_checked`: the result may not fit its kind, and is refused then."""
+
+    kind: Kind
+    span: SourceSpan
+    operator: Operator
+    operand: Node
+    is_checked: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Binary:
+    """Arithmetic of two numbers, or ADD of two texts.
+
+    Of two integers the result is an integer (of DIVIDE a float), else both become doubles. `is_checked`: an integer
+    that may not fit its kind, and is refused then.
+    """
+
+    kind: Kind
+    span: SourceSpan
+    operator: Operator
+    left: Node
+    right: Node
+    is_checked: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """`a < b <= c`. Each operand is evaluated once, and none behind a comparison that is false."""
+
+    kind: Kind
+    span: SourceSpan
+    relations: tuple[Relation, ...]
+    operands: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Contains:
+    """`sought in values`, or `not in`."""
+
+    kind: Kind
+    span: SourceSpan
+    sought: Node
+    values: Node
+    is_negated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """`and` (`is_all`) or `or`: nothing behind a decision is evaluated."""
+
+    kind: Kind
+    span: SourceSpan
+    is_all: bool
+    operands: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """`body if test else orelse`: only one of both is evaluated."""
+
+    kind: Kind
+    span: SourceSpan
+    test: Node
+    body: Node
+    orelse: Node
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A function of the language, or one of `conversion`'s checks. `kind` says what the call gives.
+
+    `len`, and `min`, `max` and `sum` of one argument, take a whole list.
+    """
+
+    kind: Kind
+    span: SourceSpan
+    function: str
+    arguments: tuple[Node, ...]
+
+
+Node = Union[
+    Constant, Variable, Read, Present, Element, Listed, Each, Unary, Binary, Compare, Contains, Logic, Choice, Call
+]
+
+
+def constant_of(node: Node) -> bool | int | float | str | None:
+    """The value of a Constant, None for everything else (there is no None in the language)."""
+    return node.value if isinstance(node, Constant) else None
+
+
+CHECKS = ("fit", "fit_text", "octets", "named", "member")
+"""Functions that `conversion` puts around a value, and that tables cannot call:
+
+fit(x, low, high)   an integer, refused outside of two Constants
+fit_text(x, most)   text or bytes of at most so many bytes
+octets(list)        a list of integers as bytes, each refused outside of 0 to 255
+named(text)         the value of the enum in `kind` that has this name, refused if none has
+member(x)           a number as a value of the closed enum in `kind`, refused if it has no such value
+"""
