@@ -221,7 +221,7 @@ def path_of(node: Node) -> Path | None:
     return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
 
 
-def parts_of(node: Node) -> tuple[Node, ...]:  # noqa: PLR0911 - a case a node
+def parts_of(node: Node) -> tuple[Node, ...]:
     """The nodes directly in this one."""
     match node:
         case Constant() | Variable():
