@@ -9,6 +9,7 @@ import pytest
 from router.compiler import Checked
 from router.compiler.checked import CheckedSubscription, CheckedTarget
 from router.compiler.plan import Leaf, Record
+from router.compiler.python import render
 from router.errors import Code, Diagnostic, Severity
 from router.table.model import OnLimit, Priority
 from tests.compiler.conftest import CheckText
@@ -96,7 +97,7 @@ def source_of(plan: Record, name: str) -> str:
     """What fills a field, as code."""
     made = next(inner for member, inner in plan.members if member.name == name)
     assert isinstance(made, Leaf)
-    return ast.unparse(made.node)
+    return ast.unparse(render(made.node))
 
 
 def plan_of(feed: CheckedSubscription) -> Record:
