@@ -68,7 +68,7 @@ def render(node: Node, values: Values = NO_VALUES) -> ast.expr:
     return placed(_made(node, values), node.span)
 
 
-def _made(node: Node, values: Values) -> ast.expr:  # noqa: C901, PLR0911, PLR0912 - a case a node
+def _made(node: Node, values: Values) -> ast.expr:  # noqa: C901, PLR0912 - a case a node
     match node:
         case Constant():
             return ast.Constant(node.value)
@@ -150,7 +150,7 @@ def _is_exact(kind: Kind) -> bool:
     """Whether a number is a double as it is."""
     integer = as_int(kind)
     bounds = (0, 0) if integer is None else integer.bounds
-    return bounds is not None and -_EXACT <= bounds[0] and bounds[1] <= _EXACT
+    return bounds is not None and bounds[0] >= -_EXACT and bounds[1] <= _EXACT
 
 
 def _fit(made: ast.expr, kind: Kind) -> ast.expr:
