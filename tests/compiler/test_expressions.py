@@ -28,7 +28,7 @@ from router.compiler.expressions.kinds import (
     kind_of,
 )
 from router.compiler.expressions.scope import field_of
-from router.compiler.expressions.tree import Node, Variable
+from router.compiler.expressions.tree import Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
@@ -402,7 +402,7 @@ def evaluated(text: str, **given: Any) -> Any:
     """What an expression comes to; `given` are elements of `boxes` by the names that they have beside the fields."""
     names = {name: Variable(kind_of(BOX), SPAN, name) for name in given}
     node, out = check(written(text), scope_over(DECLARED, names)), Source()
-    reads = CdrReads(DECLARED, [node])
+    reads = CdrReads(DECLARED, paths_in(node))
     with out.block(f"def evaluate(cdr, {', '.join(given)}):", SPAN):
         reads.write(out, SPAN)
         out.line(f"return {out.expression(render(node, reads.values))}", SPAN)
