@@ -105,7 +105,7 @@ def table(folder: Path) -> Program:
 
 def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     """The carrier with clocks that are set, and `seam_handle`. With `sanitizers`, processes must preload libasan."""
-    files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publishing.c", "receive.c"})]
+    files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publish.c", "receive.c"})]
     flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
     flags += ["-fPIC", "-shared", "-include", str(HERE / "clocked.h"), f"-I{NATIVE}"]
     compile_c([*flags, *map(str, files), "-o", str(output)], "gcc" if sanitizers else None)
@@ -114,10 +114,10 @@ def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     loaded.seam_next_due.restype, loaded.seam_next_due.argtypes = c_int64, (c_void_p,)
     loaded.seam_handle.restype = None
     loaded.seam_handle.argtypes = (c_void_p, c_uint32, ctypes.c_char_p, c_size_t, c_uint32, c_uint32, c_int64)
-    loaded.seam_publishing_open.restype = c_void_p
-    loaded.seam_publishing_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
+    loaded.seam_publish_open.restype = c_void_p
+    loaded.seam_publish_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
     loaded.seam_publish.restype, loaded.seam_publish.argtypes = None, (c_void_p,)
-    loaded.seam_publishing_close.restype, loaded.seam_publishing_close.argtypes = None, (c_void_p,)
+    loaded.seam_publish_close.restype, loaded.seam_publish_close.argtypes = None, (c_void_p,)
     return loaded
 
 
@@ -194,7 +194,7 @@ class Whole:
         self._routes = PublishRoutes(made, publications, self._names.number, self._limit)
         self._publish = _PUBLISH(self._published_natively)
         self._published = Ring(loaded, 1 << 17)
-        self._publishing = loaded.seam_publishing_open(
+        self._publishing = loaded.seam_publish_open(
             self._published.address, self._publish_counts, self._events.address, self._publish
         )
         listening = SimpleNamespace(socket=SimpleNamespace(fileno=lambda: -1), is_inherited=False)
@@ -223,7 +223,7 @@ class Whole:
         for engine in self._parts.values():
             engine.close()
         self._library.carrier_close(self._carrier)
-        self._library.seam_publishing_close(self._publishing)
+        self._library.seam_publish_close(self._publishing)
         self._braking.clear()
         for destination in self._destinations.values():
             destination.close()
