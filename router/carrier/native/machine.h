@@ -47,10 +47,4 @@ bool machine_read(struct machine *machine, uint16_t node, const uint8_t *data, s
 /* Give the slots of a node their defaults, and read an element of a list of messages into them. */
 bool machine_enter(struct machine *machine, uint16_t node, const struct value *element);
 
-/* Take the first element off a list that is not empty. `stored` is an enum scalar: how the list is stored. */
-struct value machine_next(const struct machine *machine, struct value *list, enum scalar stored);
-
-/* Add an element to a list in cells, or return false for lack of memory. */
-bool machine_add(struct machine *machine, struct value *list, struct value element);
-
 #endif

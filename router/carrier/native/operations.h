@@ -99,7 +99,7 @@ enum operation_kind {
     OP_REAL_LEAST,
     OP_REAL_GREATEST,
     OP_REAL_CLAMP,
-    OP_SQRT, /* these refuse numbers without a result */
+    OP_SQRT, /* these refuse numbers without a result, and what is finite but for its result */
     OP_SIN,
     OP_COS,
     OP_TAN,
@@ -121,7 +121,7 @@ enum operation_kind {
     OP_AND,    /* likewise, and leave it there; else drop it */
     OP_OR,     /* if it is true */
     OP_EITHER, /* of two, both evaluated */
-    OP_WANT,   /* refuses what is false */
+    OP_WANT,   /* take it off, and refuse what is false */
     /* Text and bytes: */
     OP_JOIN,
     OP_DECIMAL,    /* an integer as text; `flag`: an unsigned one */
