@@ -19,8 +19,8 @@ from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.library import load
-from router.carrier.program import Names, Outlets, PartTargets, native_program
-from router.carrier.publishing import PublishRoutes
+from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.program import native_program
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
@@ -191,7 +191,6 @@ class Whole:
         publications = {
             topic: _Publication(number, topic not in unwanted) for number, topic in enumerate(self._topics, 1)
         }
-        self._routes = PublishRoutes(made, publications, self._names.number, self._limit)
         self._publish = _PUBLISH(self._published_natively)
         self._published = Ring(loaded, 1 << 17)
         self._publishing = loaded.seam_publish_open(
@@ -204,7 +203,7 @@ class Whole:
             Outlets(
                 listeners=cast("Any", {plan.name: listening for plan in made.listeners}),
                 senders={name: each.address for name, each in self._destinations.items()},
-                wanted={topic: each.wanted for topic, each in publications.items()},
+                publications=publications,
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
@@ -312,8 +311,7 @@ class Whole:
             if handler.route in self._functions[part]
         ]
         if targets := self._divided[Part.PUBLISHED].get(handler.route):
-            publishes = self._routes.route(handler, targets)
-            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, publishes=publishes))
+            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, is_native=True))
         return parts
 
     def _serve(self, part: Part) -> None:
