@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import compress, count
 
-from router.compiler.cdr import write_message
+from router.compiler.cdr import CdrReads, write_message
 from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
-from router.compiler.expressions import Typed
-from router.compiler.metrics import DROP_REASONS, Counters
+from router.compiler.expressions.tree import Node, paths_in
+from router.compiler.metrics import Counters
 from router.compiler.payload import write_envelope
-from router.compiler.program import TargetPlan
+from router.compiler.plan import expressions
+from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
 from router.table.model import OnLimit, Route
@@ -27,10 +27,22 @@ Deliver = Callable[[str, CheckedTarget], None]
 """Appends the lines that hand the message to a target."""
 
 NamedTarget = tuple[str, CheckedTarget]
-"""A target with its part of the Python names."""
+"""A target with its part of the Python names (TargetPlan.identifier)."""
 
 _EXPIRY = {True: "command_expires", False: "expires"}
 """The names of the time after which a message is stale, by whether the target is a board."""
+
+
+def function_name(route: Route) -> str:
+    return f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
+
+
+def _reads(subscription: CheckedSubscription) -> CdrReads:
+    """What the expressions of a subscription read."""
+    nodes = [subscription.for_each, subscription.stamp, subscription.when]
+    for target in subscription.targets:
+        nodes += [target.when, *(expressions(target.plan) if target.plan is not None else ())]
+    return CdrReads(subscription.type, (path for node in nodes if node is not None for path in paths_in(node)))
 
 
 class HandlerSource:
@@ -44,43 +56,34 @@ class HandlerSource:
         self.route = route
         self.case = case
         self.counters = counters
-        self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self.targets: list[TargetPlan] = []
+        self.values: Values = NO_VALUES
 
-    def inbound(
-        self,
-        targets: Sequence[CheckedTarget],
-        collect: CheckedCollect | None,
-        served: Sequence[CheckedTarget] | None = None,
-    ) -> None:
-        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames.
-
-        `targets` are all of the route, `served` those that the function serves, None for all.
-        """
-        named = self._serving([self._named(target) for target in targets], targets if served is None else served)
+    def inbound(self, named: Sequence[NamedTarget], collect: CheckedCollect | None) -> None:
+        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames."""
+        topics = [(name, target) for name, target in named if target.topic]
         with self._function("m", "datagram"):
             self._expires(named)
-            if collect is None:
+            if collect is None or not topics:
                 self._serve(named)
             else:
                 self._serve([(name, target) for name, target in named if not target.topic])
-                topics = [(name, target) for name, target in named if target.topic]
                 self._collect(collect, topics)
                 self._serve(topics)
-            if not targets:
+            if not named:
                 self.out.line("pass", self.route.span)
 
-    def outbound(self, subscription: CheckedSubscription) -> None:
+    def outbound(self, subscription: CheckedSubscription, named: Sequence[NamedTarget]) -> None:
         """The message is read once for all destinations. With `for_each`, each element is served as a message."""
         span, for_each = subscription.topic.span, subscription.for_each
         one_received = self._received(subscription, "1")
-        named = [self._named(target) for target in subscription.targets]
+        reads = _reads(subscription)
+        self.values = reads.values
         with self._function("cdr"):
             with self.out.block("try:", span):
-                subscription.reads.write(self.out, span)
+                reads.write(self.out, span)
                 if for_each is not None:
-                    self.out.line(f"elements = {self.out.expression(for_each.node)}", for_each.span)
+                    self.out.line(f"elements = {self._expression(for_each)}", for_each.span)
             self._all_lost(named, span, one_received)
             if subscription.stamp is not None:
                 self._born(subscription.stamp)
@@ -102,14 +105,17 @@ class HandlerSource:
     @contextmanager
     def _function(self, *message: str) -> Iterator[None]:
         parameters = (*message, "received_at", "now", "source", *(["born"] if self.route.ttl else []))
-        with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.route.span):
+        with self.out.block(f"def {function_name(self.route)}({', '.join(parameters)}):", self.route.span):
             yield
+
+    def _expression(self, node: Node) -> str:
+        return self.out.expression(render(node, self.values))
 
     # the age of the message
 
-    def _born(self, stamp: Typed) -> None:
+    def _born(self, stamp: Node) -> None:
         """The age counts from the stamp where the message has one, else from its arrival."""
-        value = self.out.expression(stamp.node)
+        value = self._expression(stamp)
         with self.out.block(f"if {value}:", stamp.span):
             self.out.line(f"born = born.or_before(stamped({value}, received_at, now))", stamp.span)
 
@@ -130,12 +136,9 @@ class HandlerSource:
     def _collect(self, collect: CheckedCollect, topics: Sequence[NamedTarget]) -> None:
         """Append the lines that return unless a frame is complete. `items` are its parts, `m` is the first of them."""
         span = collect.span
-        for _, target in topics:
-            self.counters.index("messages_collected", self.route.name, target.label)
         self.out.line("# collect", span)
         with self.out.block("try:", span):
-            collect.reads.write(self.out, span)
-            by, count, order = (self.out.expression(typed.node) for typed in (collect.by, collect.count, collect.order))
+            by, count, order = map(self._expression, (collect.by, collect.count, collect.order))
             self.out.line(f"items = collect(now, (source, {by}), {count}, {order}, m)", span)
         self._all_lost(topics, span)
         with self.out.block("if items is None:", span):
@@ -144,43 +147,7 @@ class HandlerSource:
 
     # targets
 
-    def _named(self, target: CheckedTarget) -> NamedTarget:
-        """Add a target, and open all its series in the counters."""
-        for reason in DROP_REASONS:
-            self.counters.index("messages_dropped", self.route.name, target.label, reason)
-        self.counters.index("messages_filtered", self.route.name, target.label)
-        self.counters.index("messages_waiting", self.route.name, target.label)
-        delivered = ("messages_published",) if target.topic else ("datagrams_sent", "sent_bytes")
-        for metric in delivered:
-            self.counters.index(metric, self.route.name, target.label)
-        name = self._unique(namespace_name(target.label))
-        self.targets.append(
-            TargetPlan(
-                identifier=name,
-                label=target.label,
-                is_topic=target.topic is not None,
-                max_rate=target.declared.max_rate,
-                on_limit=target.declared.on_limit,
-                priority=target.priority,
-                is_deferred=target.is_deferred,
-                deadmen=target.deadmen,
-            )
-        )
-        return name, target
-
-    def _serving(self, named: Sequence[NamedTarget], served: Sequence[CheckedTarget]) -> list[NamedTarget]:
-        """Return those that are served, and forget the others, whose names stay taken."""
-        kept = [any(target is each for each in served) for _, target in named]
-        self.targets = list(compress(self.targets, kept))
-        return list(compress(named, kept))
-
-    def _unique(self, base: str) -> str:
-        """Return a Python name that no other target has: `a/b` and `a_b` are different topics."""
-        taken = {plan.identifier for plan in self.targets}
-        candidates = (f"{base}_{number}" if number > 1 else base for number in count(1))
-        return next(name for name in candidates if name not in taken)
-
-    def _serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
+    def _serve(self, targets: Sequence[NamedTarget], when: Node | None = None) -> None:
         """Append the lines that serve targets. `when` is a condition for all of them, beside their own."""
         for name, target in targets:
             self.out.line(f"# {'topic' if target.topic else 'destination'} {target.label}", target.span)
@@ -206,13 +173,11 @@ class HandlerSource:
         self,
         name: str,
         target: CheckedTarget,
-        conditions: Sequence[Typed],
+        conditions: Sequence[Node],
         deliver: Deliver,
     ) -> None:
         """A failure of one target is counted for it and does not affect the others."""
         with self.out.block("try:", target.span):
-            if target.reads is not None:
-                target.reads.write(self.out, target.span)
             self._conditional(name, target, conditions, deliver)
         with self.out.block("except FAILURES as error:", target.span):
             self.out.line(f"lost_{name}(error)", target.span)
@@ -221,13 +186,13 @@ class HandlerSource:
         self,
         name: str,
         target: CheckedTarget,
-        conditions: Sequence[Typed],
+        conditions: Sequence[Node],
         deliver: Deliver,
     ) -> None:
         """Serve the target if each `when` is true, the message is not older than `ttl`, and `max_rate` allows it."""
         word = "if"
         for condition in conditions:
-            with self.out.block(f"{word} not {self.out.expression(condition.node)}:", condition.span):
+            with self.out.block(f"{word} not {self._expression(condition)}:", condition.span):
                 self._count("messages_filtered", target)
             word = "elif"
         if self.route.ttl:
@@ -253,9 +218,9 @@ class HandlerSource:
         if target.plan is None:
             data = "datagram"
         elif target.topic:
-            return write_message(self.out, target.plan, name)
+            return write_message(self.out, target.plan, name, self.values)
         else:
-            data = write_envelope(self.out, target.plan, self.case, name)
+            data = write_envelope(self.out, target.plan, self.case, name, self.values)
         return f"trimmed({data})" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
 
     def _send(self, name: str, target: CheckedTarget) -> None:

@@ -13,7 +13,6 @@ from google.protobuf.descriptor import Descriptor
 
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.executors import CARRIER, Executor, Executors
-from router.compiler.expressions import ParsedReads
 from router.compiler.lowering.expressions import Lowering, Names, readable
 from router.compiler.lowering.messages import MessageWriter, Unlowered
 from router.compiler.lowering.operations import (
@@ -99,6 +98,7 @@ def _executors(routes: Sequence[CheckedRoute], envelope: Envelope) -> Executors:
 
 def _own_executor(checked: CheckedRoute, target: CheckedTarget, envelope: Envelope) -> Executor:
     """The executor of a target, without regard to others of its topic."""
+    return Executor("typed trees are not lowered yet", target.span)
     if checked.collect is not None:
         return Executor("`collect` needs it", checked.collect.span)
     if target.declared.on_limit is OnLimit.LATEST:
