@@ -16,8 +16,8 @@ from router.carrier.lowered import Programs
 from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.targets import TargetWriter
-from router.compiler.lowering import LoweredFeed
-from router.compiler.lowering.layout import NONE
+from router.compiler.lowering import LoweredElements, LoweredFeed
+from router.compiler.lowering.operations import NONE
 from router.compiler.program import Handler, Program
 from router.threads import StuckError
 
@@ -73,16 +73,7 @@ def _route(writer: TargetWriter, handler: Handler, feed: LoweredFeed) -> c.RosRo
     assert handler.topic is not None  # noqa: S101 - of a route from ROS
     counters, programs = writer.program.counters, Programs(feed.layout, writer.arrays)
     targets = writer.targets(handler, handler.targets, feed.targets, programs)
-    for_each = c.ForEach()
-    if (elements := feed.for_each) is not None:
-        for_each = c.ForEach(
-            list=programs.code(elements.code),
-            stored=elements.stored,
-            node=elements.node,
-            item=elements.item,
-            index=elements.index,
-            count=elements.count,
-        )
+    for_each = native_for_each(feed.for_each, programs)
     targets.layout = programs.layout()
     seconds, nanoseconds = feed.stamp or (NONE, NONE)
     return c.RosRoute(
@@ -93,6 +84,20 @@ def _route(writer: TargetWriter, handler: Handler, feed: LoweredFeed) -> c.RosRo
         received=counters.index("messages_received", handler.route, handler.topic),
         last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
         duration=counters.index("route_duration_seconds", handler.route),
+    )
+
+
+def native_for_each(elements: LoweredElements | None, programs: Programs) -> c.ForEach:
+    """`for_each` of a route, None without."""
+    if elements is None:
+        return c.ForEach()
+    return c.ForEach(
+        list=programs.code(elements.code),
+        stored=elements.stored,
+        node=elements.node,
+        item=elements.item,
+        index=elements.index,
+        count=elements.count,
     )
 
 

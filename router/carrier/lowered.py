@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
-from router.compiler.lowering import Code, Layout
-from router.compiler.lowering.layout import Node
+from router.compiler.lowering.layout import Layout, PlacedNode
+from router.compiler.lowering.operations import Code
 
 _OPERATION, _REAL_OPERATION = struct.Struct("@BBHIQ"), struct.Struct("@BBHId")
 """`struct operation`, with an integer and with a real number."""
@@ -59,13 +59,9 @@ class Programs:
         self.arrays += [literals, made]
         return ctypes.pointer(made)
 
-    def _node(self, node: Node) -> c.Node:
-        if self._layout.is_cdr:
-            entries = [c.ReadOperation(kind, size, type_, slot=slot, count=count)
-                       for kind, size, type_, slot, count in node.entries]  # fmt: skip
-            made: Any = (c.ReadOperation * len(entries))(*entries)
-        else:
-            made = (c.NodeField * len(node.entries))(*(c.NodeField(*each) for each in node.entries))
+    def _node(self, node: PlacedNode) -> c.Node:
+        kind = c.ReadOperation if self._layout.is_cdr else c.NodeField
+        made = (kind * len(node.entries))(*(kind(**each._asdict()) for each in node.entries))
         self.arrays.append(made)
         return c.Node(ctypes.addressof(made), len(node.entries), node.first_slot, node.slot_count)
 
