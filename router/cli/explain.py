@@ -9,14 +9,10 @@ from pathlib import Path
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import add_table, seconds, table_path
-from router.compiler import Checked, check_table
+from router.compiler import check_table
 from router.compiler.checked import CheckedRoute
-from router.compiler.commands import lower_commands
-from router.compiler.executors import Executors, executors
-from router.compiler.link import compile_handlers
 from router.compiler.lookup import Definitions
-from router.compiler.lowering import lower_topics
-from router.compiler.metrics import Counters
+from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 
@@ -60,34 +56,30 @@ def _explain(args: argparse.Namespace) -> int:
     path = table_path(args)
     checked = check_table(path)
     print_findings(checked.diagnostics, sys.stderr)
-    if checked.has_errors or checked.table is None:
+    program = checked.program
+    if program is None:
         return BAD_TABLE
     routes: dict[str, list[CheckedRoute]] = {}
     for route in checked.routes:
         routes.setdefault(route.case.name, []).append(route)
     gateways = {gateway.settings.name: gateway for gateway in checked.gateways}
-    ignored = checked.table.ignored_gateways
+    ignored = program.table.ignored_gateways
     known = [*routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
             raise UsageError(f"{path} has no route or gateway '{name}'", did_you_mean(name, known))
-    executed_by = _executors(checked)
-    topics = seen_topics(checked.table, args.seconds or _LIVE) if args.live else known_topics(checked.table)
+    topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            _print_route(route, checked, executed_by, with_code=args.code)
+            print(*explained_route(route, checked, program.executors), sep="\n")
+            if args.code:
+                _print_code(route, program)
+            print()
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
             print(*ignored_gateway(ignored[name]), sep="\n", end="\n\n")
     return OK
-
-
-def _executors(checked: Checked) -> Executors:
-    assert checked.envelope is not None  # noqa: S101 - as above
-    routes = [route for route in checked.routes if not route.route.ignore]
-    published = lower_topics(routes, checked.envelope).executors
-    return {**executors(routes), **lower_commands(routes).executors, **published}
 
 
 def _diff(old: Path, new: Path) -> int:
@@ -102,17 +94,14 @@ def _diff(old: Path, new: Path) -> int:
     return OK
 
 
-def _print_route(route: CheckedRoute, checked: Checked, executed_by: Executors, *, with_code: bool) -> None:
-    assert checked.table is not None  # noqa: S101 - a table without errors is one
-    print(*explained_route(route, checked, executed_by), sep="\n")
-    if with_code and not route.route.ignore:
-        for handler in compile_handlers(route, checked.table, Counters()):
-            _print_code(handler.source)
-    print()
+def _print_code(route: CheckedRoute, program: Program) -> None:
+    for handler in program.handlers:
+        if handler.route == route.route.name:
+            print()
+            _print_python(handler.source.text())
 
 
-def _print_code(source: str) -> None:
-    print()
+def _print_python(source: str) -> None:
     if is_coloured(sys.stdout):
         from rich.console import Console
         from rich.syntax import Syntax

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import compress, count
 
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
 from router.compiler.expressions.tree import Node, paths_in
-from router.compiler.metrics import DROP_REASONS, Counters
+from router.compiler.metrics import Counters
 from router.compiler.payload import write_envelope
 from router.compiler.plan import expressions
-from router.compiler.program import TargetPlan
 from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
@@ -29,10 +27,14 @@ Deliver = Callable[[str, CheckedTarget], None]
 """Appends the lines that hand the message to a target."""
 
 NamedTarget = tuple[str, CheckedTarget]
-"""A target with its part of the Python names."""
+"""A target with its part of the Python names (TargetPlan.identifier)."""
 
 _EXPIRY = {True: "command_expires", False: "expires"}
 """The names of the time after which a message is stale, by whether the target is a board."""
+
+
+def function_name(route: Route) -> str:
+    return f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
 
 
 def _reads(subscription: CheckedSubscription) -> CdrReads:
@@ -54,39 +56,27 @@ class HandlerSource:
         self.route = route
         self.case = case
         self.counters = counters
-        self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self.targets: list[TargetPlan] = []
         self.values: Values = NO_VALUES
 
-    def inbound(
-        self,
-        targets: Sequence[CheckedTarget],
-        collect: CheckedCollect | None,
-        served: Sequence[CheckedTarget] | None = None,
-    ) -> None:
-        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames.
-
-        `targets` are all of the route, `served` those that the function serves, None for all.
-        """
-        named = self._serving([self._named(target) for target in targets], targets if served is None else served)
+    def inbound(self, named: Sequence[NamedTarget], collect: CheckedCollect | None) -> None:
+        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames."""
+        topics = [(name, target) for name, target in named if target.topic]
         with self._function("m", "datagram"):
             self._expires(named)
-            if collect is None:
+            if collect is None or not topics:
                 self._serve(named)
             else:
                 self._serve([(name, target) for name, target in named if not target.topic])
-                topics = [(name, target) for name, target in named if target.topic]
                 self._collect(collect, topics)
                 self._serve(topics)
-            if not targets:
+            if not named:
                 self.out.line("pass", self.route.span)
 
-    def outbound(self, subscription: CheckedSubscription) -> None:
+    def outbound(self, subscription: CheckedSubscription, named: Sequence[NamedTarget]) -> None:
         """The message is read once for all destinations. With `for_each`, each element is served as a message."""
         span, for_each = subscription.topic.span, subscription.for_each
         one_received = self._received(subscription, "1")
-        named = [self._named(target) for target in subscription.targets]
         reads = _reads(subscription)
         self.values = reads.values
         with self._function("cdr"):
@@ -115,7 +105,7 @@ class HandlerSource:
     @contextmanager
     def _function(self, *message: str) -> Iterator[None]:
         parameters = (*message, "received_at", "now", "source", *(["born"] if self.route.ttl else []))
-        with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.route.span):
+        with self.out.block(f"def {function_name(self.route)}({', '.join(parameters)}):", self.route.span):
             yield
 
     def _expression(self, node: Node) -> str:
@@ -146,8 +136,6 @@ class HandlerSource:
     def _collect(self, collect: CheckedCollect, topics: Sequence[NamedTarget]) -> None:
         """Append the lines that return unless a frame is complete. `items` are its parts, `m` is the first of them."""
         span = collect.span
-        for _, target in topics:
-            self.counters.index("messages_collected", self.route.name, target.label)
         self.out.line("# collect", span)
         with self.out.block("try:", span):
             by, count, order = map(self._expression, (collect.by, collect.count, collect.order))
@@ -158,42 +146,6 @@ class HandlerSource:
         self.out.line("m, count = items[0], len(items)", span)
 
     # targets
-
-    def _named(self, target: CheckedTarget) -> NamedTarget:
-        """Add a target, and open all its series in the counters."""
-        for reason in DROP_REASONS:
-            self.counters.index("messages_dropped", self.route.name, target.label, reason)
-        self.counters.index("messages_filtered", self.route.name, target.label)
-        self.counters.index("messages_waiting", self.route.name, target.label)
-        delivered = ("messages_published",) if target.topic else ("datagrams_sent", "sent_bytes")
-        for metric in delivered:
-            self.counters.index(metric, self.route.name, target.label)
-        name = self._unique(namespace_name(target.label))
-        self.targets.append(
-            TargetPlan(
-                identifier=name,
-                label=target.label,
-                is_topic=target.topic is not None,
-                max_rate=target.declared.max_rate,
-                on_limit=target.declared.on_limit,
-                priority=target.priority,
-                is_deferred=target.is_deferred,
-                deadmen=target.deadmen,
-            )
-        )
-        return name, target
-
-    def _serving(self, named: Sequence[NamedTarget], served: Sequence[CheckedTarget]) -> list[NamedTarget]:
-        """Return those that are served, and forget the others, whose names stay taken."""
-        kept = [any(target is each for each in served) for _, target in named]
-        self.targets = list(compress(self.targets, kept))
-        return list(compress(named, kept))
-
-    def _unique(self, base: str) -> str:
-        """Return a Python name that no other target has: `a/b` and `a_b` are different topics."""
-        taken = {plan.identifier for plan in self.targets}
-        candidates = (f"{base}_{number}" if number > 1 else base for number in count(1))
-        return next(name for name in candidates if name not in taken)
 
     def _serve(self, targets: Sequence[NamedTarget], when: Node | None = None) -> None:
         """Append the lines that serve targets. `when` is a condition for all of them, beside their own."""

@@ -1,12 +1,14 @@
 """The compiled table: all handlers, and what must be opened for them.
 
-A program is plain data and code objects; `engine` binds it to sockets, publishers and counts.
+A program is plain data; handlers are generated when something asks for them. `engine` binds it to sockets, publishers
+and counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain
 from types import CodeType
 
@@ -14,6 +16,8 @@ from router.compiler.commands import Commands
 from router.compiler.executors import Executors
 from router.compiler.lowering import LoweredRoute
 from router.compiler.metrics import Counters
+from router.compiler.namespace import NAMESPACE
+from router.compiler.source import Source
 from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
@@ -116,36 +120,48 @@ class GatewayPlan:
     inbound: Mapping[str, InboundPlan]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Handler:
-    """One route as generated Python, for a route from ROS one for each of its topics.
+    """What serves one route in Python, or one of the topics of a route from ROS.
 
-    `code` defines the function called `function`; its namespace needs `constants` and what the engine binds for
-    `targets` (see engine.binding). It serves one message: a parsed payload, or the CDR bytes from `topic`. `source` is
-    its text. `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS
-    has none. `ttl` and `collect_timeout` in ns, None for none.
+    It serves one message: a parsed payload, or the CDR bytes from `topic`. `sources` are the endpoints that may send
+    the message, perhaps with STRANGER among them; a route from ROS has none. `ttl` and `collect_timeout` in ns, None
+    for none.
 
-    It serves all targets of the route. `part` compiles a handler that serves some of them, with the same counters and
-    TargetPlans.
+    `generate` writes the function called `function`, which serves the given targets, and `file` is what its tracebacks
+    name. It is generated and compiled on first use, because most handlers are never called: the carrier serves their
+    targets.
     """
 
     route: str
     case: PayloadCase
-    function: str
-    source: str
-    code: CodeType
-    constants: Mapping[str, object]
     targets: tuple[TargetPlan, ...]
     sources: frozenset[str | None]
+    generate: Callable[[Sequence[TargetPlan]], Source] = field(repr=False, compare=False)
+    function: str
+    file: str
     topic: str | None = None
     ttl: int | None = None
     collect_timeout: int | None = None
-    compile_part: Callable[[Sequence[TargetPlan]], Handler] | None = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def source(self) -> Source:
+        return self.generate(self.targets)
+
+    @cached_property
+    def code(self) -> CodeType:
+        """Defines the function. Its namespace needs `constants` and what the engine binds for `targets`."""
+        return self.source.compile(self.file)
+
+    @property
+    def constants(self) -> Mapping[str, object]:
+        return {**NAMESPACE, **self.source.constants}
 
     def part(self, targets: Sequence[TargetPlan]) -> Handler:
-        """Return the handler of these targets only, for a route from UDP."""
-        assert self.compile_part is not None  # noqa: S101 - a route from UDP
-        return self.compile_part(targets)
+        """Return the handler of these targets only, with the same counters and TargetPlans."""
+        has_topics = any(target.is_topic for target in targets)
+        served = tuple(target for target in self.targets if target in targets)
+        return replace(self, targets=served, collect_timeout=self.collect_timeout if has_topics else None)
 
 
 @dataclass(frozen=True, slots=True)

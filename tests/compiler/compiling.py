@@ -23,7 +23,8 @@ from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.rig import Rig
 from tests.oracles.reference import fill
-from tests.oracles.reference_expressions import Context, View
+from tests.oracles.reference_expressions import Context
+from tests.oracles.reference_kinds import View
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
 RECEIVED_AT = 1_700_000_000_123_456_789

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
+from router.compiler import Checked, lowering
+from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.executors import executors
 from router.compiler.program import Program
+from router.types.protobuf import Envelope
 from tests.compiler.conftest import CheckText
 
 ENDPOINTS = """{
@@ -163,3 +168,17 @@ def test_of_the_rovers_targets_all_but_one_are_the_carriers(rover_program: Progr
         49,
         {("detected_object_from_ros_2", "detected_objects", "basestation"): "`for_each` needs it"},
     )
+
+
+def test_each_topic_is_lowered_once(rover: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[str, str]] = []
+    lower = lowering.lower
+
+    def counted(checked: CheckedRoute, targets: Sequence[CheckedTarget], envelope: Envelope) -> lowering.LoweredRoute:
+        made.extend((checked.route.name, target.label) for target in targets)
+        return lower(checked, targets, envelope)
+
+    monkeypatch.setattr(lowering, "lower", counted)
+    assert rover.program_in(None) is not None
+    assert made
+    assert len(made) == len(set(made))

@@ -9,9 +9,7 @@ import traceback
 import pytest
 
 from router.compiler import Checked, check_table
-from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import Definitions
-from router.compiler.metrics import Counters
 from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published
@@ -23,18 +21,8 @@ SPAN = SourceSpan("table.yaml", 3, 5, 9)
 
 def generated(checked: Checked) -> list[Source]:
     """The code of all routes of a table."""
-    made = []
-    for route in checked.routes:
-        generator = HandlerSource(route.route, route.case, Counters())
-        if not route.route.is_outbound:
-            generator.inbound(route.targets, route.collect)
-            made.append(generator.out)
-        for feed in route.subscriptions:
-            generator = HandlerSource(route.route, route.case, Counters())
-            generator.outbound(feed)
-            made.append(generator.out)
-    assert made
-    return made
+    assert checked.program is not None
+    return [handler.source for handler in checked.program.handlers]
 
 
 @pytest.mark.parametrize("table", ["rover", "sim", "legacy"])

@@ -74,7 +74,7 @@ def test_a_part_serves_its_targets_alone(made: Program) -> None:
     assert handler.targets == (handler.targets[0], *destinations.targets, *topics.targets)  # whose state is kept by it
     assert [target.label for target in destinations.targets] == ["recorder"]
     assert [target.identifier for target in topics.targets] == ["accel_x", "accel_x_2"]
-    assert "basestation" not in topics.source + destinations.source
+    assert "basestation" not in topics.source.text() + destinations.source.text()
 
 
 @given(values=st.lists(st.tuples(st.sampled_from([0.0, 2.0, 7.0]), st.integers(0, 300 * MS)), max_size=20))

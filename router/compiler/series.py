@@ -1,0 +1,124 @@
+"""Every series of a table, opened before anything counts: what is scraped does not depend on who serves a target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from router.compiler.metrics import (
+    CLIENT_DROP_REASONS,
+    CLIENTS,
+    DROP_REASONS,
+    GATEWAY_DROP_REASONS,
+    GATEWAY_REJECT_REASONS,
+    INBOUND_DROP_REASONS,
+    QOS_POLICIES,
+    RECORD_DROP_REASONS,
+    REJECT_REASONS,
+    RELOAD_RESULTS,
+    TOPIC_STATES,
+    UNKNOWN_CASE,
+    Counters,
+)
+from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Handler, source_label
+from router.table.model import ROS, RouteTable
+from router.types.protobuf import Envelope
+
+
+def open_series(
+    counters: Counters,
+    table: RouteTable,
+    envelope: Envelope,
+    handlers: Iterable[Handler],
+    deadmen: Iterable[DeadmanPlan],
+    gateways: Iterable[GatewayPlan],
+) -> None:
+    """Open the series of a program with these parts."""
+    _open_listeners(counters, table, envelope)
+    _open_own(counters, table)
+    for handler in handlers:
+        _open_handler(counters, table, handler)
+    for deadman in deadmen:
+        _open_deadman(counters, deadman)
+    for gateway in gateways:
+        _open_gateway(counters, gateway)
+
+
+def _open(counters: Counters, metrics: Iterable[str], *labels: str) -> None:
+    for metric in metrics:
+        counters.index(metric, *labels)
+
+
+def _open_each(counters: Counters, metric: str, *labels: str, last: Iterable[str]) -> None:
+    """Open a series for each value of the last label."""
+    for value in last:
+        counters.index(metric, *labels, value)
+
+
+def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -> None:
+    for listener in table.listeners:
+        _open(
+            counters,
+            ("datagrams_received", "received_bytes", "kernel_drops", "listener_waiting", "datagrams_padded"),
+            listener,
+        )
+        _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
+    _open_each(counters, "unhandled", last=(*envelope.cases, UNKNOWN_CASE))
+    _open_each(counters, "endpoint_last_seen_timestamp_seconds", last=table.endpoints)
+
+
+def _open_own(counters: Counters, table: RouteTable) -> None:
+    """The series of mirror, recorder and reloads."""
+    _open(counters, ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"))
+    _open_each(counters, "config_reloads", last=RELOAD_RESULTS)
+    if table.record is not None:
+        _open(counters, ("recorded_datagrams", "recorded_bytes"))
+        _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
+
+
+def _open_handler(counters: Counters, table: RouteTable, handler: Handler) -> None:
+    """The series of a route, or of one of the topics that a route from ROS takes messages from."""
+    route = handler.route
+    _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route)
+    published = [target.label for target in handler.targets if target.is_topic]
+    for topic in published if handler.topic is None else [handler.topic]:
+        _open_each(counters, "qos_incompatible", route, topic, last=QOS_POLICIES)
+    if handler.topic is None:
+        sources = [source for source in (*table.endpoints, STRANGER) if source in handler.sources]
+        _open_each(counters, "messages_received", route, last=map(source_label, sources))
+    else:
+        counters.index("messages_received", route, handler.topic)
+    for target in handler.targets:
+        _open_each(counters, "messages_dropped", route, target.label, last=DROP_REASONS)
+        _open(counters, ("messages_filtered", "messages_waiting"), route, target.label)
+        delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
+        _open(counters, delivered, route, target.label)
+        if target.is_topic and handler.collect_timeout is not None:
+            counters.index("messages_collected", route, target.label)
+
+
+def _open_deadman(counters: Counters, plan: DeadmanPlan) -> None:
+    _open(counters, ("deadman_active", "deadman_trips"), plan.route)
+    for to, _ in plan.datagrams:
+        _open(counters, ("deadman_datagrams_sent", "deadman_send_errors"), plan.route, to)
+
+
+def _open_gateway(counters: Counters, plan: GatewayPlan) -> None:
+    name = plan.settings.name
+    _open(counters, ("datagrams_received", "received_bytes", "gateway_clients", "gateway_client_clock_ahead"), name)
+    _open(counters, ("route_last_message_timestamp_seconds",), name)
+    _open_each(counters, "datagrams_rejected", name, last=GATEWAY_REJECT_REASONS)
+    _open_each(counters, "messages_received", name, last=(ROS, CLIENTS))
+    _open(counters, ("messages_sent", "messages_filtered"), name, CLIENTS)
+    _open_each(counters, "messages_dropped", name, CLIENTS, last=GATEWAY_DROP_REASONS)
+    _open(counters, ("datagrams_sent", "sent_bytes"), name, plan.settings.transport.value.value)
+    if plan.settings.zenoh is not None:
+        _open(counters, ("gateway_key_conflicts",), name)
+        _open(counters, ("gateway_connections",), name, plan.settings.zenoh.mode)
+    _open_each(counters, "gateway_topics", name, last=TOPIC_STATES)
+    _open_each(counters, "client_messages_dropped", name, last=CLIENT_DROP_REASONS)
+    for topic, inbound in plan.inbound.items():
+        _open(counters, ("messages_published",), name, topic)
+        _open_each(counters, "messages_dropped", name, topic, last=INBOUND_DROP_REASONS)
+        _open_each(counters, "qos_incompatible", name, topic, last=QOS_POLICIES)
+        if inbound.deadman is not None:
+            _open_deadman(counters, inbound.deadman)
