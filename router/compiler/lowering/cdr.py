@@ -17,7 +17,6 @@ from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Op, Operation, Scalar, keep, known, load
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.errors import SourceSpan
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
 _EMPTY = b"\0"

@@ -7,18 +7,13 @@ nanoseconds. A message is never on the stack but as the element of a list: its f
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import (
-    BoolKind,
-    BytesKind,
-    EnumKind,
     FloatKind,
-    IntKind,
     Kind,
     ListKind,
     MessageKind,
@@ -34,23 +29,22 @@ from router.compiler.expressions.tree import (
     Contains,
     Element,
     Logic,
-    Node as Tree,
     Operator,
     Present,
     Read,
-    Relation,
     Unary,
     Variable,
+)
+from router.compiler.expressions.tree import (
+    Node as Tree,
 )
 from router.compiler.lowering import functions, lists
 from router.compiler.lowering.layout import Node
 from router.compiler.lowering.names import Names
-from router.compiler.lowering.numbers import as_integer, coerced, compare, is_unsigned, signs, to_real
+from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
-    WANT,
     Code,
-    Compared,
     Op,
     Operation,
     Scalar,
@@ -62,7 +56,7 @@ from router.compiler.lowering.operations import (
     real,
     text,
 )
-from router.types.model import Field, MessageType
+from router.types.model import Field
 
 _REALS: Mapping[Operator, Op] = {
     Operator.ADD: Op.REAL_ADD,
@@ -89,7 +83,7 @@ class Lowering:
 
     names: Names
 
-    def value(self, node: Tree) -> Code:  # noqa: C901, PLR0911, PLR0912 - a case a node
+    def value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
         """What puts the value of a node on the stack."""
         if isinstance(node.kind, ListKind):
             return lists.stored(self, node).code

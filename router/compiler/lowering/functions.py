@@ -10,22 +10,18 @@ from typing import TYPE_CHECKING
 from router.compiler.expressions.functions import NS_PER_MILLISECOND, NS_PER_SECOND
 from router.compiler.expressions.kinds import (
     BoolKind,
-    BytesKind,
     EnumKind,
     FloatKind,
     IntKind,
-    Kind,
-    ListKind,
     StringKind,
 )
 from router.compiler.expressions.tree import Binary, Call, Choice, Constant, Listed
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
-from router.compiler.lowering.numbers import INT64, bounds, coerced, fitted, is_unsigned, signs, to_real
+from router.compiler.lowering.numbers import INT64, bounds, fitted, is_unsigned, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
     MAX_DATAGRAM,
-    SIZE,
     WANT,
     Code,
     Compared,
@@ -144,9 +140,7 @@ def _named(lowering: Lowering, node: Call) -> Code:
     found: Code = (integer(0), WANT, integer(0))
     for name, number in reversed(node.kind.enum.values):
         is_it = load(slot), text(name.encode()), Operation(Op.COMPARE, int(Compared.TEXTS), flag=Relation.EQUAL)
-        found = code(
-            is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found
-        )
+        found = code(is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found)
     return code(lowering.value(node.arguments[0]), keep(slot), DROP, found)
 
 
@@ -235,6 +229,6 @@ _OTHERS: Mapping[str, Callable[[Lowering, Call], Code]] = {
     "octets": _octets,
     "seconds": _seconds,
     "str": _str,
-    "sum": lambda lowering, node: lists.total(lowering, node),
+    "sum": lists.total,
     "text": _text,
 }

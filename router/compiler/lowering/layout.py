@@ -14,7 +14,6 @@ from typing import NamedTuple, Union
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import NONE, Counted, Scalar, Slot
 from router.types.descriptors import enum_of, message_of
@@ -46,7 +45,7 @@ class Wanted:
 
 @dataclass(eq=False, slots=True)
 class Node:
-    """A message at one place: the source message, a message in it, or the elements of a list, which are read one by one.
+    """A message at one place: the source message, a message in it, or an element of a list.
 
     `descriptor` is None for a ROS message. `path` is what stands in front of the names of its fields: `motors[].`.
     """
@@ -226,7 +225,7 @@ class ReadOperation(NamedTuple):
     size: int = 0
     type: Scalar = Scalar.BOOL
     slot: int = NONE
-    count: int = 0
+    elements: int = 0
 
 
 class PlacedNode(NamedTuple):
@@ -277,22 +276,20 @@ class _Layout:
         self.messages = [node.type.name for node in nodes]
 
     def made(self, *, is_cdr: bool, closed: Iterable[tuple[int, ...]] = ()) -> Layout:
-        every = map(tuple, (self.nodes, self.defaults, self.names, self.messages, closed))
-        return Layout(is_cdr, *every)  # type: ignore[arg-type]
+        nodes, defaults, names, messages = self.nodes, self.defaults, self.names, self.messages
+        return Layout(is_cdr, tuple(nodes), tuple(defaults), tuple(names), tuple(messages), tuple(closed))
 
 
 # ---- datagrams
 
 
 def protobuf_layout(
-    slots: Sequence[Slot], payload: Node, envelope: tuple[MessageType, Descriptor], case: str, elements: Sequence[Node]
+    slots: Sequence[Slot], payload: Node, envelope: Descriptor, case: str, elements: Sequence[Node]
 ) -> Layout:
     """Number `slots`, from 0, then those of the payload in its envelope, and those of elements of lists."""
     maker = _ProtobufLayout(slots)
-    around = Node(*envelope)
-    member = around.type.field(case)
-    assert member is not None  # noqa: S101 - the case is one of the envelope's
-    around.wanted[case] = Wanted(member, node=payload)
+    around = Node(MessageType(envelope.full_name), envelope)
+    around.wanted[case] = Wanted(Member(case, payload.type), node=payload)
     maker.number_nodes([payload, around, *_inner(payload), *chain.from_iterable(map(_all, elements))])
     for root in (around, *elements):
         maker.place(root)
@@ -360,7 +357,7 @@ class _ProtobufLayout(_Layout):
 
 
 class TooManyListsError(Exception):
-    """A ROS message has lists of messages in lists of messages, too deep to be gone through."""
+    """A ROS message has more lists of messages within each other than are gone through."""
 
 
 def cdr_layout(slots: Sequence[Slot], message: Node, elements: Sequence[Node]) -> Layout:
@@ -426,9 +423,9 @@ class _Steps:
             self.message(declared, node)
             return
         if node is not None and node.wanted:
-            self._loop(ReadOperation(ReadKind.EACH, count=1), slot, lambda steps: steps.message(declared, node))
+            self._loop(ReadOperation(ReadKind.EACH, elements=1), slot, lambda steps: steps.message(declared, node))
         else:
-            self._loop(ReadOperation(ReadKind.EACH, count=1), slot, lambda steps: steps.message(declared, None))
+            self._loop(ReadOperation(ReadKind.EACH, elements=1), slot, lambda steps: steps.message(declared, None))
 
     def _list(self, declared: List, slot: Slot | None) -> None:
         element, length = declared.element, declared.length
@@ -444,7 +441,7 @@ class _Steps:
             self._scalars(size, length)
         else:
             self._flush()
-            self._add(ReadOperation(ReadKind.ARRAY, size, scalar_of(element), count=length), slot)
+            self._add(ReadOperation(ReadKind.ARRAY, size, scalar_of(element), elements=length), slot)
             self.offset.advance(size, size * length)
 
     def _elements(self, element: MessageType | String, length: int | None, slot: Slot | None) -> None:
@@ -452,7 +449,7 @@ class _Steps:
             for _ in range(length):
                 self._field(element, None)
             return
-        each = ReadOperation(ReadKind.EACH_SEQUENCE if length is None else ReadKind.EACH, count=length or 0)
+        each = ReadOperation(ReadKind.EACH_SEQUENCE if length is None else ReadKind.EACH, elements=length or 0)
         if slot is not None and isinstance(element, String):
             texts = ReadOperation(ReadKind.TEXTS, slot=self.layout.number(slot))
             self._loop(each, None, lambda steps: steps.made.append(texts))
@@ -462,7 +459,8 @@ class _Steps:
 
     def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
         if self.loops == MOST_READ_LOOPS:
-            raise TooManyListsError
+            message = f"a message of this type has more than {MOST_READ_LOOPS} lists of messages within each other"
+            raise TooManyListsError(message)
         self._add(each, slot)
         inside = _Steps(self.layout, Offset(), self.loops + 1)
         body(inside)
@@ -497,6 +495,6 @@ class _Steps:
             return
         alignment, size = self._skipped
         self._skipped = None
-        self.made.append(ReadOperation(ReadKind.SKIP, alignment, count=size // alignment))
+        self.made.append(ReadOperation(ReadKind.SKIP, alignment, elements=size // alignment))
         if size % alignment:
-            self.made.append(ReadOperation(ReadKind.SKIP, 1, count=size % alignment))
+            self.made.append(ReadOperation(ReadKind.SKIP, 1, elements=size % alignment))

@@ -42,6 +42,7 @@ from router.compiler.lowering.operations import (
     real,
     repeat,
 )
+
 if TYPE_CHECKING:
     from router.compiler.lowering.expressions import Lowering
 
@@ -196,12 +197,10 @@ def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], 
     """What is done for the elements at one place of all lists."""
     before: Code = ()
     for variable, of, slot in taken:
-        one, meaning = _taken(lowering, of, slot)
-        if meaning is None:
-            meaning = lowering.names.temporary()
-            one = code(one, keep(meaning), DROP)
+        one, node = _taken(lowering, of, slot)
+        meaning = node or lowering.names.temporary()
         lowering.names.variables[variable] = meaning
-        before = code(before, one)
+        before = code(before, one) if isinstance(meaning, Node) else code(before, one, keep(meaning), DROP)
     return _without_a_detour(code(before, body()))
 
 

@@ -1,4 +1,4 @@
-"""What the writers of both kinds of messages have in common: operations with their places, and lists that fill fields."""
+"""What the writers of both kinds of messages share: operations with their places, and lists that fill fields."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Place(NamedTuple):
     field: str
 
     def __str__(self) -> str:
-        return f"{self.span}: {self.field}"
+        return f"{self.span}: {self.field}" if self.field else str(self.span)
 
 
 Placed = tuple[Operation, Place]

@@ -13,7 +13,6 @@ from router.compiler.expressions.kinds import (
     IntKind,
     Kind,
     StringKind,
-    TimeKind,
 )
 from router.compiler.expressions.tree import Relation as TreeRelation
 from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer

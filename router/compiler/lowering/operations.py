@@ -1,4 +1,4 @@
-"""The operations of a program, as `native/operations.h` declares them, and what is known of a program before it runs."""
+"""The operations of a program, as `native/operations.h` declares them, and what is known before it runs."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _tag(to: FieldDescriptor) -> int:
 # ---- known bytes
 
 
-def _encoded(value: bool | int | float | str, to: FieldDescriptor) -> bytes:
+def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
     """A constant without its tag."""
     write = _WRITES.get(to.type, Op.WRITE_VARINT)
     if write is Op.WRITE_FLOAT:
@@ -139,7 +139,7 @@ def _encoded(value: bool | int | float | str, to: FieldDescriptor) -> bytes:
 _ALL_BITS = (1 << 64) - 1
 
 
-def _is_set(value: bool | int | float | str, to: FieldDescriptor) -> bool:
+def _is_set(value: bool | float | str, to: FieldDescriptor) -> bool:
     """Whether a constant is not zero, which has no presence. Minus zero is not."""
     is_real = _WRITES.get(to.type) in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
