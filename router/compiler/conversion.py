@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 
 from router.compiler.expressions import ExpressionError, Scope
-from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, INT64_END, clamp
+from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
 from router.compiler.expressions.kinds import (
     INT32,
+    INT64,
     OCTET,
     BoolKind,
     BytesKind,
@@ -27,6 +28,7 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     kind_of,
 )
+from router.compiler.expressions.lists import fitted
 from router.compiler.expressions.scope import field_of
 from router.compiler.expressions.tree import Binary, Call, Constant, Listed, Node, Operator, Variable, constant_of
 from router.compiler.expressions.tree import Each as Computed
@@ -81,25 +83,17 @@ def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
 
 
 def _to_time(value: Node, target: MessageType) -> Record:
-    def part(member: Field, operator: Operator, low: int, high: int) -> tuple[Field, Plan]:
+    def part(member: Field, operator: Operator, kind: IntKind) -> tuple[Field, Plan]:
         divisor = Constant(IntKind(NS_PER_SECOND, NS_PER_SECOND), value.span, NS_PER_SECOND)
-        made = Binary(IntKind(low, high), value.span, operator, value, divisor)
-        return member, Leaf(member.type, _within(made, member.type), value.span)
+        made = Binary(kind, value.span, operator, value, divisor)
+        assert isinstance(member.type, Int)  # noqa: S101 - times are made of integers
+        range_ = _range(member.type)
+        return member, Leaf(member.type, made if range_.holds(kind) else fitted(made, range_), value.span)
 
     sec, nanosec = target.fields
-    seconds = part(sec, Operator.FLOOR_DIVIDE, -INT64_END // NS_PER_SECOND, INT64_END // NS_PER_SECOND)
-    return Record(target, (seconds, part(nanosec, Operator.MODULO, 0, NS_PER_SECOND - 1)), value.span)
-
-
-def _within(value: Binary, target: Type) -> Node:
-    """The integer, refused at run time where it is outside of the field's range."""
-    assert isinstance(target, Int)  # noqa: S101 - times are made of integers
-    assert isinstance(value.kind, IntKind)  # noqa: S101
-    return (
-        value
-        if _fits(value.kind, target)
-        else _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
-    )
+    seconds = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
+    members = part(sec, Operator.FLOOR_DIVIDE, seconds), part(nanosec, Operator.MODULO, IntKind(0, NS_PER_SECOND - 1))
+    return Record(target, members, value.span)
 
 
 def _to_same_named(value: Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
@@ -212,30 +206,31 @@ def _to_int(value: Node, target: Int) -> Node:
 
 def _saturate(value: Node, target: Int) -> Node:
     """An enum limited to an integer's range."""
-    if _fits(IntKind(INT32.low, INT32.high), target):
+    range_, every = _range(target), _range(INT32)
+    if range_.holds(every):
         return value
-    kind = IntKind(max(INT32.low, target.low), min(INT32.high, target.high))
+    kind = IntKind(max(every.low, range_.low), min(every.high, range_.high))
     literal = constant_of(value)
     if isinstance(literal, int):
-        return Constant(kind, value.span, int(clamp(literal, target.low, target.high)))
+        return Constant(kind, value.span, int(clamp(literal, kind.low, kind.high)))
     return _limited("clamp", value, kind, target.low, target.high)
 
 
-def _fits(kind: IntKind, target: Int) -> bool:
-    return kind.bounds is not None and target.low <= kind.bounds[0] and kind.bounds[1] <= target.high
+def _range(target: Int) -> IntKind:
+    return IntKind(target.low, target.high)
 
 
 def _fit(value: Node, kind: IntKind, target: Int) -> Node:
-    if kind.bounds is None:
-        return _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
-    if _fits(kind, target):
+    range_ = _range(target)
+    if range_.holds(kind):
         return value
-    low, high = kind.bounds
-    if high < target.low or low > target.high:
+    if kind.high < range_.low or kind.low > range_.high:
         limits = f"{target.low}..{target.high}"
         raise ExpressionError(
             value.span, Code.OUT_OF_RANGE, f"{value.kind} does not fit {target}", f"it holds {limits}"
         )
+    if kind.is_rounded:
+        return fitted(value, range_)
     hint = "say how: clamp() or wrap()"
     raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
 
@@ -251,8 +246,8 @@ def _to_float(value: Node, target: Float) -> Node:
                 hint = "float32() says that losing digits is meant"
                 raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)
             return value
-        case IntKind(bounds=bounds):
-            if bounds is None or (-limit <= bounds[0] and bounds[1] <= limit):
+        case IntKind() as kind:
+            if kind.is_rounded or IntKind(-limit, limit).holds(kind):
                 return value
             hint = f"float{target.bits}() says that losing digits is meant"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
@@ -332,7 +327,7 @@ def _is_octet(kind: Kind) -> bool:
     """Whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
     if not isinstance(kind, IntKind):
         return False
-    return kind.bounds is None or OCTET.low <= kind.bounds[0] <= kind.bounds[1] <= OCTET.high
+    return kind.is_rounded or _range(OCTET).holds(kind)
 
 
 def _limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
