@@ -34,7 +34,7 @@ from router.compiler.expressions.tree import (
     path_of,
 )
 from router.compiler.source import attribute, call, load, placed
-from router.types.model import Field, List, MessageType
+from router.types.model import Field, List
 
 Values = Mapping[Path, ast.expr]
 """What stands for fields of the source message, by path."""
@@ -114,12 +114,11 @@ def _read(node: Variable | Read, values: Values) -> ast.expr:
 
 
 def _value_of(message: ast.expr, member: Field) -> ast.expr:
-    """A field of a message object. A protobuf map is read as the list of its entries."""
+    """A field of a message object."""
     value = attribute(message, member.name)
-    element = member.type.element if isinstance(member.type, List) else None
-    if member.is_unchecked:
-        return call("checked_texts" if element else "checked_text", value)
-    return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
+    if not member.is_unchecked:
+        return value
+    return call("checked_texts" if isinstance(member.type, List) else "checked_text", value)
 
 
 def lists_of(lists: tuple[tuple[str, Node], ...], values: Values = NO_VALUES) -> tuple[str, ast.expr]:

@@ -39,7 +39,6 @@ from tests.compiler.compiling import (
 from tests.compiler.generated_types import EACH_TYPE, mirror, payload_sources, values
 from tests.compiler.payloads import (
     Wire,
-    assert_same_bytes,
     compiled_envelope,
     made,
     made_wire,
@@ -229,18 +228,6 @@ def test_a_map_takes_a_list_of_entries_and_keeps_the_last_of_each_key() -> None:
     ]
     optionals = made("maps", AUTO, optionals=(List(narrow), twice)).optionals
     assert (optionals[1].number, optionals[1].text) == (0, "")
-
-
-def test_map_is_read_as_the_list_of_its_entries_in_the_order_of_its_keys() -> None:
-    wire = made_wire()
-    maps, many = wire[1].cases["maps"], wire[1].cases["many"]
-    given = maps.message_class(counts={"b": 2, "a": 1}, singles={True: 0.5})
-    copied = compiled_envelope(wire, maps, AUTO, maps.type)(given)
-    assert wire[1].message_class.FromString(copied) == wire[1].message_class(maps=given)
-    assert_same_bytes(wire, copied, reference_envelope(wire, maps, AUTO, maps.type)(given))
-    picked = field_map(numbers="[counts[0].value, clamp(len(singles), 0, 9)]", texts="[counts[1].key]")
-    expected = wire[1].message_class(many={"numbers": [1, 1], "texts": ["b"]})
-    assert compiled_envelope(wire, many, picked, maps.type)(given) == expected.SerializeToString()
 
 
 def test_a_time_fills_a_timestamp() -> None:
