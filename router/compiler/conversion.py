@@ -29,7 +29,7 @@ from router.compiler.expressions.kinds import (
     kind_of,
 )
 from router.compiler.expressions.lists import fitted
-from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.scope import field_of, want_readable
 from router.compiler.expressions.tree import Binary, Call, Constant, Listed, Node, Operator, Variable, constant_of
 from router.compiler.expressions.tree import Each as Computed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
@@ -45,6 +45,7 @@ _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 
 def convert(value: Node, target: Type, scope: Scope) -> Plan:
     """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
+    want_readable(value)
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
     if isinstance(target, List):
@@ -263,26 +264,28 @@ def _to_string(value: Node, target: String) -> Node:
     if not isinstance(value.kind, StringKind):
         numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
         raise mismatch(value, target, "str() makes text of it" if numeric else "")
+    if target.wide:
+        hint = "leave it out, and it keeps its default; or declare it as a string"
+        raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions do not fill a wstring", hint)
     literal = constant_of(value)
     if isinstance(literal, str):
         _want_text(value, literal, target)
         return value
     if target.bound is None:
         return value
-    return _limited("fit_wide_text" if target.wide else "fit_text", value, StringKind(), target.bound)
+    return _limited("fit_text", value, StringKind(), target.bound)
 
 
 def _want_text(value: Node, text: str, target: String) -> None:
     """Raise ExpressionError if a literal cannot stand in the field."""
     try:
-        length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
+        length = len(text.encode())
     except UnicodeEncodeError as error:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is no character") from None
-    if not target.wide and "\0" in text:
+    if "\0" in text:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, "a string cannot hold a NUL")
     if target.bound is not None and length > target.bound:
-        unit = "characters" if target.wide else "bytes"
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} {unit} do not fit {target}")
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
 
 
 def _to_enum(value: Node, target: Enum) -> Node:
@@ -290,13 +293,26 @@ def _to_enum(value: Node, target: Enum) -> Node:
         case EnumKind(enum) if enum == target:
             return value
         case IntKind() as kind:
-            return _fit(value, kind, INT32)
+            return _member(_fit(value, kind, INT32), target)
         case StringKind() if isinstance(literal := constant_of(value), str):
             return Constant(EnumKind(target), value.span, _number_of(value, literal, target))
         case StringKind():
             return Call(EnumKind(target), value.span, "named", (value,))
         case _:
             raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
+
+
+def _member(value: Node, target: Enum) -> Node:
+    """A number as a value of the enum, refused at run time if a closed one does not have it."""
+    literal = constant_of(value)
+    if not target.is_closed:
+        return value
+    if literal is None:
+        return Call(EnumKind(target), value.span, "member", (value,))
+    if literal not in dict(target.values).values():
+        hint = f"it is closed: name one of its values, as {target.name}.{target.values[0][0]}"
+        raise ExpressionError(value.span, Code.UNKNOWN_ENUM_VALUE, f"'{target}' has no value {literal}", hint)
+    return value
 
 
 def _number_of(value: Node, name: str, target: Enum) -> int:

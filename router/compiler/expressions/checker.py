@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
     is_list,
 )
 from router.compiler.expressions.operators import constant
-from router.compiler.expressions.scope import ExpressionError, Scope, field_of
+from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
 from router.compiler.expressions.syntax import Parsed, dotted, forbidden
 from router.compiler.expressions.tree import (
     MESSAGE,
@@ -60,7 +60,7 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
     if expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
         return lists.list_of(items, expression.span)
-    text = Parsed(expression)
+    text = Parsed(expression, scope.field_names())
     return _Checker(text, scope).check(text.tree, expected)
 
 
@@ -233,7 +233,7 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> N
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
-        return field_of(scope.whole_message(span), member, span)
+        return _readable(field_of(scope.whole_message(span), member, span))
     if text in scope.given:
         return _given(text, span, scope)
     if text in ("true", "false"):  # as YAML spells them
@@ -324,7 +324,12 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         message = f"{holder.kind.type} has no field '{node.attr}'"
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
-    return field_of(holder, member, span)
+    return _readable(field_of(holder, member, span))
+
+
+def _readable(field: Read) -> Read:
+    want_readable(field)
+    return field
 
 
 def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
