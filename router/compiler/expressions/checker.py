@@ -136,7 +136,7 @@ def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scop
     if is_source(subject) and scope.sources and covered == {*scope.sources}:
         return
     if not isinstance(subject.kind, EnumKind):
-        message = f"a {subject.kind} has more values than those of this map"
+        message = f"{subject.kind} has more values than those of this map"
         raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
     missing = [name for name, number in subject.kind.enum.values if number not in covered]
     if missing:

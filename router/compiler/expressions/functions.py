@@ -219,7 +219,7 @@ def _clamped(nodes: Sequence[Node]) -> Kind:
         return _double(nodes)
     first, last = (float(end) for end in ends if end is not None)
     if first > last:
-        raise ValueError(f"the low bound {first} is above the high bound {last}")
+        raise ValueError(f"the low bound {ends[0]} is above the high bound {ends[1]}")
     return replace(_double(nodes), low=first, high=last)
 
 

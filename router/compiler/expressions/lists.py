@@ -81,8 +81,8 @@ def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
     """The length of all these lists, None if it is known of none."""
     lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
     if len(lengths) > 1:
-        message = f"these lists have {' and '.join(map(str, lengths))} elements"
-        hint = "lists are taken side by side, so they must have the same length"
+        message = f"lists of {' and '.join(map(str, lengths))} elements cannot go side by side"
+        hint = "give them one length"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return lengths[0] if lengths else None
 

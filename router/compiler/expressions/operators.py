@@ -74,7 +74,7 @@ def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False)
     kind, is_checked = within_64_bits(found, is_rounded)
     if kind is None or (is_checked and min(found) == max(found)):
         message = "an integer has 64 bits, and this one never fits"
-        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"the limits are {INT64.low} and {UINT64.high}")
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"they hold {INT64.low} to {UINT64.high}")
     return kind, is_checked
 
 
@@ -291,7 +291,7 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
     if isinstance(kind, MessageKind) or isinstance(element_of(kind), MessageKind):
-        message, hint = f"{kind} is not chosen as a whole", "choose at each field, as in a.x if c else b.x"
+        message, hint = f"a choice cannot give a whole {kind}", "choose at each field, as in a.x if c else b.x"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 

@@ -8,7 +8,7 @@ CONDITIONAL = "write `b if a else c`"
 LEFT_OUT = "a field that is left out keeps its default; `when` keeps a message from being sent"
 ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
-DECIMALS = "write text(x, 2): so many decimals"
+DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
 
 SQUARE = "write x ** 2; there is no power of bits"
