@@ -18,6 +18,7 @@ from router.compiler.cdr import CdrReads
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import (
+    INT64,
     BoolKind,
     FloatKind,
     IntKind,
@@ -211,6 +212,9 @@ def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
     assert ours == outcome(lambda: reference_bytes(fields, declared, context_of(message, SOURCE, [MODE]))), text
 
 
+ROUNDED = IntKind(INT64.low, INT64.high, is_rounded=True)
+
+
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
@@ -229,8 +233,8 @@ def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
         ("clamp(i32, i8, u8)", IntKind(-128, 255)),
         ("clamp(round(f64), 0, 9)", IntKind(0, 9)),
         ("wrap(i32, 0, 359)", IntKind(0, 359)),
-        ("wrap(i32, i8, u8)", IntKind(None, None)),
-        ("round(f32)", IntKind(None, None)),
+        ("wrap(i32, i8, u8)", IntKind(-128, 255)),
+        ("round(f32)", ROUNDED),
         ("int(flag) * 3", IntKind(0, 3)),
         ("u8 if flag else 1000", IntKind(0, 1000)),
         ("2 + 3 * 4", IntKind(14, 14)),
@@ -422,10 +426,9 @@ def evaluated(text: str, **given: Any) -> Any:
         ("len(boxes)", 2),
         ("boxes[1].area", 4.0),
         ("boxes[1].seen", -3_999_999_995),
-        ("(left if use_left else right).area", 1.0),
-        ("(right if use_left else left).seen", 2_000_000_005),
+        ("left.area if use_left else right.area", 1.0),
+        ("right.seen if use_left else left.seen", 2_000_000_005),
         ("[left, right][1].area", 2.0),
-        ("(message if use_left else message).right.area", 2.0),
     ],
 )
 def test_expression_over_a_serialized_message(text: str, value: object) -> None:
