@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from router.compiler.cdr import CdrReads
-from router.compiler.expressions import Reads, Typed
+from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.errors import SourceSpan
@@ -19,16 +18,14 @@ class CheckedTarget:
     """A target of a route, as the table declares it, with what its check has found.
 
     `endpoint` is that of a destination, `type` that of a topic which is published. Without a `plan` the datagram is
-    forwarded unchanged; `rows` show the mapping that the plan was made of. `reads` makes the variables of the
-    expressions; None where they are made once for all targets of the route. `deadmen` are the routes whose deadmen
-    are fed or disarmed by each command to it.
+    forwarded unchanged; `rows` show the mapping that the plan was made of. `deadmen` are the routes whose deadmen are
+    fed or disarmed by each command to it.
     """
 
     declared: Destination | Topic
     endpoint: Endpoint | None = None
     type: MessageType | None = None
-    reads: Reads | None = None
-    when: Typed | None = None
+    when: Node | None = None
     plan: Record | None = None
     rows: tuple[Row, ...] = ()
     priority: Priority = Priority.TELEMETRY
@@ -63,29 +60,27 @@ class CheckedTarget:
 class CheckedSubscription:
     """A topic that an outbound route subscribes to, with a target for each destination.
 
-    `reads` serves all expressions in it. `when` is the topic's own. With `for_each`, a list, `when` and the
-    targets are evaluated for each element: `item` and `index` of `count`. `stamp` is the message's `header.stamp`
-    (ns) where the route has a `ttl` and the type has the stamp.
+    `when` is the topic's own. With `for_each`, a list, `when` and the targets are evaluated for each element: `item`
+    and `index` of `count`. `stamp` is the message's `header.stamp` (ns) where the route has a `ttl` and the type has
+    the stamp.
     """
 
     topic: Topic
     type: MessageType
-    reads: CdrReads
-    when: Typed | None
-    for_each: Typed | None
-    stamp: Typed | None
+    when: Node | None
+    for_each: Node | None
+    stamp: Node | None
     targets: tuple[CheckedTarget, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedCollect:
-    """How the datagrams of a frame are grouped, counted and ordered. `reads` makes the variables of all three."""
+    """How the datagrams of a frame are grouped, counted and ordered."""
 
     span: SourceSpan
-    reads: Reads
-    by: Typed
-    count: Typed
-    order: Typed
+    by: Node
+    count: Node
+    order: Node
 
 
 @dataclass(frozen=True, slots=True)

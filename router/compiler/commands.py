@@ -19,7 +19,7 @@ from google.protobuf.message_factory import GetMessageClass
 from router.compiler.cdr.reading import LENGTH, Leap, Loop, Moment, Object, Step, Stretch, Take, Unpack
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.executors import CARRIER, Executor, Executors
-from router.compiler.expressions import Typed
+from router.compiler.expressions.tree import Node as Typed
 from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import call
@@ -161,6 +161,7 @@ def _is_urgent(route: Route, feed: CheckedSubscription) -> bool:
 
 def lower(route: Route, case: PayloadCase, feed: CheckedSubscription) -> Command:
     """Lower what a route makes of the messages of one topic. Raises NeedsPythonError."""
+    raise NeedsPythonError("typed trees are not lowered yet", feed.topic.span)
     if feed.for_each is not None:
         raise NeedsPythonError("`for_each` needs it", feed.for_each.span)
     if feed.when is not None:

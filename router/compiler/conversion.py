@@ -8,11 +8,10 @@ Every function raises ExpressionError where the value does not fit.
 
 from __future__ import annotations
 
-import ast
 import math
 
-from router.compiler.expressions import ExpressionError, Scope, Typed
-from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
+from router.compiler.expressions import ExpressionError, Scope
+from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, TIME_END, clamp
 from router.compiler.expressions.kinds import (
     INT32,
     OCTET,
@@ -28,8 +27,10 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     kind_of,
 )
+from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.tree import Binary, Call, Constant, Listed, Node, Operator, Variable, constant_of
+from router.compiler.expressions.tree import Each as Computed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.compiler.source import call, load, placed
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
@@ -40,7 +41,7 @@ _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 """Up to this many bits every integer is exactly a float of that width."""
 
 
-def convert(value: Typed, target: Type, scope: Scope) -> Plan:
+def convert(value: Node, target: Type, scope: Scope) -> Plan:
     """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
@@ -48,14 +49,14 @@ def convert(value: Typed, target: Type, scope: Scope) -> Plan:
         return _to_list(value, target, scope)
     if isinstance(value.kind, MessageKind) and len(value.kind.type.fields) == 1:
         (only,) = value.kind.type.fields
-        return convert(scope.field_of(value, only, value.span), target, scope)
+        return convert(field_of(value, only, value.span), target, scope)
     return Leaf(target, converted(value, target), value.span)
 
 
-def same_named(holder: Typed, member: Field, scope: Scope) -> Typed | None:
+def same_named(holder: Node, member: Field) -> Node | None:
     """The field of `holder` with the name of `member`, or None."""
     found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
-    return scope.field_of(holder, found, holder.span) if found else None
+    return field_of(holder, found, holder.span) if found else None
 
 
 def unset(member: Field, span: SourceSpan) -> Unset:
@@ -66,7 +67,7 @@ def unset(member: Field, span: SourceSpan) -> Unset:
 # messages
 
 
-def _to_message(value: Typed, target: MessageType, scope: Scope) -> Plan:
+def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
     if isinstance(value.kind, TimeKind) and target.name in _TIMES:
         return _to_time(value, target)
     if isinstance(value.kind, MessageKind):
@@ -79,19 +80,32 @@ def _to_message(value: Typed, target: MessageType, scope: Scope) -> Plan:
     raise mismatch(value, target, "map its fields one by one")
 
 
-def _to_time(value: Typed, target: MessageType) -> Record:
-    def part(member: Field, op: ast.operator) -> tuple[Field, Plan]:
-        made = ast.BinOp(value.node, op, ast.Constant(NS_PER_SECOND))
-        return member, Leaf(member.type, Typed.at(value.span, value.kind, made).node, value.span)
+def _to_time(value: Node, target: MessageType) -> Record:
+    def part(member: Field, operator: Operator, low: int, high: int) -> tuple[Field, Plan]:
+        divisor = Constant(IntKind(NS_PER_SECOND, NS_PER_SECOND), value.span, NS_PER_SECOND)
+        made = Binary(IntKind(low, high), value.span, operator, value, divisor)
+        return member, Leaf(member.type, _within(made, member.type), value.span)
 
     sec, nanosec = target.fields
-    return Record(target, (part(sec, ast.FloorDiv()), part(nanosec, ast.Mod())), value.span)
+    seconds = part(sec, Operator.FLOOR_DIVIDE, -TIME_END // NS_PER_SECOND, TIME_END // NS_PER_SECOND)
+    return Record(target, (seconds, part(nanosec, Operator.MODULO, 0, NS_PER_SECOND - 1)), value.span)
 
 
-def _to_same_named(value: Typed, source: MessageType, target: MessageType, scope: Scope) -> Record:
+def _within(value: Binary, target: Type) -> Node:
+    """The integer, refused at run time where it is outside of the field's range."""
+    assert isinstance(target, Int)  # noqa: S101 - times are made of integers
+    assert isinstance(value.kind, IntKind)  # noqa: S101
+    return (
+        value
+        if _fits(value.kind, target)
+        else _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
+    )
+
+
+def _to_same_named(value: Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
     members: list[tuple[Field, Plan]] = []
     for member in target.fields:
-        given = same_named(value, member, scope)
+        given = same_named(value, member)
         members.append((member, convert(given, member.type, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
         raise mismatch(value, target, "they have no field name in common")
@@ -101,8 +115,8 @@ def _to_same_named(value: Typed, source: MessageType, target: MessageType, scope
 # lists
 
 
-def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
-    if value.items is not None:
+def _to_list(value: Node, target: List, scope: Scope) -> Plan:
+    if isinstance(value, Listed):
         _want_length(value, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = _elements(value.kind)
@@ -110,9 +124,10 @@ def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
         raise mismatch(value, target, "write a list, [a, b]")
     if length is not None:
         _want_length(value, target, length)
-    variable = scope.reads.loop()
-    element = Typed.at(value.span, element_kind, load(variable))
-    return Each(target, value.node, variable, convert(element, target.element, scope), value.span)
+    if isinstance(value, Computed):
+        return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
+    element = Variable(element_kind, value.span, scope.element_variable())
+    return Each(target, ((element.name, value),), convert(element, target.element, scope), value.span)
 
 
 def _elements(kind: Kind) -> tuple[Kind | None, int | None]:
@@ -122,7 +137,7 @@ def _elements(kind: Kind) -> tuple[Kind | None, int | None]:
     return (kind.element, kind.length) if isinstance(kind, ListKind) else (None, None)
 
 
-def _want_length(value: Typed, target: List, length: int) -> None:
+def _want_length(value: Node, target: List, length: int) -> None:
     if target.length is not None and length != target.length:
         raise ExpressionError(value.span, Code.TYPE_MISMATCH, f"{target} takes {target.length} elements, not {length}")
     if target.bound is not None and length > target.bound:
@@ -134,7 +149,7 @@ def _want_length(value: Typed, target: List, length: int) -> None:
 # scalars
 
 
-def converted(value: Typed, target: Type) -> ast.expr:
+def converted(value: Node, target: Type) -> Node:
     """The expression that fills a scalar field. Raises ExpressionError when it does not fit."""
     _want_finite(value, target)
     match target:
@@ -154,35 +169,36 @@ def converted(value: Typed, target: Type) -> ast.expr:
             raise AssertionError(f"{target} is no scalar")
 
 
-def _want_finite(value: Typed, target: Type) -> None:
+def _want_finite(value: Node, target: Type) -> None:
     """Raise ExpressionError if `nan` or `inf` would fill what is no float."""
-    if isinstance(value.constant, float) and not isinstance(target, Float) and not math.isfinite(value.constant):
-        hint = f"text has quotes of its own: \"'{value.constant}'\"" if isinstance(target, String) else ""
-        message = f"{value.constant} does not fill {target}"
+    literal = constant_of(value)
+    if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
+        hint = f"text has quotes of its own: \"'{literal}'\"" if isinstance(target, String) else ""
+        message = f"{literal} does not fill {target}"
         raise ExpressionError(
             value.span, Code.TYPE_MISMATCH, message, hint or "only a float field holds it: write a value"
         )
 
 
-def mismatch(value: Typed, target: Type, hint: str = "") -> ExpressionError:
+def mismatch(value: Node, target: Type, hint: str = "") -> ExpressionError:
     """The error for a value whose kind cannot fill the type."""
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 
-def _to_bool(value: Typed, target: Bool) -> ast.expr:
+def _to_bool(value: Node, target: Bool) -> Node:
     if isinstance(value.kind, BoolKind):
-        return value.node
-    if value.constant in (0, 1):
-        raise mismatch(value, target, f"write {'true' if value.constant else 'false'}")
+        return value
+    if (literal := constant_of(value)) in (0, 1):
+        raise mismatch(value, target, f"write {'true' if literal else 'false'}")
     raise mismatch(value, target, "compare it, as in x != 0" if isinstance(value.kind, (IntKind, FloatKind)) else "")
 
 
-def _to_int(value: Typed, target: Int) -> ast.expr:
+def _to_int(value: Node, target: Int) -> Node:
     match value.kind:
         case EnumKind():
             return _saturate(value, target)
-        case IntKind(bounds=bounds):
-            return _fit(value, target, bounds)
+        case IntKind() as kind:
+            return _fit(value, kind, target)
         case FloatKind():
             hint = "say how: round() or trunc()"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a float does not fit {target}", hint)
@@ -194,24 +210,27 @@ def _to_int(value: Typed, target: Int) -> ast.expr:
             raise mismatch(value, target)
 
 
-def _saturate(value: Typed, target: Int) -> ast.expr:
-    """An enum limited to an integer's range: one comparison, and a call only for a value outside."""
-    if target.low <= INT32.low and INT32.high <= target.high:
-        return value.node
-    if isinstance(value.constant, int):
-        return placed(ast.Constant(clamp(value.constant, target.low, target.high)), value.span)
-    bind = ast.NamedExpr(ast.Name("v", ast.Store()), value.node)
-    inside = ast.Compare(ast.Constant(target.low), [ast.LtE(), ast.LtE()], [bind, ast.Constant(target.high)])
-    clamped = call("clamp", load("v"), ast.Constant(target.low), ast.Constant(target.high))
-    return placed(ast.IfExp(inside, load("v"), clamped), value.span)
+def _saturate(value: Node, target: Int) -> Node:
+    """An enum limited to an integer's range."""
+    if _fits(IntKind(INT32.low, INT32.high), target):
+        return value
+    kind = IntKind(max(INT32.low, target.low), min(INT32.high, target.high))
+    literal = constant_of(value)
+    if isinstance(literal, int):
+        return Constant(kind, value.span, int(clamp(literal, target.low, target.high)))
+    return _limited("clamp", value, kind, target.low, target.high)
 
 
-def _fit(value: Typed, target: Int, bounds: tuple[int, int] | None) -> ast.expr:
-    if bounds is None:
-        return _limited("fit", value, target.low, target.high)
-    low, high = bounds
-    if target.low <= low and high <= target.high:
-        return value.node
+def _fits(kind: IntKind, target: Int) -> bool:
+    return kind.bounds is not None and target.low <= kind.bounds[0] and kind.bounds[1] <= target.high
+
+
+def _fit(value: Node, kind: IntKind, target: Int) -> Node:
+    if kind.bounds is None:
+        return _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
+    if _fits(kind, target):
+        return value
+    low, high = kind.bounds
     if high < target.low or low > target.high:
         limits = f"{target.low}..{target.high}"
         raise ExpressionError(
@@ -221,20 +240,20 @@ def _fit(value: Typed, target: Int, bounds: tuple[int, int] | None) -> ast.expr:
     raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
 
 
-def _to_float(value: Typed, target: Float) -> ast.expr:
+def _to_float(value: Node, target: Float) -> Node:
     limit = 1 << _EXACT_INTEGER_BITS[target.bits]
     match value.kind:
         case FloatKind(bits):
-            literal = value.constant if isinstance(value.constant, float) else 0.0
-            if target.bits == 32 and FLOAT32_END <= abs(literal) < math.inf:
+            literal = constant_of(value)
+            if target.bits == 32 and isinstance(literal, float) and FLOAT32_END <= abs(literal) < math.inf:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{literal!r} does not fit float32")
             if bits > target.bits:
                 hint = "float32() says that losing digits is meant"
                 raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)
-            return value.node
+            return value
         case IntKind(bounds=bounds):
             if bounds is None or (-limit <= bounds[0] and bounds[1] <= limit):
-                return value.node
+                return value
             hint = f"float{target.bits}() says that losing digits is meant"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
         case EnumKind() | BoolKind():
@@ -245,19 +264,20 @@ def _to_float(value: Typed, target: Float) -> ast.expr:
             raise mismatch(value, target)
 
 
-def _to_string(value: Typed, target: String) -> ast.expr:
+def _to_string(value: Node, target: String) -> Node:
     if not isinstance(value.kind, StringKind):
         numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
         raise mismatch(value, target, "str() makes text of it" if numeric else "")
-    if isinstance(value.constant, str):
-        _want_text(value, value.constant, target)
-        return value.node
+    literal = constant_of(value)
+    if isinstance(literal, str):
+        _want_text(value, literal, target)
+        return value
     if target.bound is None:
-        return value.node
-    return _limited("fit_wide_text" if target.wide else "fit_text", value, target.bound)
+        return value
+    return _limited("fit_wide_text" if target.wide else "fit_text", value, StringKind(), target.bound)
 
 
-def _want_text(value: Typed, text: str, target: String) -> None:
+def _want_text(value: Node, text: str, target: String) -> None:
     """Raise ExpressionError if a literal cannot stand in the field."""
     try:
         length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
@@ -270,21 +290,21 @@ def _want_text(value: Typed, text: str, target: String) -> None:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} {unit} do not fit {target}")
 
 
-def _to_enum(value: Typed, target: Enum) -> ast.expr:
+def _to_enum(value: Node, target: Enum) -> Node:
     match value.kind:
         case EnumKind(enum) if enum == target:
-            return value.node
-        case IntKind(bounds=bounds):
-            return _fit(value, INT32, bounds)
-        case StringKind() if isinstance(value.constant, str):
-            return placed(ast.Constant(_number_of(value, value.constant, target)), value.span)
+            return value
+        case IntKind() as kind:
+            return _fit(value, kind, INT32)
+        case StringKind() if isinstance(literal := constant_of(value), str):
+            return Constant(EnumKind(target), value.span, _number_of(value, literal, target))
         case StringKind():
-            return value.node  # protobuf takes names for numbers, and refuses those that it does not know
+            return Call(EnumKind(target), value.span, "named", (value,))
         case _:
             raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
 
 
-def _number_of(value: Typed, name: str, target: Enum) -> int:
+def _number_of(value: Node, name: str, target: Enum) -> int:
     numbers = dict(target.values)
     if name not in numbers:
         hint = did_you_mean(name, numbers)
@@ -292,19 +312,20 @@ def _number_of(value: Typed, name: str, target: Enum) -> int:
     return numbers[name]
 
 
-def _to_bytes(value: Typed, target: Bytes) -> ast.expr:
+def _to_bytes(value: Node, target: Bytes) -> Node:
+    made = value
     match value.kind:
         case BytesKind():
-            made = value
+            pass
         case ListKind(element, length) if element is None or _is_octet(element):
             if target.bound is not None and length is not None and length > target.bound:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
-            made = Typed.at(value.span, BytesKind(), call("bytes", value.node))
+            made = Call(BytesKind(), value.span, "octets", (value,))
         case ListKind():
             raise mismatch(value, target, f"bytes are integers {OCTET.low}..{OCTET.high}")
         case _:
             raise mismatch(value, target)
-    return made.node if target.bound is None else _limited("fit_text", made, target.bound)
+    return made if target.bound is None else _limited("fit_text", made, BytesKind(), target.bound)
 
 
 def _is_octet(kind: Kind) -> bool:
@@ -314,6 +335,7 @@ def _is_octet(kind: Kind) -> bool:
     return kind.bounds is None or OCTET.low <= kind.bounds[0] <= kind.bounds[1] <= OCTET.high
 
 
-def _limited(function: str, value: Typed, *limits: int) -> ast.expr:
-    """The value, checked at run time by a function of `namespace`."""
-    return placed(call(function, value.node, *map(ast.Constant, limits)), value.span)
+def _limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
+    """The value within limits, which are checked at run time."""
+    bounds = (Constant(IntKind(limit, limit), value.span, limit) for limit in limits)
+    return Call(kind, value.span, function, (value, *bounds))

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
-from router.compiler.expressions import ParsedReads
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -249,7 +248,7 @@ def constant_plan(
 
     Expressions can name the constants of `ros_type`.
     """
-    scope = replace(lookup.scope(_NOTHING, ParsedReads(), ros_type), given=())
+    scope = replace(lookup.scope(_NOTHING, ros_type), given=())
     mapping = build(fields, target, scope, span)
     findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
     lookup.findings += findings

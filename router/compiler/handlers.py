@@ -11,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from router.compiler.cdr import write_message
+from router.compiler.cdr import CdrReads, write_message
 from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
-from router.compiler.expressions import Typed
+from router.compiler.expressions.tree import Node, paths_in
 from router.compiler.metrics import Counters
 from router.compiler.payload import write_envelope
+from router.compiler.plan import expressions
+from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
 from router.table.model import OnLimit, Route
@@ -35,6 +37,14 @@ def function_name(route: Route) -> str:
     return f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
 
 
+def _reads(subscription: CheckedSubscription) -> CdrReads:
+    """What the expressions of a subscription read."""
+    nodes = [subscription.for_each, subscription.stamp, subscription.when]
+    for target in subscription.targets:
+        nodes += [target.when, *(expressions(target.plan) if target.plan is not None else ())]
+    return CdrReads(subscription.type, (path for node in nodes if node is not None for path in paths_in(node)))
+
+
 class HandlerSource:
     """The source of `def route_NAME(MESSAGE, received_at, now, source)` for one route, with the targets that it serves.
 
@@ -47,6 +57,7 @@ class HandlerSource:
         self.case = case
         self.counters = counters
         self.out = Source()
+        self.values: Values = NO_VALUES
 
     def inbound(self, named: Sequence[NamedTarget], collect: CheckedCollect | None) -> None:
         """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames."""
@@ -66,11 +77,13 @@ class HandlerSource:
         """The message is read once for all destinations. With `for_each`, each element is served as a message."""
         span, for_each = subscription.topic.span, subscription.for_each
         one_received = self._received(subscription, "1")
+        reads = _reads(subscription)
+        self.values = reads.values
         with self._function("cdr"):
             with self.out.block("try:", span):
-                subscription.reads.write(self.out, span)
+                reads.write(self.out, span)
                 if for_each is not None:
-                    self.out.line(f"elements = {self.out.expression(for_each.node)}", for_each.span)
+                    self.out.line(f"elements = {self._expression(for_each)}", for_each.span)
             self._all_lost(named, span, one_received)
             if subscription.stamp is not None:
                 self._born(subscription.stamp)
@@ -95,11 +108,14 @@ class HandlerSource:
         with self.out.block(f"def {function_name(self.route)}({', '.join(parameters)}):", self.route.span):
             yield
 
+    def _expression(self, node: Node) -> str:
+        return self.out.expression(render(node, self.values))
+
     # the age of the message
 
-    def _born(self, stamp: Typed) -> None:
+    def _born(self, stamp: Node) -> None:
         """The age counts from the stamp where the message has one, else from its arrival."""
-        value = self.out.expression(stamp.node)
+        value = self._expression(stamp)
         with self.out.block(f"if {value}:", stamp.span):
             self.out.line(f"born = born.or_before(stamped({value}, received_at, now))", stamp.span)
 
@@ -122,8 +138,7 @@ class HandlerSource:
         span = collect.span
         self.out.line("# collect", span)
         with self.out.block("try:", span):
-            collect.reads.write(self.out, span)
-            by, count, order = (self.out.expression(typed.node) for typed in (collect.by, collect.count, collect.order))
+            by, count, order = map(self._expression, (collect.by, collect.count, collect.order))
             self.out.line(f"items = collect(now, (source, {by}), {count}, {order}, m)", span)
         self._all_lost(topics, span)
         with self.out.block("if items is None:", span):
@@ -132,7 +147,7 @@ class HandlerSource:
 
     # targets
 
-    def _serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
+    def _serve(self, targets: Sequence[NamedTarget], when: Node | None = None) -> None:
         """Append the lines that serve targets. `when` is a condition for all of them, beside their own."""
         for name, target in targets:
             self.out.line(f"# {'topic' if target.topic else 'destination'} {target.label}", target.span)
@@ -158,13 +173,11 @@ class HandlerSource:
         self,
         name: str,
         target: CheckedTarget,
-        conditions: Sequence[Typed],
+        conditions: Sequence[Node],
         deliver: Deliver,
     ) -> None:
         """A failure of one target is counted for it and does not affect the others."""
         with self.out.block("try:", target.span):
-            if target.reads is not None:
-                target.reads.write(self.out, target.span)
             self._conditional(name, target, conditions, deliver)
         with self.out.block("except FAILURES as error:", target.span):
             self.out.line(f"lost_{name}(error)", target.span)
@@ -173,13 +186,13 @@ class HandlerSource:
         self,
         name: str,
         target: CheckedTarget,
-        conditions: Sequence[Typed],
+        conditions: Sequence[Node],
         deliver: Deliver,
     ) -> None:
         """Serve the target if each `when` is true, the message is not older than `ttl`, and `max_rate` allows it."""
         word = "if"
         for condition in conditions:
-            with self.out.block(f"{word} not {self.out.expression(condition.node)}:", condition.span):
+            with self.out.block(f"{word} not {self._expression(condition)}:", condition.span):
                 self._count("messages_filtered", target)
             word = "elif"
         if self.route.ttl:
@@ -205,9 +218,9 @@ class HandlerSource:
         if target.plan is None:
             data = "datagram"
         elif target.topic:
-            return write_message(self.out, target.plan, name)
+            return write_message(self.out, target.plan, name, self.values)
         else:
-            data = write_envelope(self.out, target.plan, self.case, name)
+            data = write_envelope(self.out, target.plan, self.case, name, self.values)
         return f"trimmed({data})" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
 
     def _send(self, name: str, target: CheckedTarget) -> None:

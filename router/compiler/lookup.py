@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from router.compiler.expressions import ExpressionError, Reads, Scope, Typed, check
+from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind, Kind
+from router.compiler.expressions.tree import Node
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
 from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, Route, RouteTable, Topic
@@ -56,7 +57,7 @@ class Definitions:
 
 _ALIKE = 0.8
 """How near the names of two endpoints are for one to be suggested in place of the other: commands go there."""
-NO_NAMES: Mapping[str, Typed] = {}
+NO_NAMES: Mapping[str, Node] = {}
 
 
 @dataclass(slots=True)
@@ -139,9 +140,8 @@ class Lookup:
     def scope(
         self,
         message: MessageType,
-        reads: Reads,
         ros_type: MessageType | None = None,
-        names: Mapping[str, Typed] = NO_NAMES,
+        names: Mapping[str, Node] = NO_NAMES,
         route: Route | None = None,
     ) -> Scope:
         """The scope of expressions over `message`, with the constants of `ros_type` and of the types in it.
@@ -151,22 +151,22 @@ class Lookup:
         nested = tuple(nested_types(ros_type)) if ros_type else ()
         sources = tuple(source.value for source in route.sources) if route else ()
         known = () if ANY in sources else sources
-        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names, sources=known)
+        return Scope(message, tuple(self.schema.enums.values()), nested, names, sources=known)
 
     def value(
         self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
-    ) -> Typed | None:
+    ) -> Node | None:
         """A checked expression of one of `kinds`, or None with a finding that begins with `wanted`."""
         try:
-            typed = check(expression, scope)
-            if not isinstance(typed.kind, kinds):
-                raise ExpressionError(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}", hint)
+            node = check(expression, scope)
+            if not isinstance(node.kind, kinds):
+                raise ExpressionError(node.span, Code.TYPE_MISMATCH, f"{wanted}, not {node.kind}", hint)
         except ExpressionError as error:
             self.findings.append(error.diagnostic)
             return None
-        return typed
+        return node
 
-    def when(self, expression: Expression | None, scope: Scope) -> Typed | None:
+    def when(self, expression: Expression | None, scope: Scope) -> Node | None:
         if expression is None:
             return None
         hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Union
 
 from router.compiler.conversion import convert, same_named, unset
-from router.compiler.expressions import ExpressionError, Scope, Typed, check
+from router.compiler.expressions import ExpressionError, Scope, check
+from router.compiler.expressions.tree import Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
@@ -67,7 +68,7 @@ def build(
     target: MessageType,
     scope: Scope,
     span: SourceSpan,
-    whole: Typed | None = None,
+    whole: Node | None = None,
     ros_type: MessageType | None = None,
 ) -> FieldMapping:
     """Map a message of type `target`. `span` is the position of findings that concern no single entry.
@@ -183,16 +184,16 @@ class _Builder:
 
     # plans
 
-    def record(self, branch: _Branch, automatic: Typed | None, prefix: str) -> Record:
+    def record(self, branch: _Branch, automatic: Node | None, prefix: str) -> Record:
         members = [
             (member, self._member(member, branch.given.get(member.name), automatic, prefix))
             for member in branch.type.fields
         ]
         return Record(branch.type, tuple(members), self.span)
 
-    def _member(self, member: Field, given: FieldEntry | _Branch | None, automatic: Typed | None, prefix: str) -> Plan:
+    def _member(self, member: Field, given: FieldEntry | _Branch | None, automatic: Node | None, prefix: str) -> Plan:
         path = prefix + member.name
-        source = same_named(automatic, member, self.scope) if automatic else None
+        source = same_named(automatic, member) if automatic else None
         if isinstance(given, FieldEntry):
             return self._explicit(member, given, path)
         if given is not None:
@@ -226,7 +227,7 @@ class _Builder:
                 return error.diagnostic
         return None
 
-    def _automatic(self, member: Field, source: Typed, path: str) -> Plan:
+    def _automatic(self, member: Field, source: Node, path: str) -> Plan:
         try:
             plan = convert(source, member.type, self.scope)
         except ExpressionError as error:

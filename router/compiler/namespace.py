@@ -5,7 +5,7 @@ A value that a field cannot hold raises MappingError.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
 from typing import Any, NamedTuple, TypeVar
 
 from router.compiler.cdr.primitives import (
@@ -17,12 +17,12 @@ from router.compiler.cdr.primitives import (
     put_numbers,
     put_text,
     put_wide_text,
+    read_text,
+    read_texts,
+    read_wide_text,
+    read_wide_texts,
     refuse,
-    text,
-    texts,
     want_length,
-    wide_text,
-    wide_texts,
 )
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.source import Source
@@ -90,10 +90,61 @@ def fit_length(values: Values, least: int, most: int) -> Values:
     raise MappingError(f"{len(values)} elements where {wanted} fit")
 
 
+def named(name: str, values: Mapping[str, int]) -> int:
+    """Return the value of an enum that has this name."""
+    if name in values:
+        return values[name]
+    raise MappingError(f"no value is called {name!r}")
+
+
+def member(x: int, values: Collection[int]) -> int:
+    """Return a number that is a value of a closed enum."""
+    if x in values:
+        return x
+    raise MappingError(f"{x} is no value of the enum")
+
+
+def octets(values: Iterable[int]) -> bytes:
+    """Return integers as bytes. Raises ValueError for one outside of 0 to 255."""
+    return bytes(values)
+
+
+# lists
+
+
+def side_by_side(*lists: Sequence[object]) -> list[tuple[object, ...]]:
+    """Return the first elements of all lists, the second ones, and so on."""
+    if len({len(each) for each in lists}) > 1:
+        raise MappingError(f"lists of {' and '.join(str(len(each)) for each in lists)} elements, side by side")
+    return list(zip(*lists, strict=True))
+
+
+def contains(sought: object, values: Iterable[object]) -> bool:
+    """Return whether a value equals one of a list; NaN equals nothing."""
+    return any(value == sought for value in values)
+
+
+def total(values: Iterable[float]) -> float:
+    """Return the sum of floats, added one after the other."""
+    result = 0.0
+    for value in values:
+        result += value
+    return result
+
+
+def whole_total(values: Iterable[int], low: int, high: int) -> int:
+    """Return the sum of integers. No sum on the way may be outside of `low` to `high`."""
+    result = 0
+    for value in values:
+        result = fit(result + value, low, high)
+    return result
+
+
 _CALLED = (
-    checked_text, checked_texts, entries, fit, fit_length, fit_text, fit_wide_text,
+    checked_text, checked_texts, entries, fit, fit_length, fit_text, fit_wide_text, named, member, octets,
+    side_by_side, contains, total, whole_total,
     put_text, put_wide_text, put_numbers, put_length, want_length,
-    refuse, cut_off, text, texts, wide_text, wide_texts, numbers,
+    refuse, cut_off, read_text, read_texts, read_wide_text, read_wide_texts, numbers,
 )  # fmt: skip
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},

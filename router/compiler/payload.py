@@ -11,8 +11,10 @@ import keyword
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from router.compiler.expressions.tree import Call, Constant, Element, Node, Read, Variable
 from router.compiler.namespace import constant_bytes
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.compiler.python import NO_VALUES, Values, lists_of, render
 from router.compiler.source import Source, attribute, call, load, placed
 from router.types.model import Field, Float
 from router.types.protobuf import PayloadCase
@@ -22,10 +24,11 @@ _ONE_BYTE = 128
 """Lengths below this are varints of one byte."""
 
 
-def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str) -> str:
+def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str, values: Values = NO_VALUES) -> str:
     """Append the code that builds a payload, and return the expression that is the bytes of its envelope.
 
-    `name` is part of the names that the code calls, and different for each payload of a function.
+    `name` is part of the names that the code calls, and different for each payload of a function. `values` are the
+    fields that were read.
     """
     methods = case.message_class  # called on the class: a field may have the name of a method
     make = out.constant(f"make_{name}", case.message_class)
@@ -34,7 +37,7 @@ def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str) -> s
     clear = out.constant(f"clear_{name}", methods.Clear)
     envelope = out.constant(f"envelope_{name}", _envelope(case.number))
     out.line(f"payload = {make}()", plan.span)
-    _Writer(out, present, clear).fill("payload", plan)
+    _Writer(out, present, clear, values).fill("payload", plan)
     return f"{envelope}({serialize}(payload))"
 
 
@@ -70,6 +73,7 @@ class _Writer:
     out: Source
     present: str
     clear: str
+    values: Values
     computed: set[str] = field(default_factory=lambda: {"item"})
 
     def fill(self, holder: str, plan: Record) -> None:
@@ -111,16 +115,16 @@ class _Writer:
                 self.fill(inner, element)
 
     def _add_each(self, where: str, inner: str, each: Each) -> None:
-        values = self._values(each)
-        if not _is_read(each.values, self.computed):
-            self.computed.add(each.variable)
+        names, values = self._lists(each)
+        self.computed.update(name for name, read in each.lists if not _is_read(read, self.computed))
         if not isinstance(each.element, Leaf):
-            with self.out.block(f"for {each.variable} in {values}:", each.span):
+            with self.out.block(f"for {names} in {values}:", each.span):
                 self._add(where, inner, each.element)
             return
         value = self._value(each.element)
-        if not (isinstance(each.element.node, ast.Name) and self._is_fit(each.element)):
-            values = f"[{value} for {each.variable} in {values}]"
+        node = each.element.node
+        if not (isinstance(node, Variable) and node.name == names and self._is_fit(each.element)):
+            values = f"[{value} for {names} in {values}]"
         self.out.line(f"{where}.extend({values})", each.span)
 
     def _put(self, where: str, inner: str, entry: Record) -> None:
@@ -139,29 +143,31 @@ class _Writer:
     # values
 
     def _value(self, leaf: Leaf) -> str:
-        node = leaf.node if self._is_fit(leaf) else placed(call("float32", leaf.node), leaf.span)
-        return self.out.expression(node)
+        made = render(leaf.node, self.values)
+        return self.out.expression(made if self._is_fit(leaf) else placed(call("float32", made), leaf.span))
 
     def _is_fit(self, leaf: Leaf) -> bool:
         """Whether protobuf takes the value as it is: it turns what is too large for a float32 into infinity."""
         return leaf.type != Float(32) or _is_read(leaf.node, self.computed)
 
-    def _values(self, each: Each) -> str:
+    def _lists(self, each: Each) -> tuple[str, str]:
+        """The variables of a loop, and what it iterates over."""
+        names, values = lists_of(each.lists, self.values)
         length, bound = each.type.length, each.type.bound
-        if length is None and bound is None:
-            return self.out.expression(each.values)
-        limits = (0, bound) if length is None else (length, length)
-        return self.out.expression(placed(call("fit_length", each.values, *map(ast.Constant, limits)), each.span))
+        if length is not None or bound is not None:
+            limits = (0, bound) if length is None else (length, length)
+            values = call("fit_length", values, *map(ast.Constant, limits))
+        return names, self.out.expression(placed(values, each.span))
 
 
-def _is_read(node: ast.expr, computed: set[str]) -> bool:
+def _is_read(node: Node, computed: set[str]) -> bool:
     """Whether the value was read from a field, or checked: where a float32 is filled, it is one already."""
     match node:
-        case ast.Constant() | ast.Attribute() | ast.Call(func=ast.Name("float32")):
+        case Constant() | Read() | Call(function="float32"):
             return True
-        case ast.Name(name):
+        case Variable(name=name):
             return name not in computed
-        case ast.Subscript(value=values):
+        case Element(values=values):
             return _is_read(values, computed)
         case _:
             return False

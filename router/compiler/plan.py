@@ -1,14 +1,15 @@
 """The plan of a message: a tree with its structure that says where the value of each field comes from.
 
-`mapping` makes plans; `cdr.writing` and `payload` generate code of them.
+`mapping` makes plans; `lowering`, `cdr.writing` and `payload` turn them into code.
 """
 
 from __future__ import annotations
 
-import ast
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Union
 
+from router.compiler.expressions.tree import Node, constant_of
 from router.errors import SourceSpan
 from router.types.model import Field, List, MessageType, Type
 
@@ -18,12 +19,12 @@ class Leaf:
     """One scalar, which `node` computes; `constant` is its value if that is known at compile time."""
 
     type: Type
-    node: ast.expr
+    node: Node
     span: SourceSpan
 
     @property
-    def constant(self) -> object:
-        return self.node.value if isinstance(self.node, ast.Constant) else None
+    def constant(self) -> bool | int | float | str | None:
+        return constant_of(self.node)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +47,13 @@ class Items:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list made of a list (or bytes) `values`: `element` fills one element from the variable `variable`."""
+    """A list made of one or more lists (or bytes), side by side: `element` fills one element from the variables.
+
+    `lists` have the variable that an element of each is bound to. Lists of different length are refused at run time.
+    """
 
     type: List
-    values: ast.expr
-    variable: str
+    lists: tuple[tuple[str, Node], ...]
     element: Plan
     span: SourceSpan
 
@@ -65,3 +68,21 @@ class Unset:
 
 
 Plan = Union[Leaf, Record, Items, Each, Unset]
+
+
+def expressions(plan: Plan) -> Iterator[Node]:
+    """All expressions of a plan."""
+    match plan:
+        case Leaf():
+            yield plan.node
+        case Record():
+            for _, member in plan.members:
+                yield from expressions(member)
+        case Items():
+            for item in plan.items:
+                yield from expressions(item)
+        case Each():
+            yield from (values for _, values in plan.lists)
+            yield from expressions(plan.element)
+        case Unset():
+            pass

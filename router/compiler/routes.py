@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from router.compiler.cdr.reading import CdrReads
 from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.deadmen import check_deadman, deadmen_of
-from router.compiler.expressions import ParsedReads, Scope, Typed
+from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
+from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
-from router.compiler.source import load
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
@@ -139,12 +139,10 @@ def _forward(
     if destination.fields is not None:
         message, hint = "a datagram is forwarded unchanged", "'fields' is for messages that come from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
-    reads = ParsedReads()
-    when = lookup.when(destination.when, lookup.scope(case.type, reads, route=route))
+    when = lookup.when(destination.when, lookup.scope(case.type, route=route))
     return CheckedTarget(
         destination,
         endpoint=endpoint,
-        reads=reads,
         when=when,
         priority=_priority(route, endpoint),
         deadmen=deadmen_of(lookup.table, route, destination),
@@ -152,35 +150,35 @@ def _forward(
 
 
 def _publish(
-    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Typed]
+    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Node]
 ) -> CheckedTarget:
-    reads = ParsedReads()
-    scope = lookup.scope(case.type, reads, ros_type, names, route)
+    scope = lookup.scope(case.type, ros_type, names, route)
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
     lookup.findings += mapping.findings
-    return CheckedTarget(topic, type=ros_type, reads=reads, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
+    return CheckedTarget(topic, type=ros_type, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
 
 
-def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
+def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:
     """What expressions of topics see beside the fields of a frame's first part."""
-    items = Typed.at(span, ListKind(MessageKind(case.type)), load("items"))
-    return {"items": items, "count": Typed.at(span, UINT32, load("count"))}
+    return {
+        ITEMS: Variable(ListKind(MessageKind(case.type)), span, ITEMS),
+        COUNT: Variable(UINT32, span, COUNT),
+    }
 
 
 def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) -> CheckedCollect | None:
     if not route.topics and route.destinations:
         message = "'collect' puts frames together for topics, and there are none"
         lookup.report(collect.span, Code.UNKNOWN_KEY, message, "destinations get each datagram as it came")
-    reads = ParsedReads()
-    scope = lookup.scope(case.type, reads)
+    scope = lookup.scope(case.type)
     names = (IntKind, EnumKind, StringKind, BoolKind)
     by = lookup.value(collect.by, scope, names, "'by' takes what can name a frame: an integer or a string")
     count = lookup.value(collect.count, scope, (IntKind,), "'count' takes an integer")
     order = lookup.value(collect.order, scope, (IntKind,), "'order' takes an integer")
     if by is None or count is None or order is None:
         return None
-    return CheckedCollect(collect.span, reads, by, count, order)
+    return CheckedCollect(collect.span, by, count, order)
 
 
 # from ROS
@@ -208,22 +206,21 @@ def _subscription(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
 ) -> CheckedSubscription | None:
     """A topic with its targets. None if the type of `item` is unknown, since every use of it would be a finding."""
-    reads = CdrReads(ros_type)
-    scope = lookup.scope(ros_type, reads, ros_type)
+    scope = lookup.scope(ros_type, ros_type)
     stamp = _stamp(scope, topic.span) if route.ttl else None
     for_each = None
     if route.for_each is not None:
         for_each = _elements(lookup, route.for_each, scope)
         if for_each is None:
             return None
-        scope = lookup.scope(ros_type, reads, ros_type, _element_names(for_each))
+        scope = lookup.scope(ros_type, ros_type, _element_names(for_each))
     when = lookup.when(topic.when, scope)
     own = any(destination.fields for destination, _ in found)  # then the route need not have any
     targets = []
     for destination, endpoint in found:
         condition = lookup.when(destination.when, scope)
         fields = destination.fields or route.fields
-        whole = scope.variable("item", route.span) if for_each else None
+        whole = scope.variable(ITEM, route.span) if for_each else None
         span = destination.span if own else route.span
         mapping = build(fields, case.type, scope, span, whole, _element_type(for_each) if for_each else ros_type)
         lookup.findings += mapping.findings
@@ -237,41 +234,41 @@ def _subscription(
             deadmen=deadmen_of(lookup.table, route, destination),
         )
         targets.append(target)
-    return CheckedSubscription(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
+    return CheckedSubscription(topic, ros_type, when, for_each, stamp, tuple(targets))
 
 
-def _element_type(elements: Typed) -> MessageType | None:
+def _element_type(elements: Node) -> MessageType | None:
     """The message type of the elements of `for_each`, None if they are no messages."""
     element = elements.kind.element if isinstance(elements.kind, ListKind) else None
     return element.type if isinstance(element, MessageKind) else None
 
 
-def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:
+def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
     """The field `header.stamp`, or None."""
     header = scope.message.field("header")
     if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
         return None
     stamp = header.type.field("stamp")
-    return scope.read(("header",), stamp, span) if stamp else None
+    return field_of(field_of(scope.whole_message(span), header, span), stamp, span) if stamp else None
 
 
-def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Typed | None:
+def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | None:
     """The list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
-    typed = lookup.value(expression, scope, (ListKind,), "'for_each' takes a list")
-    if typed is not None and isinstance(typed.kind, ListKind) and typed.kind.element is None:
-        lookup.report(typed.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
+    node = lookup.value(expression, scope, (ListKind,), "'for_each' takes a list")
+    if node is not None and isinstance(node.kind, ListKind) and node.kind.element is None:
+        lookup.report(node.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
         return None
-    return typed
+    return node
 
 
-def _element_names(elements: Typed) -> dict[str, Typed]:
+def _element_names(elements: Node) -> dict[str, Node]:
     """What expressions see beside the fields of the message, with `for_each`."""
     assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
     assert elements.kind.element is not None  # noqa: S101
     return {
-        "item": Typed.at(elements.span, elements.kind.element, load("item")),
-        "index": Typed.at(elements.span, UINT32, load("index")),
-        "count": Typed.at(elements.span, UINT32, load("count")),
+        ITEM: Variable(elements.kind.element, elements.span, ITEM),
+        INDEX: Variable(UINT32, elements.span, INDEX),
+        COUNT: Variable(UINT32, elements.span, COUNT),
     }
 
 

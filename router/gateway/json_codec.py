@@ -7,7 +7,6 @@ Structs, and generated code writes their fields.
 
 from __future__ import annotations
 
-import ast
 import linecache
 import struct
 from collections.abc import Callable, Sequence
@@ -21,12 +20,14 @@ import orjson
 from router.compiler.cdr import write_message
 from router.compiler.cdr.primitives import CDR_LE, scalar_format
 from router.compiler.cdr.reading import LENGTH, Loop, ReadingCode, Step, Stretch, Take
+from router.compiler.expressions.kinds import IntKind, StringKind, kind_of
+from router.compiler.expressions.tree import Call, Constant, Element, Node, Read, Variable
 from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import Each, Leaf, Plan, Record
 from router.compiler.source import Source
 from router.errors import MappingError, SourceSpan
 from router.gateway.json_types import PLACEHOLDER, Style
-from router.types.model import Bool, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 Encode = Callable[[bytes], bytes]
 """From CDR bytes with their header to UTF-8 JSON. Raises UnreadableError."""
@@ -224,7 +225,7 @@ def decoder(message: MessageType, style: Style) -> Decode:
     read: Callable[[bytes], Any] = msgspec.json.Decoder(writing.struct(message)).decode
     out = Source()
     with out.block("def write(it):", span):
-        out.line(f"return {write_message(out, writing.plan(message, 'it', ''), 'message')}", span)
+        out.line(f"return {write_message(out, writing.whole(message, 'it'), 'message')}", span)
     write = _function(out, "write", file, _DECODING)
 
     def decode(text: bytes) -> bytes:
@@ -298,41 +299,47 @@ class _Writing:
             case _:
                 raise TypeError(f"ROS has no type {declared}")
 
-    def plan(self, message: MessageType, holder: str, path: str) -> Record:
-        """The plan of a message that the expression `holder` is. `path` names it in errors."""
+    def whole(self, message: MessageType, variable: str) -> Record:
+        """The plan of a message that is read from the Struct in a variable."""
+        return self._record(message, Variable(kind_of(message), self._span, variable), "")
+
+    def _record(self, message: MessageType, holder: Node, path: str) -> Record:
+        """`path` names the message in errors."""
         members = []
         for index, field in enumerate(message.fields):
-            value = f"{holder}.f{index}"
+            value: Node = Read(kind_of(field.type), self._span, holder, Field(f"f{index}", field.type))
             if self._is_wrapped and not isinstance(field.type, List):
-                value += "[0]"
+                value = Element(value.kind, self._span, value, 0)
             members.append((field, self._plan(field.type, value, f"{path}.{field.name}".lstrip("."))))
         return Record(message, tuple(members), self._span)
 
-    def _plan(self, declared: Type, value: str, path: str) -> Plan:
+    def _plan(self, declared: Type, value: Node, path: str) -> Plan:
         match declared:
             case MessageType():
-                return self.plan(declared, value, path)
+                return self._record(declared, value, path)
             case List():
-                item = f"item{next(self._items)}"
+                item = Variable(kind_of(declared.element), self._span, f"item{next(self._items)}")
                 element = self._plan(declared.element, item, f"{path}[]")
-                return Each(declared, _expression(value), item, element, self._span)
+                return Each(declared, ((item.name, value),), element, self._span)
+            case String(wide=True) if self._is_wrapped:  # msgspec has checked its bound
+                return Leaf(declared, self._checked("wide_text_of_units", value, path), self._span)
             case String():
-                check = "text" if not declared.wide else "wide_text_of_units" if self._is_wrapped else "wide_text"
-                return self._leaf(declared, f"checked_{check}({value}, {declared.bound}, {path!r})")
+                check = "wide_text" if declared.wide else "text"
+                return Leaf(declared, self._checked(check, value, path, declared.bound), self._span)
             case Int(bits=64, signed=False):
-                return self._leaf(declared, f"checked_uint64({value}, {path!r})")
+                return Leaf(declared, self._checked("uint64", value, path), self._span)
             case _:
-                return self._leaf(declared, value)
+                return Leaf(declared, value, self._span)
 
-    def _leaf(self, declared: Type, value: str) -> Leaf:
-        return Leaf(declared, _expression(value), self._span)
+    def _checked(self, check: str, value: Node, path: str, bound: int | None = None) -> Node:
+        """The call of one of the functions below; without a bound where there is none."""
+        given = [Constant(StringKind(), self._span, path)]
+        if bound is not None:
+            given.append(Constant(IntKind(bound, bound), self._span, bound))
+        return Call(value.kind, self._span, f"checked_{check}", (value, *given))
 
 
-def _expression(text: str) -> ast.expr:
-    return ast.parse(text, mode="eval").body
-
-
-def _checked_text(value: str, bound: int | None, path: str) -> str:
+def _checked_text(value: str, path: str, bound: int | None = None) -> str:
     if "\0" in value:
         raise InvalidMessageError(f"{path}: a string of ROS holds no NUL")
     if bound is not None and (size := len(value.encode())) > bound:
@@ -340,14 +347,13 @@ def _checked_text(value: str, bound: int | None, path: str) -> str:
     return value
 
 
-def _checked_wide_text(value: str, bound: int | None, path: str) -> str:
+def _checked_wide_text(value: str, path: str, bound: int | None = None) -> str:
     if bound is not None and (size := len(value.encode("utf-16-le")) // 2) > bound:
         raise InvalidMessageError(f"{path}: {size} characters are more than {bound}")
     return value
 
 
-def _checked_wide_text_of_units(units: Sequence[int], bound: int | None, path: str) -> str:
-    """`bound` is checked already."""
+def _checked_wide_text_of_units(units: Sequence[int], path: str) -> str:
     try:
         return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
     except UnicodeDecodeError:

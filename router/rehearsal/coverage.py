@@ -12,7 +12,7 @@ from pathlib import Path
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.expressions import Typed
+from router.compiler.expressions.tree import Node
 from router.compiler.program import Program
 from router.errors import SourceSpan
 from router.rehearsal.comparing import Outcome
@@ -131,7 +131,7 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
             yield ("rate_limited", name, target.label), Item("rejection", target.span, gap)
 
 
-def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Typed | None]]:
+def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Node | None]]:
     """Every target of a route, with its `when` or that of the topic that topics it."""
     yield from ((target, target.when) for target in route.targets)
     for subscription in route.subscriptions:

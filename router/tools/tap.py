@@ -13,9 +13,10 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
 from router.clock import wall_ns
-from router.compiler.expressions import ExpressionError, ParsedReads, Scope, check
+from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
+from router.compiler.python import render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.engine.wire import Decoded, Wire
@@ -75,17 +76,15 @@ class Condition:
 def _compiled(text: str, message: MessageType) -> Holds:
     """Raises ExpressionError."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
-    reads = ParsedReads()
     place = TextPlace(span, ((0, span),))
-    typed = check(Expression(text, place), Scope(message, tuple(_enums(message)), (), reads))
-    if not isinstance(typed.kind, BoolKind):
+    node = check(Expression(text, place), Scope(message, tuple(_enums(message)), ()))
+    if not isinstance(node.kind, BoolKind):
         raise ExpressionError(
-            span, Code.TYPE_MISMATCH, f"it is {typed.kind}, not a bool", "compare something, as in speed > 0"
+            span, Code.TYPE_MISMATCH, f"it is {node.kind}, not a bool", "compare something, as in speed > 0"
         )
     out = Source()
     with out.block(f"def {FUNCTION}(m, source, received_at):", span):
-        reads.write(out, span)
-        out.line(f"return {out.expression(typed.node)}", span)
+        out.line(f"return {out.expression(render(node))}", span)
     names: dict[str, object] = {**NAMESPACE}
     exec(out.compile("--where"), names)  # noqa: S102 - of checked expressions, as in handlers
     return cast("Holds", names[FUNCTION])

@@ -6,10 +6,12 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from router.compiler.cdr import write_message
-from router.compiler.expressions import ParsedReads, Scope, Typed, check
+from router.compiler.expressions import Scope, check
+from router.compiler.expressions.tree import Node
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
+from router.compiler.python import render
 from router.compiler.source import Source
 from router.engine.binding import bind
 from router.engine.delivery import MAPPING_FAILURES
@@ -21,7 +23,8 @@ from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.rig import Rig
 from tests.oracles.reference import fill
-from tests.oracles.reference_expressions import Context, View
+from tests.oracles.reference_expressions import Context
+from tests.oracles.reference_kinds import View
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
 RECEIVED_AT = 1_700_000_000_123_456_789
@@ -54,7 +57,7 @@ AUTO = field_map(True)
 
 
 def scope_of(message: MessageType, enums: Collection[Enum] = (), ros_types: Collection[MessageType] = ()) -> Scope:
-    return Scope(message, enums, ros_types, ParsedReads())
+    return Scope(message, enums, ros_types)
 
 
 def context_of(
@@ -65,16 +68,15 @@ def context_of(
 
 def compiled(
     expression: str | Expression, scope: Scope, expected: Type | None = None
-) -> tuple[Typed, Callable[[Any], Any]]:
+) -> tuple[Node, Callable[[Any], Any]]:
     """A checked expression, and as a function of the message. Raises ExpressionError."""
-    typed = check(written(expression) if isinstance(expression, str) else expression, scope, expected)
+    node = check(written(expression) if isinstance(expression, str) else expression, scope, expected)
     out = Source()
     with out.block("def evaluate(m, source, received_at):", SPAN):
-        scope.reads.write(out, SPAN)
-        out.line(f"return {out.expression(typed.node)}", SPAN)
+        out.line(f"return {out.expression(render(node))}", SPAN)
     namespace: dict[str, Any] = dict(NAMESPACE)
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return typed, lambda message: namespace["evaluate"](message, SOURCE, RECEIVED_AT)
+    return node, lambda message: namespace["evaluate"](message, SOURCE, RECEIVED_AT)
 
 
 def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[[Any], bytes]:
@@ -83,7 +85,6 @@ def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[
     assert mapping.findings == []
     out = Source()
     with out.block("def serialize(m, source, received_at):", SPAN):
-        scope.reads.write(out, SPAN)
         out.line(f"return {write_message(out, mapping.plan, 'it')}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested

@@ -9,10 +9,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from router.compiler.cdr import CdrReads
-from router.compiler.expressions import ParsedReads, Reads, Scope
+from router.compiler.expressions import Scope
+from router.compiler.expressions.tree import paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
+from router.compiler.plan import expressions
+from router.compiler.python import NO_VALUES
 from router.compiler.source import Source
 from router.errors import Located
 from router.table.model import FieldMap
@@ -46,17 +49,20 @@ def wire_of(root: Path, name: str) -> Wire:
 
 
 def compiled_envelope(
-    wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType, reads: Reads | None = None
+    wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType, *, is_serialized: bool = False
 ) -> MakeEnvelope:
-    """What the compiler makes of a mapping without findings. With CdrReads the message comes as CDR bytes."""
+    """What the compiler makes of a mapping without findings. The message comes as an object, or as CDR bytes."""
     schema, _ = wire
-    scope = Scope(source, tuple(schema.enums.values()), (), reads or ParsedReads())
+    scope = Scope(source, tuple(schema.enums.values()), ())
     mapping = build(fields, case.type, scope, SPAN)
     assert mapping.findings == []
     out = Source()
-    with out.block(f"def envelope({'cdr' if isinstance(reads, CdrReads) else 'm'}, source, received_at):", SPAN):
-        scope.reads.write(out, SPAN)
-        out.line(f"return {write_envelope(out, mapping.plan, case, 'it')}", SPAN)
+    with out.block(f"def envelope({'cdr' if is_serialized else 'm'}, source, received_at):", SPAN):
+        reads = CdrReads(source, (path for node in expressions(mapping.plan) for path in paths_in(node)))
+        if is_serialized:
+            reads.write(out, SPAN)
+        values = reads.values if is_serialized else NO_VALUES
+        out.line(f"return {write_envelope(out, mapping.plan, case, 'it', values)}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     function = namespace["envelope"]

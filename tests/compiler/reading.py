@@ -43,16 +43,8 @@ def at(declared: MessageType, path: Path) -> Type:
 
 def reader(declared: MessageType, wanted: Sequence[Path]) -> tuple[str, Callable[[bytes], list[Any]]]:
     """The code, and as a function what it reads at each of `wanted`, in this order."""
-    reads, out = CdrReads(declared), Source()
-    nodes = []
-    for path in wanted:
-        found = at(declared, path)
-        if isinstance(found, MessageType) and (path == WHOLE or found.name not in TIME_TYPES):
-            node = reads.message(path)
-            reads.need_objects(node)
-        else:
-            node = reads.field(path[:-1], Field(path[-1], found))
-        nodes.append(placed(node, SPAN))
+    reads, out = CdrReads(declared, wanted), Source()
+    nodes = [placed(reads.values[path], SPAN) for path in wanted]
     with out.block("def read(cdr):", SPAN):
         reads.write(out, SPAN)
         out.line(f"return [{', '.join(map(out.expression, nodes))}]", SPAN)

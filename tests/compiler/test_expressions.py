@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler.cdr import CdrReads
-from router.compiler.expressions import ExpressionError, Scope, Typed, check
+from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import (
     BoolKind,
@@ -27,9 +27,12 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     kind_of,
 )
+from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.tree import Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
-from router.compiler.source import Source, load
+from router.compiler.python import render
+from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.rehearsal.cdr import serialize as cdr
@@ -146,7 +149,7 @@ MANY = settings(suppress_health_check=list(HealthCheck))
 @given(expressions, present(SOURCE))
 def test_compiled_and_reference_agree(text: str, message: Any) -> None:
     try:
-        typed, run = compiled(text, scope_of(SOURCE, [MODE]))
+        node, run = compiled(text, scope_of(SOURCE, [MODE]))
     except ExpressionError as error:
         if error.diagnostic.code not in REFUSED and "nan equals nothing" not in error.diagnostic.message:
             raise
@@ -157,7 +160,7 @@ def test_compiled_and_reference_agree(text: str, message: Any) -> None:
     assert same(value, by_reference), (text, value, by_reference)
     event("failed" if value is MAPPING_FAILURES else "has a value")
     if value is not MAPPING_FAILURES:
-        assert_of_kind(value, typed.kind)
+        assert_of_kind(value, node.kind)
 
 
 def assert_of_kind(value: object, kind: Kind) -> None:
@@ -238,8 +241,8 @@ def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
     ],
 )
 def test_inferred_kind(text: str, kind: Kind) -> None:
-    typed, _ = compiled(text, scope_of(SOURCE, [MODE]))
-    assert typed.kind == kind
+    node, _ = compiled(text, scope_of(SOURCE, [MODE]))
+    assert node.kind == kind
 
 
 @pytest.mark.parametrize(
@@ -276,8 +279,8 @@ def test_a_time_has_64_bits(text: str, time: int | None) -> None:
 
 def test_bounds_of_clamp_and_wrap_come_from_the_field() -> None:
     for text in ("clamp(i32)", "wrap(i32) if flag else clamp(u64)"):
-        typed, _ = compiled(text, scope_of(SOURCE, [MODE]), Int(8, signed=False))
-        assert typed.kind == IntKind(0, 255)
+        node, _ = compiled(text, scope_of(SOURCE, [MODE]), Int(8, signed=False))
+        assert node.kind == IntKind(0, 255)
 
 
 def test_nan_goes_through_clamp() -> None:
@@ -290,10 +293,10 @@ def test_a_field_or_an_enum_value_called_nan_wins_over_not_a_number() -> None:
     _, run = compiled("nan + 1", scope_of(source))
     assert run(SimpleNamespace(nan=4)) == 5
     mode = Enum("Mode", (("nan", 7),))
-    typed, run = compiled("nan", scope_of(SOURCE, [mode]), mode)
+    node, run = compiled("nan", scope_of(SOURCE, [mode]), mode)
     assert run(None) == 7
     assert evaluate(written("nan"), context_of(None, SOURCE, [mode]), mode) == 7
-    assert str(typed.kind) == "enum Mode"
+    assert str(node.kind) == "enum Mode"
 
 
 @pytest.mark.parametrize("text", ["nan", "-nan", "inf", "-inf", "nan if flag else f32", "max(f32, -inf)"])
@@ -312,9 +315,9 @@ def test_nan_and_inf_fill_floats_and_nothing_else(text: str) -> None:
 
 
 def test_generated_code_is_told_with_the_names_of_the_language() -> None:
-    typed, _ = compiled("[nan if flag else f32, -inf, 1e300]", scope_of(SOURCE))
+    node, _ = compiled("[nan if flag else f32, -inf, 1e300]", scope_of(SOURCE))
     out = Source()
-    out.line(f"return {out.expression(typed.node)}", SPAN)
+    out.line(f"return {out.expression(render(node))}", SPAN)
     assert out.text() == "return ([nan if m.flag else m.f32, -inf, 1e+300])\n"
 
 
@@ -349,11 +352,11 @@ PYTHON_TYPE: dict[type, tuple[type, ...]] = {
 
 @pytest.mark.parametrize(("name", "text", "value"), EXAMPLES, ids=[text for _, text, _ in EXAMPLES])
 def test_example_is_true_compiled_and_by_reference(name: str, text: str, value: object) -> None:
-    typed, run = compiled(text, scope_of(NOTHING))
+    node, run = compiled(text, scope_of(NOTHING))
     assert run(None) == value
     assert evaluate(written(text), context_of(None, NOTHING)) == value
     assert name in text
-    assert isinstance(run(None), PYTHON_TYPE[type(typed.kind)])
+    assert isinstance(run(None), PYTHON_TYPE[type(node.kind)])
 
 
 def test_functions_have_examples_a_summary_and_a_signature() -> None:
@@ -391,18 +394,18 @@ SCENE: dict[str, Value] = {
 }  # fmt: skip
 
 
-def scope_over(declared: MessageType, names: Mapping[str, Typed]) -> Scope:
-    return Scope(declared, (), (), CdrReads(declared), names)
+def scope_over(declared: MessageType, names: Mapping[str, Node]) -> Scope:
+    return Scope(declared, (), (), names)
 
 
 def evaluated(text: str, **given: Any) -> Any:
     """What an expression comes to; `given` are elements of `boxes` by the names that they have beside the fields."""
-    names = {name: Typed.at(SPAN, kind_of(BOX), load(name)) for name in given}
-    scope, out = scope_over(DECLARED, names), Source()
-    typed = check(written(text), scope)
+    names = {name: Variable(kind_of(BOX), SPAN, name) for name in given}
+    node, out = check(written(text), scope_over(DECLARED, names)), Source()
+    reads = CdrReads(DECLARED, paths_in(node))
     with out.block(f"def evaluate(cdr, {', '.join(given)}):", SPAN):
-        scope.reads.write(out, SPAN)
-        out.line(f"return {out.expression(typed.node)}", SPAN)
+        reads.write(out, SPAN)
+        out.line(f"return {out.expression(render(node, reads.values))}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     return namespace["evaluate"](cdr(DECLARED, SCENE), **given)
@@ -438,14 +441,13 @@ def test_name_beside_the_fields_wins_over_a_field() -> None:
 
 def test_element_has_fields_that_are_called_as_keywords_are() -> None:
     (first, _) = evaluated("boxes")
-    item = Typed.at(SPAN, kind_of(BOX), load("item"))
-    name = scope_over(DECLARED, {"item": item}).field_of(item, BOX.fields[0], SPAN)
-    code = compile(ast.Expression(name.node), "table.yaml", "eval")
+    name = field_of(Variable(kind_of(BOX), SPAN, "item"), BOX.fields[0], SPAN)
+    code = compile(ast.Expression(render(name)), "table.yaml", "eval")
     assert eval(code, {"item": first}) == "first"  # noqa: S307 - what is tested
 
 
 def test_misspelt_name_beside_the_fields_is_suggested() -> None:
-    scope = scope_over(DECLARED, {"total_count": Typed.at(SPAN, kind_of(_UINT8), load("total_count"))})
+    scope = scope_over(DECLARED, {"total_count": Variable(kind_of(_UINT8), SPAN, "total_count")})
     with pytest.raises(ExpressionError) as raised:
         check(written("total_cuont"), scope)
     assert "total_count" in raised.value.diagnostic.hint
@@ -453,7 +455,7 @@ def test_misspelt_name_beside_the_fields_is_suggested() -> None:
 
 @pytest.mark.parametrize("text", ["has(left)", "has(item)", "has(item.area)", "has(left.area)"])
 def test_has_finds_nothing_that_could_be_missing(text: str) -> None:
-    scope = scope_over(DECLARED, {"item": Typed.at(SPAN, MessageKind(BOX), load("item"))})
+    scope = scope_over(DECLARED, {"item": Variable(MessageKind(BOX), SPAN, "item")})
     with pytest.raises(ExpressionError):
         check(written(text), scope)
 

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.compiler.expressions import DEEPEST, ExpressionError
+from router.compiler.python import render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
@@ -84,13 +85,13 @@ def check_ends_well(text: str) -> ExpressionError | None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a table says what is wrong with it in findings alone
         try:
-            typed, _ = compiled(text, scope_of(SOURCE, [MODE]))
+            node, _ = compiled(text, scope_of(SOURCE, [MODE]))
         except ExpressionError as error:
             return error
         out = Source()
-        out.line(f"it = {out.expression(typed.node)}", SPAN)
+        out.line(f"it = {out.expression(render(node))}", SPAN)
         assert ast.unparse(ast.parse(out.text())) == ast.unparse(NamedConstants().visit(out.tree()))
-        assert str(typed.kind)
+        assert str(node.kind)
         return None
 
 

@@ -15,7 +15,6 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.cdr import CdrReads
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
@@ -307,7 +306,7 @@ def test_both_members_of_a_oneof_by_auto_are_a_finding() -> None:
     assert made("choice", AUTO, number=(I32, 0), flag=(Bool(), True)).WhichOneof("chosen") == "number"
 
 
-def test_what_protobuf_refuses_is_blamed_on_the_line_of_the_table(
+def test_what_a_field_refuses_is_blamed_on_the_line_of_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -318,9 +317,9 @@ def test_what_protobuf_refuses_is_blamed_on_the_line_of_the_table(
     wire = made_wire()
     source = MessageType("made/msg/Source", (Field("text", String()),))
     make = compiled_envelope(wire, wire[1].cases["scalars"], FieldMap(SPAN, False, (entry,)), source)
-    with pytest.raises(ValueError, match="ROCK_RED") as caught:
+    with pytest.raises(MappingError, match="ROCK_RED") as caught:
         make(SimpleNamespace(text="ROCK_RED"))
-    assert traceback.extract_tb(caught.value.__traceback__)[-1].lineno == 9
+    assert traceback.extract_tb(caught.value.__traceback__)[-2].lineno == 9
 
 
 GOLDEN: list[dict[str, Any]] = json.loads(
@@ -376,7 +375,7 @@ def test_ros_messages_of_the_rover_make_the_envelopes_of_the_reference(definitio
 
 def assert_same_envelopes(wire: Wire, case: PayloadCase, declared: MessageType) -> None:
     """Whatever a ROS message of type `declared` holds."""
-    compiled = compiled_envelope(wire, case, AUTO, declared, CdrReads(declared))
+    compiled = compiled_envelope(wire, case, AUTO, declared, is_serialized=True)
     reference = reference_envelope(wire, case, AUTO, declared)
 
     @EACH_TYPE

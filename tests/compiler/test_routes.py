@@ -9,6 +9,7 @@ import pytest
 from router.compiler import Checked
 from router.compiler.checked import CheckedSubscription, CheckedTarget
 from router.compiler.plan import Leaf, Record
+from router.compiler.python import render
 from router.errors import Code, Diagnostic, Severity
 from router.table.model import OnLimit, Priority
 from tests.compiler.conftest import CheckText
@@ -96,7 +97,7 @@ def source_of(plan: Record, name: str) -> str:
     """What fills a field, as code."""
     made = next(inner for member, inner in plan.members if member.name == name)
     assert isinstance(made, Leaf)
-    return ast.unparse(made.node)
+    return ast.unparse(render(made.node))
 
 
 def plan_of(feed: CheckedSubscription) -> Record:
@@ -109,7 +110,7 @@ def test_element_index_and_count_are_visible_beside_the_fields_of_the_message(ch
     fields = "{frame_id: frame_id, total_count: count, index: index, confidence: item.confidence}"
     plan = plan_of(only_feed(check_text(objects(fields, "item.id > 0", "index < count"))))
     assert [source_of(plan, name) for name in ("frame_id", "total_count", "index", "confidence")] == [
-        "m_frame_id",
+        "m.frame_id",
         "count",
         "index",
         "item.confidence",
@@ -131,7 +132,7 @@ def test_names_of_for_each_win_over_fields_which_the_message_still_reaches(check
         destinations: [base]
     """
     plan = plan_of(only_feed(check_text(routes)))
-    assert (source_of(plan, "index"), source_of(plan, "id")) == ("index", "m_index")
+    assert (source_of(plan, "index"), source_of(plan, "id")) == ("index", "m.index")
 
 
 def test_list_itself_does_not_see_its_elements(check_text: CheckText) -> None:

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any, Union
 
-from router.errors import MappingError
 from router.table.model import Expression, FieldMap
-from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
-from tests.oracles.reference_expressions import NS, Context, EnumNumber, Nanoseconds, View, evaluate
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.oracles.reference_expressions import Context, evaluate
+from tests.oracles.reference_kinds import MAPPING_ERROR, NS, EnumNumber, Nanoseconds, Refused, View, all_of
 
 Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
 """What fills a field; a message is a dictionary of its fields, in their order."""
@@ -24,7 +24,7 @@ Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
 def fill(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
     """The ROS message that `fields` makes of a message, with all its fields.
 
-    Raises MappingError where a field has no value.
+    Raises Refused where a field has no value.
     """
     return _completed(target, fill_given(fields, target, context))
 
@@ -46,7 +46,7 @@ def _complete(declared: Type, value: Any) -> Any:
         case List():
             return [_complete(declared.element, element) for element in value]
         case String(wide=False) if "\0" in value:
-            raise MappingError("a ROS string cannot hold a NUL")
+            raise Refused(MAPPING_ERROR)
         case _:
             return value
 
@@ -61,18 +61,19 @@ def fill_given(fields: FieldMap | None, target: MessageType, context: Context) -
 
 
 def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, context: Context) -> dict[str, Value]:
-    made: dict[str, Value] = {}
-    for field in target.fields:
+    def fill_field(field: Field) -> Value:
         given = tree.get(field.name)
         same_named = auto.read(field.name) if auto and auto.type.field(field.name) else None
         if isinstance(given, Expression):
-            made[field.name] = converted(evaluate(given, context, field.type), field.type)
-        elif given is not None:
-            assert isinstance(field.type, MessageType)
-            made[field.name] = _filled(field.type, given, same_named if isinstance(same_named, View) else None, context)
-        elif same_named is not None:
-            made[field.name] = converted(same_named, field.type)
-    return made
+            return converted(evaluate(given, context, field.type), field.type)
+        if given is None:
+            return converted(same_named, field.type)
+        assert isinstance(field.type, MessageType)
+        return _filled(field.type, given, same_named if isinstance(same_named, View) else None, context)
+
+    fields = [each for each in target.fields if each.name in tree or (auto and auto.type.field(each.name))]
+    values = all_of([lambda field=field: fill_field(field) for field in fields])
+    return {field.name: value for field, value in zip(fields, values, strict=True)}
 
 
 def initial(declared: Type, default: object = None) -> Value:
@@ -97,14 +98,14 @@ def initial(declared: Type, default: object = None) -> Value:
 
 
 def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a case a type
-    """The value as a field of the target's type holds it. Raises MappingError when it does not fit."""
+    """The value as a field of the target's type holds it. Raises Refused when it does not fit."""
     match target:
         case MessageType():
             return _to_message(value, target)
         case List():
-            elements = [converted(element, target.element) for element in value]
+            elements = all_of([lambda each=each: converted(each, target.element) for each in value])
             if len(elements) not in range(target.length or 0, _most_elements(target) + 1):
-                raise MappingError(f"{len(elements)} elements do not fit {target}")
+                raise Refused(MAPPING_ERROR)
             return elements
         case _ if isinstance(value, View):
             return converted(value.read(value.type.fields[0].name), target)
@@ -114,7 +115,7 @@ def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a cas
             if isinstance(value, EnumNumber):
                 return max(target.low, min(target.high, int(value)))
             if not target.low <= value <= target.high:
-                raise MappingError(f"{value} does not fit {target}")
+                raise Refused(MAPPING_ERROR)
             return int(value)
         case Float():
             return _to_float(value, target)
@@ -124,7 +125,9 @@ def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a cas
             return _to_enum(value, target)
         case Bytes():
             if target.bound is not None and len(value) > target.bound:
-                raise MappingError(f"{len(value)} bytes do not fit {target}")
+                raise Refused(MAPPING_ERROR)
+            if any(not 0 <= octet <= 255 for octet in value):
+                raise Refused(MAPPING_ERROR)
             return bytes(value)
 
 
@@ -151,14 +154,14 @@ def _to_float(value: float, target: Float) -> float:
     try:
         struct.pack("<f" if target.bits == 32 else "<d", value)
     except (OverflowError, struct.error) as error:
-        raise MappingError(f"{value} does not fit {target}: {error}") from error
+        raise Refused(MAPPING_ERROR) from error
     return float(value)
 
 
 def _to_text(value: str, target: String) -> str:
     size = len(value.encode("utf-16-le")) // 2 if target.wide else len(value.encode())
     if target.bound is not None and size > target.bound:
-        raise MappingError(f"a text of {size} does not fit {target}")
+        raise Refused(MAPPING_ERROR)
     return value
 
 
@@ -166,8 +169,8 @@ def _to_enum(value: int | str, target: Enum) -> int:
     """A number as it is, a name as what it stands for."""
     numbers = dict(target.values)
     if isinstance(value, str) and value not in numbers:
-        raise MappingError(f"{target} has no value '{value}'")
+        raise Refused(MAPPING_ERROR)
     number = numbers[value] if isinstance(value, str) else int(value)
     if not -(1 << 31) <= number < 1 << 31:
-        raise MappingError(f"{number} does not fit {target}")
+        raise Refused(MAPPING_ERROR)
     return number

@@ -1,243 +1,433 @@
-"""The oracle's expressions: walks the syntax that the user wrote, over a message, with Python's own values.
+"""The oracle's expressions: what docs/reference/table.md says of them, in Python's exact integers and doubles.
 
-Expects expressions that the compiler has accepted; see `reference`.
+Reads the syntax that the user wrote, over a message. Expects expressions that the compiler has accepted; see
+`reference`. Where several parts of an expression have no result, the reason may be that of any of them, as the page
+does not say what is computed first.
 """
 
 from __future__ import annotations
 
 import ast
+import itertools
+import keyword
+import math
 import operator
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from types import SimpleNamespace
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from router.compiler.expressions.functions import FUNCTIONS, NOT_FINITE
-from router.compiler.expressions.kinds import TIME_TYPES
-from router.errors import MappingError
 from router.table.model import Choices, Expression
 from router.types.model import Enum, Int, List, MessageType, Type
-
-NS = 1_000_000_000
-
-
-class Nanoseconds(int):
-    """A time, told apart from a number."""
-
-
-class EnumNumber(int):
-    """The value of a protobuf enum, told apart from a number: it saturates."""
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A message together with what its type model says about it."""
-
-    message: Any
-    type: MessageType
-
-    def read(self, name: str) -> object:
-        """The value of a field. Raises KeyError when the type has none of this name."""
-        field = self.type.field(name)
-        if field is None:
-            raise KeyError(f"{self.type} has no field '{name}'")
-        return _seen(getattr(self.message, name), field.type)
-
-
-def _seen(raw: Any, declared: Type) -> object:
-    """A field's value as expressions see it."""
-    match declared:
-        case MessageType() if declared.name in TIME_TYPES:
-            return Nanoseconds(raw.sec * NS + raw.nanosec)
-        case MessageType():
-            return View(raw, declared)
-        case Enum():
-            return EnumNumber(raw)
-        case List(MessageType(is_map_entry=True) as entry):
-            return [View(SimpleNamespace(key=key, value=raw[key]), entry) for key in sorted(raw)]
-        case List():
-            return [_seen(element, declared.element) for element in raw]
-        case _:
-            return raw
+from tests.oracles.reference_functions import (
+    FUNCTIONS,
+    OPERATORS,
+    Rule,
+    extreme_of,
+    kind_of_sum,
+    negate,
+    same_number,
+    sum_of,
+)
+from tests.oracles.reference_kinds import (
+    MAPPING_ERROR,
+    EnumNumber,
+    Kind,
+    Listing,
+    Member,
+    Message,
+    Nanoseconds,
+    Real,
+    Refused,
+    Text,
+    Time,
+    Truth,
+    View,
+    Whole,
+    all_of,
+    joined,
+    kind_of,
+    number,
+    seen,
+    shaped,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What expressions can see: a message, who sent it, when (ns since 1970), and the constants by holder."""
+    """What expressions can see: a message, who sent it, when (ns since 1970), and the constants by holder.
+
+    `names` are values beside the fields, which win over fields of the same name, with their types.
+    """
 
     view: View
     source: str
     received_at: int
     enums: Collection[Enum]
     ros_types: Collection[MessageType]
+    names: Mapping[str, tuple[Any, Type]] = field(default_factory=dict)
 
 
-def evaluate(expression: Expression, context: Context, expected: Type | None = None) -> object:
-    """The value of an expression that the compiler accepts; `expected` is the field that it fills.
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What an expression means: its kind, and its value in a context of the same types.
 
-    Raises MappingError where the value has no result.
+    `items` are those of a list literal, whose kinds may differ. `constant` is the value of one that is known.
     """
+
+    kind: Kind
+    give: Callable[[Context], Any]
+    items: tuple[Meaning, ...] | None = None
+    constant: Any = None
+
+
+def evaluate(expression: Expression, context: Context, expected: Type | None = None) -> Any:
+    """The value of an expression; `expected` is the type of the field that it fills. Raises Refused."""
+    return value_of(meaning_of(expression, context, expected), context)
+
+
+def value_of(meaning: Meaning, context: Context) -> Any:
+    """A list literal gives its items as they are: each fills an element by itself."""
+    if meaning.items is not None:
+        return all_of([lambda item=item: value_of(item, context) for item in meaning.items])
+    return meaning.give(context)
+
+
+def meaning_of(expression: Expression, context: Context, expected: Type | None = None) -> Meaning:
+    """What an expression means in all contexts with these types."""
     if expression.items is not None:
-        return [evaluate(item, context, _element(expected)) for item in expression.items]
+        return _literal([meaning_of(item, context, _innermost(expected)) for item in expression.items])
     if expression.literal:
-        return expression.text
+        return _constant(Text(), expression.text)
     if expression.choices is not None:
-        return evaluate(_chosen(expression.choices, context), context, expected)
-    syntax = ast.parse(expression.text.replace("\n", " ").strip(), mode="eval").body
-    try:
-        return _Evaluator(context).visit(syntax, expected)
-    except (ArithmeticError, ValueError, LookupError) as error:
-        raise MappingError(str(error)) from error
+        return _chosen(expression.choices, context, expected)
+    syntax = ast.parse(_without_words(expression.text.replace("\n", " ").strip()), mode="eval").body
+    return _Reader(context).read(syntax, expected)
 
 
-def _chosen(choices: Choices, context: Context) -> Expression:
-    subject = evaluate(choices.subject, context)
-    for name, value in choices.values:
-        named = [number for enum in context.enums for each, number in enum.values if each == name.value]
-        if subject == (name.value if isinstance(subject, str) else (named or [ast.literal_eval(name.value)])[0]):
-            return value
-    if choices.otherwise is None:
-        raise MappingError(f"the map has no value for {subject}")
-    return choices.otherwise
+def _innermost(expected: Type | None) -> Type | None:
+    return expected.element if isinstance(expected, List) else expected
 
 
-def _element(expected: Type | None) -> Type | None:
-    return expected.element if isinstance(expected, List) else None
+# ---- field names that are words of Python
 
-
-_BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow,
-}  # fmt: skip
-_UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
-    ast.Not: operator.not_, ast.USub: operator.neg, ast.UAdd: operator.pos,
-}  # fmt: skip
-_GIVE_FLOATS = frozenset(
-    {"radians", "degrees", "sqrt", "sin", "cos", "tan", "atan2", "hypot", "float32", "float64", "seconds"}
+_PREFIX = "word_of_python_"
+_ONLY_AFTER_A_DOT = frozenset(
+    {"and", "or", "not", "in", "is", "if", "else", "lambda", "for", "await", "yield", "True", "False", "None"}
 )
-_GIVE_AN_ARGUMENT = frozenset({"min", "max", "clamp"})
-_COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+_NAMES = re.compile(r"""'[^']*'|"[^"]*"|(?P<dot>\.\s*)?\b(?P<name>[A-Za-z_]\w*)""")
+
+
+def _without_words(text: str) -> str:
+    """The text with names that Python can parse."""
+
+    def replaced(match: re.Match[str]) -> str:
+        name, dot = match["name"], match["dot"]
+        if not name or not keyword.iskeyword(name) or (not dot and name in _ONLY_AFTER_A_DOT):
+            return match[0]
+        return f"{dot or ''}{_PREFIX}{name}"
+
+    return _NAMES.sub(replaced, text)
+
+
+def _name(name: str) -> str:
+    return name.removeprefix(_PREFIX)
+
+
+# ---- meanings of parts
+
+
+def _constant(kind: Kind, value: Any) -> Meaning:
+    return Meaning(kind, lambda _: value, constant=value)
+
+
+def _literal(items: Sequence[Meaning]) -> Meaning:
+    """A list literal; as one value, its elements have a kind in common."""
+    kind = Listing(joined([item.kind for item in items]) if items else None, len(items))
+    whole_items = [_as_value(item) for item in items]
+    return Meaning(kind, lambda context: shaped(_together(whole_items, context), kind), items=tuple(items))
+
+
+def _as_value(meaning: Meaning) -> Meaning:
+    return Meaning(meaning.kind, meaning.give, constant=meaning.constant)
+
+
+def _together(meanings: Sequence[Meaning], context: Context) -> list[Any]:
+    return all_of([lambda each=each: each.give(context) for each in meanings])
+
+
+def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) -> Meaning:
+    """A rule for scalars, applied element by element where an operand is a list."""
+    if any(operand.items is not None for operand in operands):
+        return _literal([_applied(rule, parts, folds=folds) for parts in _item_by_item(operands)])
+    element_kinds = [each.kind.element if isinstance(each.kind, Listing) else each.kind for each in operands]
+    kind, compute = rule([each for each in element_kinds if each is not None], [each.constant for each in operands])
+    lists = [each.kind for each in operands if isinstance(each.kind, Listing)]
+
+    def give(context: Context) -> Any:
+        values = _together(operands, context)
+        if not lists:
+            return shaped(compute(*values), kind)
+        length = _common_length([v for v, each in zip(values, operands, strict=True) if isinstance(each.kind, Listing)])
+        columns = [
+            value if isinstance(each.kind, Listing) else itertools.repeat(value, length)
+            for value, each in zip(values, operands, strict=True)
+        ]
+        return all_of([lambda row=row: shaped(compute(*row), kind) for row in zip(*columns, strict=True)])
+
+    if lists:
+        lengths = [each.length for each in lists if each.length is not None]
+        return Meaning(Listing(kind, lengths[0] if lengths else None), give)
+    if folds and all(operand.constant is not None for operand in operands):
+        return _folded(kind, give)
+    return Meaning(kind, give)
+
+
+def _folded(kind: Kind, give: Callable[[Context], Any]) -> Meaning:
+    """What operators make of constants is a constant."""
+    value = give(None)  # type: ignore[arg-type]
+    return _constant(Whole(value, value) if isinstance(kind, Whole) else kind, value)
+
+
+def _item_by_item(operands: Sequence[Meaning]) -> list[tuple[Meaning, ...]]:
+    (length,) = {each.kind.length for each in operands if isinstance(each.kind, Listing)}
+    assert length is not None
+    return [
+        tuple(_element(each, index) if isinstance(each.kind, Listing) else each for each in operands)
+        for index in range(length)
+    ]
+
+
+def _element(values: Meaning, index: int) -> Meaning:
+    assert isinstance(values.kind, Listing)
+    assert values.kind.element is not None
+    if values.items is not None:
+        return values.items[index]
+    return Meaning(values.kind.element, lambda context: values.give(context)[index])
+
+
+def _common_length(lists: Sequence[Sequence[Any]]) -> int:
+    lengths = {len(each) for each in lists}
+    if len(lengths) > 1:
+        raise Refused(MAPPING_ERROR)
+    return lengths.pop()
+
+
+def _choice(test: Meaning, body: Meaning, orelse: Meaning) -> Meaning:
+    kind = joined([body.kind, orelse.kind])
+    return Meaning(kind, lambda context: shaped((body if test.give(context) else orelse).give(context), kind))
+
+
+def _chosen(choices: Choices, context: Context, expected: Type | None) -> Meaning:
+    """A map: choices by the value of its subject, the first of which is outermost."""
+    subject = meaning_of(choices.subject, context)
+    values = [(name.value, meaning_of(value, context, expected)) for name, value in choices.values]
+
+    def refuse(_: Context) -> Any:
+        raise Refused(MAPPING_ERROR)
+
+    made = (
+        meaning_of(choices.otherwise, context, expected)
+        if choices.otherwise is not None
+        else Meaning(values[-1][1].kind, refuse)
+    )
+    for name, value in reversed(values):
+        key = _key(name, subject.kind, context)
+        made = _choice(_equals(subject, key), value, made)
+    return made
+
+
+def _equals(subject: Meaning, key: Any) -> Meaning:
+    return Meaning(Truth(), lambda context: bool(subject.give(context) == key))
+
+
+def _key(name: str, kind: Kind, context: Context) -> Any:
+    if isinstance(kind, Member):
+        return dict(kind.enum.values)[name]
+    if isinstance(kind, Text):
+        return name
+    if name in context.view.type.constants:
+        return context.view.type.constants[name]
+    return _Reader(context).read(ast.parse(name, mode="eval").body).constant
+
+
+_RELATIONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,
-    ast.GtE: operator.ge, ast.In: lambda x, y: x in y, ast.NotIn: lambda x, y: x not in y,
+    ast.GtE: operator.ge, ast.In: lambda x, values: any(x == each for each in values),
+    ast.NotIn: lambda x, values: all(x != each for each in values),
+}  # fmt: skip
+_SYMBOLS: dict[type[ast.operator], str] = {
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.Pow: "**",
 }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class _Evaluator:
+class _Reader:
+    """Reads syntax. Of the context it needs the types only."""
+
     context: Context
 
-    def visit(  # noqa: C901, PLR0912 - a case a syntax
-        self, node: ast.expr, expected: Type | None = None
-    ) -> Any:
+    def read(self, node: ast.expr, expected: Type | None = None) -> Meaning:  # noqa: C901, PLR0912 - a case a syntax
         match node:
-            case ast.Constant():
-                return node.value
-            case ast.List():
-                return [self.visit(item, _element(expected)) for item in node.elts]
-            case ast.Name():
-                return self._name(node.id, expected)
+            case ast.Constant(value):
+                return self._literal_of(value)
+            case ast.List(elements):
+                return _literal([self.read(each, _innermost(expected)) for each in elements])
+            case ast.Name(name):
+                return self._named(_name(name), expected)
             case ast.Attribute():
                 return self._attribute(node)
-            case ast.Subscript():
-                return self.visit(node.value)[self.visit(node.slice)]
-            case ast.UnaryOp():
-                return _UNARY[type(node.op)](self.visit(node.operand))
-            case ast.BinOp():
-                return _BINARY[type(node.op)](self.visit(node.left), self.visit(node.right))
-            case ast.BoolOp(op=ast.And()):
-                return all(self.visit(value) for value in node.values)
-            case ast.BoolOp():
-                return any(self.visit(value) for value in node.values)
+            case ast.Subscript(values, index):
+                return self._indexed(self.read(values), self.read(index).constant)
+            case ast.UnaryOp(ast.Not(), operand):
+                truth = self.read(operand)
+                return Meaning(Truth(), lambda context: not truth.give(context))
+            case ast.UnaryOp(op, operand):
+                return _applied(negate if isinstance(op, ast.USub) else same_number, [self.read(operand)], folds=True)
+            case ast.BinOp(left, op, right):
+                return _applied(OPERATORS[_SYMBOLS[type(op)]], [self.read(left), self.read(right)], folds=True)
+            case ast.BoolOp(op, operands):
+                return self._logic(all if isinstance(op, ast.And) else any, [self.read(each) for each in operands])
             case ast.Compare():
-                return self._compare(node)
-            case ast.IfExp():
-                chosen = self.visit(node.body if self.visit(node.test) else node.orelse, expected)
-                return float(chosen) if self._is_float(node, expected) else chosen
-            case ast.Call(func=ast.Name("has")):
-                return self._has(node.args[0])
-            case ast.Call(func=ast.Name(name)):
-                value: Any = self._call(name, [self.visit(argument) for argument in node.args], expected)
-                return float(value) if name in _GIVE_AN_ARGUMENT and self._is_float(node) else value
+                return self._comparison(node)
+            case ast.IfExp(test, body, orelse):
+                return _choice(self.read(test), self.read(body, expected), self.read(orelse, expected))
+            case ast.Call(ast.Name("has"), [of]):
+                return self._presence(of)
+            case ast.Call(ast.Name(name), arguments):
+                return self._call(name, [self.read(each) for each in arguments], expected)
             case _:
                 raise TypeError(f"{type(node).__name__} is not part of the language")
 
-    def _is_float(self, node: ast.expr, expected: Type | None = None) -> bool:
-        """Whether an expression gives a float, whatever is chosen in it."""
-        match node:
-            case ast.IfExp():
-                return self._is_float(node.body, expected) or self._is_float(node.orelse, expected)
-            case ast.UnaryOp():
-                return self._is_float(node.operand)
-            case ast.BinOp():
-                return isinstance(node.op, ast.Div) or self._is_float(node.left) or self._is_float(node.right)
-            case ast.Call(func=ast.Name(name)):
-                return name in _GIVE_FLOATS or (
-                    name in {"abs", *_GIVE_AN_ARGUMENT} and any(map(self._is_float, node.args))
-                )
-            case ast.Subscript(value=ast.List(elements)):
-                return any(map(self._is_float, elements))
-            case ast.Compare() | ast.BoolOp() | ast.Subscript():
-                return False
+    @staticmethod
+    def _literal_of(value: Any) -> Meaning:
+        match value:
+            case bool():
+                return _constant(Truth(), value)
+            case int():
+                return _constant(Whole(value, value), value)
+            case float():
+                return _constant(Real(), value)
             case _:
-                return isinstance(self.visit(node, expected), float)
+                return _constant(Text(), value)
 
-    def _name(self, name: str, expected: Type | None) -> object:
-        view = self.context.view
-        if view.type.field(name):
-            return view.read(name)
-        named = {
-            "message": view,
-            "source": self.context.source,
-            "received_at": Nanoseconds(self.context.received_at),
-            "true": True,
-            "false": False,
-        }
+    # names
+
+    def _field(self, holder: Meaning, name: str) -> Meaning:
+        assert isinstance(holder.kind, Message)
+        member = holder.kind.type.field(name)
+        assert member is not None, f"{holder.kind.type} has no field '{name}'"
+        return Meaning(kind_of(member.type), lambda context: holder.give(context).read(name))
+
+    def _message(self) -> Meaning:
+        return Meaning(Message(self.context.view.type), lambda context: context.view)
+
+    def _is_variable(self, name: str) -> bool:
+        is_given = name in ("message", "source", "received_at")
+        return is_given or name in self.context.names or self.context.view.type.field(name) is not None
+
+    def _named(self, name: str, expected: Type | None) -> Meaning:
+        if name in self.context.names:
+            return Meaning(kind_of(self.context.names[name][1]), lambda context: seen(*context.names[name]))
+        if self.context.view.type.field(name) is not None:
+            return self._field(self._message(), name)
         values = dict(expected.values) if isinstance(expected, Enum) else {}
-        if name not in named and name in values:
-            return EnumNumber(values[name])
-        return named[name] if name in named else NOT_FINITE[name]
+        match name:
+            case "message":
+                return self._message()
+            case "source":
+                return Meaning(Text(), lambda context: context.source)
+            case "received_at":
+                return Meaning(Time(), lambda context: Nanoseconds(context.received_at))
+            case "true" | "false":
+                return _constant(Truth(), name == "true")
+            case _ if isinstance(expected, Enum) and name in values:
+                return _constant(Member(expected), EnumNumber(values[name]))
+            case _:
+                return _constant(Real(), {"nan": math.nan, "inf": math.inf}[name])
 
-    def _attribute(self, node: ast.Attribute) -> object:
+    def _attribute(self, node: ast.Attribute) -> Meaning:
         root: ast.expr = node
         while isinstance(root, ast.Attribute):
             root = root.value
-        if isinstance(root, ast.Name) and root.id != "message" and not self.context.view.type.field(root.id):
-            return self._constant(ast.unparse(node.value), node.attr)
-        holder: View = self.visit(node.value)
-        return holder.read(node.attr)
+        if isinstance(root, ast.Name) and not self._is_variable(_name(root.id)):
+            return self._constant_of(ast.unparse(node.value), _name(node.attr))
+        return self._field(self.read(node.value), _name(node.attr))
 
-    def _constant(self, holder: str, name: str) -> object:
+    def _constant_of(self, holder: str, name: str) -> Meaning:
         """`SensorState.SENSOR_ERROR`: an enum of the message's own, one of exactly this name, or any."""
         own = f"{self.context.view.type.name}.{holder}"
-        full_names = [own, holder, *(enum.name for enum in self.context.enums if enum.name.endswith(f".{holder}"))]
-        for full_name in full_names:
+        others = [enum.name for enum in self.context.enums if enum.name.endswith(f".{holder}")]
+        for full_name in [own, holder, *others]:
             for enum in self.context.enums:
                 if enum.name == full_name and name in dict(enum.values):
-                    return EnumNumber(dict(enum.values)[name])
+                    return _constant(Member(enum), EnumNumber(dict(enum.values)[name]))
         for ros in self.context.ros_types:
             if ros.short_name == holder and name in ros.constants:
-                return ros.constants[name]
+                return self._literal_of(ros.constants[name])
         raise KeyError(f"there is no {holder}.{name}")
 
-    def _compare(self, node: ast.Compare) -> bool:
-        left = self.visit(node.left)
-        for op, comparator in zip(node.ops, node.comparators, strict=True):
-            right = self.visit(comparator)
-            if not _COMPARE[type(op)](left, right):
-                return False
-            left = right
-        return True
-
-    def _call(self, name: str, arguments: list[Any], expected: Type | None) -> object:
-        function = FUNCTIONS[name]
-        if function.optional and len(arguments) < len(function.parameters) and isinstance(expected, Int):
-            arguments += [expected.low, expected.high]
-        result: Any = function.implementation(*arguments)
-        return Nanoseconds(result) if name.startswith("time_from_") else result
-
-    def _has(self, node: ast.expr) -> bool:
+    def _presence(self, node: ast.expr) -> Meaning:
         if isinstance(node, ast.Attribute):
-            holder, name = self.visit(node.value), node.attr
+            holder, name = self.read(node.value), _name(node.attr)
         else:
-            holder, name = self.context.view, ast.unparse(node)
-        return bool(holder.message.HasField(name))
+            holder, name = self._message(), _name(ast.unparse(node))
+        return Meaning(Truth(), lambda context: bool(holder.give(context).message.HasField(name)))
+
+    # decisions
+
+    @staticmethod
+    def _logic(decide: Callable[[Any], bool], operands: Sequence[Meaning]) -> Meaning:
+        return Meaning(Truth(), lambda context: decide(operand.give(context) for operand in operands))
+
+    def _comparison(self, node: ast.Compare) -> Meaning:
+        first, *others = [self.read(each) for each in (node.left, *node.comparators)]
+        compare = [_RELATIONS[type(op)] for op in node.ops]
+
+        def give(context: Context) -> bool:
+            left, *values = _together([first, others[0]], context)
+            for place, relation in enumerate(compare):
+                right = values[0] if place == 0 else others[place].give(context)
+                if not relation(left, right):
+                    return False
+                left = right
+            return True
+
+        return Meaning(Truth(), give)
+
+    # lists and functions
+
+    @staticmethod
+    def _indexed(values: Meaning, index: int) -> Meaning:
+        assert isinstance(values.kind, Listing)
+        assert values.kind.element is not None
+
+        def give(context: Context) -> Any:
+            elements = values.give(context)
+            if index >= len(elements):
+                raise Refused(MAPPING_ERROR)
+            return elements[index]
+
+        return Meaning(values.kind.element, give)
+
+    def _call(self, name: str, arguments: list[Meaning], expected: Type | None) -> Meaning:
+        if isinstance(arguments[0].kind, Listing) and len(arguments) == 1 and name in ("len", "min", "max", "sum"):
+            return _of_a_list(name, _as_value(arguments[0]), arguments[0].kind)
+        bounds = _innermost(expected)
+        if name in ("clamp", "wrap") and len(arguments) == 1:
+            assert isinstance(bounds, Int)
+            arguments += [self._literal_of(bounds.low), self._literal_of(bounds.high)]
+        return _applied(FUNCTIONS[name], arguments)
+
+
+def _of_a_list(name: str, values: Meaning, kind: Listing) -> Meaning:
+    match name:
+        case "len":
+            return Meaning(Whole(0, (1 << 32) - 1), lambda context: len(values.give(context)))
+        case "sum":
+            made = kind_of_sum(kind)
+            return Meaning(made, lambda context: sum_of(values.give(context), made))
+        case _:
+            assert kind.element is not None
+            of = number(kind.element)
+            return Meaning(of, lambda context: shaped(extreme_of(name, values.give(context)), of))

@@ -57,25 +57,25 @@ def cut_off(cdr: bytes) -> None:
     raise MappingError(f"the message ends after {len(cdr)} bytes, within a string or list")
 
 
-def text(data: bytes) -> str:
+def read_text(data: bytes) -> str:
     """A string from its bytes with the final NUL, which some writers leave out of empty strings."""
     if data and data[-1]:
         raise MappingError("a string does not end with NUL")
     return data[:-1].decode()
 
 
-def wide_text(data: bytes) -> str:
+def read_wide_text(data: bytes) -> str:
     """A wstring from its UTF-16 code units of 32 bits each."""
     units = numbers("I", 4, data)
     return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
 
 
-def texts(many: Iterable[bytes]) -> list[str]:
-    return [text(data) for data in many]
+def read_texts(many: Iterable[bytes]) -> list[str]:
+    return [read_text(data) for data in many]
 
 
-def wide_texts(many: Iterable[bytes]) -> list[str]:
-    return [wide_text(data) for data in many]
+def read_wide_texts(many: Iterable[bytes]) -> list[str]:
+    return [read_wide_text(data) for data in many]
 
 
 def numbers(letter: str, size: int, data: bytes) -> tuple[int | float, ...]:

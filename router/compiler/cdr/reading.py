@@ -16,10 +16,10 @@ from typing import Union
 
 from router.compiler.cdr.primitives import HEADER, object_class, scalar_format
 from router.compiler.expressions.kinds import OCTET, TIME_TYPES
-from router.compiler.expressions.scope import Path, Reads
+from router.compiler.expressions.tree import Path
 from router.compiler.source import Source, call, load
 from router.errors import SourceSpan
-from router.types.model import Field, List, MessageType, String, Type
+from router.types.model import List, MessageType, String, Type
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,9 +188,9 @@ def decoder(declared: Type) -> str | None:
     """The function that decodes the text of a field, None for other types."""
     match declared:
         case String():
-            return "wide_text" if declared.wide else "text"
+            return "read_wide_text" if declared.wide else "read_text"
         case List(element=String(wide=wide)):
-            return "wide_texts" if wide else "texts"
+            return "read_wide_texts" if wide else "read_texts"
         case _:
             return None
 
@@ -372,42 +372,43 @@ class ReadingCode:
         self.is_checked = False
 
 
-class CdrReads(Reads):
-    """Reads of a serialized ROS message: the fields that were asked for, up to the last of them.
+class CdrReads:
+    """Reads of a serialized ROS message: the fields at `paths`, and nothing behind the last of them.
 
-    The code raises MappingError or struct.error if the bytes are no such message. Strings are decoded where they
-    are used, so that an invalid one affects only the targets that use it.
+    `values` are the expressions for those fields, once the statements that `write` appends have run. They raise
+    MappingError or struct.error if the bytes are no such message. Strings are decoded where they are used, so that an
+    invalid one affects only the targets that use it.
     """
 
-    def __init__(self, message: MessageType) -> None:
-        super().__init__()
+    def __init__(self, message: MessageType, paths: Iterable[Path]) -> None:
         self._message = message
-        self._wanted: dict[Path, None] = {}
+        self._variables: dict[Path, str] = {(): "m"}
+        self.values: dict[Path, ast.expr] = {path: self._value(path) for path in paths}
 
-    def field(self, holder: Path, member: Field) -> ast.expr:
-        path = (*holder, member.name)
-        self._wanted[path] = None
-        variable, decode = load(self._variable(path)), decoder(member.type)
+    def _value(self, path: Path) -> ast.expr:
+        declared: Type = self._message
+        for name in path:
+            member = declared.field(name) if isinstance(declared, MessageType) else None
+            assert member is not None  # noqa: S101 - a path of a checked expression
+            declared = member.type
+        variable, decode = load(self._variable(path)), decoder(declared)
         return call(decode, variable) if decode else variable
 
-    def message(self, path: Path) -> ast.expr:
-        return load(self._variable(path))
-
-    def need_objects(self, node: ast.expr) -> None:
-        paths = {variable: path for path, variable in self.variables.items()}
-        for inner in ast.walk(node):
-            if isinstance(inner, ast.Name) and inner.id in paths:
-                self._wanted[paths[inner.id]] = None
-
-    def steps(self) -> Sequence[Step]:
-        """The steps that read the fields, once all expressions are checked."""
-        return steps(self._message, self._wanted, self._variable)
+    def _variable(self, path: Path) -> str:
+        """The variable for a path, the same each time."""
+        if path not in self._variables:
+            variable = "_".join((self._variables[()], *path))
+            while variable in self._variables.values():  # a.b_c and a_b.c
+                variable += "_"
+            self._variables[path] = variable
+        return self._variables[path]
 
     def write(self, out: Source, span: SourceSpan) -> None:
+        """Append the statements that read the fields."""
         with out.block("if cdr[:2] != CDR_LE:", span):
             out.line("refuse(cdr[:2])", span)
         code = ReadingCode(out, span)
-        code.write(self.steps())
+        code.write(steps(self._message, self.values, self._variable))
         if not code.is_checked:
             with out.block("if at > len(cdr):", span):
                 out.line("cut_off(cdr)", span)

@@ -7,15 +7,16 @@ runs, and one of eight packers is taken.
 
 from __future__ import annotations
 
-import ast
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Union
 
 from router.compiler.cdr.primitives import HEADER, put_text, put_wide_text, scalar_format
+from router.compiler.expressions.tree import Node, Variable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.compiler.source import Source
+from router.compiler.python import NO_VALUES, Values, lists_of, render
+from router.compiler.source import Source, placed
 from router.errors import SourceSpan
 from router.types.model import Bool, Float, List, MessageType, String, Type
 
@@ -28,7 +29,7 @@ class Put:
     """A scalar, which `node` computes. `format` is its struct letter, and gives its size and alignment."""
 
     format: str
-    node: ast.expr
+    node: Node
     span: SourceSpan
 
     @property
@@ -54,18 +55,17 @@ class Blob:
 class Text:
     """A string known at run time; `wide` for a wstring."""
 
-    node: ast.expr
+    node: Node
     wide: bool
     span: SourceSpan
 
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """`body` once for each of `values`, each in the variable `variable`."""
+    """`body` once for each element of `lists`, which are taken side by side, with the variables of these elements."""
 
     type: List
-    values: ast.expr
-    variable: str
+    lists: tuple[tuple[str, Node], ...]
     body: tuple[Step, ...]
     span: SourceSpan
 
@@ -95,7 +95,7 @@ def steps(plan: Plan) -> Iterable[Step]:  # noqa: C901 - a case a plan
             for item in plan.items:
                 yield from steps(item)
         case Each():
-            yield Repeat(plan.type, plan.values, plan.variable, tuple(steps(plan.element)), plan.span)
+            yield Repeat(plan.type, plan.lists, tuple(steps(plan.element)), plan.span)
 
 
 def _default(declared: Type, default: Any) -> Iterable[Step]:
@@ -208,21 +208,13 @@ def _add_known(data: bytes, letters: list[str], arguments: list[Put | bytes]) ->
         letters.append(f"{len(data)}x")  # zeros, which struct writes by itself
 
 
-def write_message(out: Source, plan: Record, name: str) -> str:
+def write_message(out: Source, plan: Record, name: str, values: Values = NO_VALUES) -> str:
     """Append the code that makes the CDR bytes of a message, and return the expression that is the bytes.
 
-    `name` is part of the names of packers and known bytes, and different for each message of a function.
+    `name` is part of the names of packers and known bytes, and different for each message of a function. `values` are
+    the fields that were read.
     """
-    runs = _runs(steps(plan))
-    first = runs[0] if isinstance(runs[0], _Run) else _Run(())
-    fixed = runs == [first]
-    letters, arguments = first.static(HEADER if fixed else b"")
-    pack = out.constant(f"pack_{name}", struct.Struct(letters).pack)
-    _call(out, "data = {}" if fixed else "data = bytearray({})", name, pack, arguments, plan.span)
-    if fixed:
-        return "data"
-    _write(out, runs[1:] if runs[0] is first else runs, name, plan.span)
-    return "HEADER + data"
+    return _Writing(out, name, values).message(plan)
 
 
 def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
@@ -240,47 +232,67 @@ def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
     return [*found, _Run(tuple(together))] if together or not found else found
 
 
-def _call(
-    out: Source, statement: str, name: str, function: str, arguments: Sequence[Put | bytes], span: SourceSpan
-) -> None:
-    """Append a statement around a call, one argument a line."""
-    before, _, after = statement.partition("{}")
-    out.line(f"{before}{function}(", span)
-    with out.indented():
-        for argument in arguments:
-            if isinstance(argument, bytes):
-                out.line(f"{out.constant(f'known_{name}', argument)},", span)
-            else:
-                out.line(f"{out.expression(argument.node)},", argument.span)
-    out.line(f"){after}", span)
+@dataclass(frozen=True, slots=True)
+class _Writing:
+    """Writes the statements for one message; see `write_message`."""
 
+    out: Source
+    name: str
+    values: Values
 
-def _write(out: Source, runs: Iterable[_Run | Text | Repeat], name: str, span: SourceSpan) -> None:
-    """Append the code behind the first string or sequence, where offsets are known at run time, modulo 8."""
-    for run in runs:
-        match run:
-            case _Run():
-                packers = tuple(struct.Struct(run.floating(phase)[0]).pack for phase in range(8))
-                at = out.constant(f"pack_{name}_at", packers)
-                _call(out, "data += {}", name, f"{at}[len(data) & 7]", run.floating(0)[1], span)
-            case Text():
-                put = "put_wide_text" if run.wide else "put_text"
-                out.line(f"{put}(data, {out.expression(run.node)})", run.span)
-            case Repeat():
-                _repeat(out, run, name)
+    def message(self, plan: Record) -> str:
+        runs = _runs(steps(plan))
+        first = runs[0] if isinstance(runs[0], _Run) else _Run(())
+        fixed = runs == [first]
+        letters, arguments = first.static(HEADER if fixed else b"")
+        pack = self.out.constant(f"pack_{self.name}", struct.Struct(letters).pack)
+        self._call("data = {}" if fixed else "data = bytearray({})", pack, arguments, plan.span)
+        if fixed:
+            return "data"
+        self._write(runs[1:] if runs[0] is first else runs, plan.span)
+        return "HEADER + data"
 
+    def _expression(self, node: Node) -> str:
+        return self.out.expression(render(node, self.values))
 
-def _repeat(out: Source, repeat: Repeat, name: str) -> None:
-    values = out.expression(repeat.values)
-    out.line(f"values = {values}", repeat.span)
-    if repeat.type.length is not None:
-        out.line(f"want_length(len(values), {repeat.type.length})", repeat.span)
-    else:
-        out.line(f"put_length(data, len(values), {repeat.type.bound})", repeat.span)
-    if len(repeat.body) == 1 and isinstance(body := repeat.body[0], Put):
-        plain = isinstance(body.node, ast.Name) and body.node.id == repeat.variable
-        each = "values" if plain else f"[{out.expression(body.node)} for {repeat.variable} in values]"
-        out.line(f"put_numbers(data, {body.format!r}, {body.size}, {each})", repeat.span)
-        return
-    with out.block(f"for {repeat.variable} in values:", repeat.span):
-        _write(out, _runs(repeat.body), name, repeat.span)
+    def _call(self, statement: str, function: str, arguments: Sequence[Put | bytes], span: SourceSpan) -> None:
+        """Append a statement around a call, one argument a line."""
+        before, _, after = statement.partition("{}")
+        self.out.line(f"{before}{function}(", span)
+        with self.out.indented():
+            for argument in arguments:
+                if isinstance(argument, bytes):
+                    self.out.line(f"{self.out.constant(f'known_{self.name}', argument)},", span)
+                else:
+                    self.out.line(f"{self._expression(argument.node)},", argument.span)
+        self.out.line(f"){after}", span)
+
+    def _write(self, runs: Iterable[_Run | Text | Repeat], span: SourceSpan) -> None:
+        """Append the code behind the first string or sequence, where offsets are known at run time, modulo 8."""
+        for run in runs:
+            match run:
+                case _Run():
+                    packers = tuple(struct.Struct(run.floating(phase)[0]).pack for phase in range(8))
+                    at = self.out.constant(f"pack_{self.name}_at", packers)
+                    self._call("data += {}", f"{at}[len(data) & 7]", run.floating(0)[1], span)
+                case Text():
+                    put = "put_wide_text" if run.wide else "put_text"
+                    self.out.line(f"{put}(data, {self._expression(run.node)})", run.span)
+                case Repeat():
+                    self._repeat(run)
+
+    def _repeat(self, repeat: Repeat) -> None:
+        out = self.out
+        names, iterated = lists_of(repeat.lists, self.values)
+        out.line(f"values = {out.expression(placed(iterated, repeat.span))}", repeat.span)
+        if repeat.type.length is not None:
+            out.line(f"want_length(len(values), {repeat.type.length})", repeat.span)
+        else:
+            out.line(f"put_length(data, len(values), {repeat.type.bound})", repeat.span)
+        if len(repeat.body) == 1 and isinstance(body := repeat.body[0], Put):
+            plain = isinstance(body.node, Variable) and body.node.name == names
+            each = "values" if plain else f"[{self._expression(body.node)} for {names} in values]"
+            out.line(f"put_numbers(data, {body.format!r}, {body.size}, {each})", repeat.span)
+            return
+        with out.block(f"for {names} in values:", repeat.span):
+            self._write(_runs(repeat.body), repeat.span)

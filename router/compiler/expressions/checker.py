@@ -1,9 +1,8 @@
-"""Check an expression, innermost node first, and make typed Python of it: names, fields, constants and calls."""
+"""Check an expression, innermost node first, and make a typed tree of it: names, fields, constants and calls."""
 
 from __future__ import annotations
 
 import ast
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,9 +10,20 @@ from router.compiler.expressions import operators, spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function
 from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, MessageKind, StringKind, TimeKind
 from router.compiler.expressions.operators import constant
-from router.compiler.expressions.scope import MESSAGE, SOURCE, ExpressionError, Scope, Typed
+from router.compiler.expressions.scope import ExpressionError, Scope, field_of
 from router.compiler.expressions.syntax import Parsed, dotted, forbidden
-from router.compiler.source import attribute, call, load
+from router.compiler.expressions.tree import (
+    MESSAGE,
+    SOURCE,
+    Call,
+    Constant,
+    Listed,
+    Node,
+    Present,
+    Read,
+    Variable,
+    constant_of,
+)
 from router.errors import Code, Located, SourceSpan, did_you_mean, nearest, plural
 from router.table.model import Choices, Expression
 from router.table.nodes import TextPlace
@@ -27,28 +37,24 @@ MOST_CHOICES = 100
 """Values of a map, which nests as deep."""
 
 
-def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Typed:
-    """The typed Python of an expression. Raises ExpressionError.
+def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Node:
+    """The typed tree of an expression. Raises ExpressionError.
 
     `expected` is the type of the field to be filled: clamp() and wrap() take their bounds from it, bare names are
     looked up among the values of an enum.
     """
     if expression.literal:
-        typed = constant(expression.text, expression.span)
-    elif expression.choices is not None:
-        typed = _chosen(expression.choices, expression.span, scope, expected)
-    elif expression.items is not None:
+        return constant(expression.text, expression.span)
+    if expression.choices is not None:
+        return _chosen(expression.choices, expression.span, scope, expected)
+    if expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
-        typed = operators.list_of(items, expression.span)
-    else:
-        text = Parsed(expression)
-        typed = _Checker(text, scope).check(text.tree, expected)
-    if typed.path is None:
-        scope.reads.need_objects(typed.node)
-    return typed
+        return operators.list_of(items, expression.span)
+    text = Parsed(expression)
+    return _Checker(text, scope).check(text.tree, expected)
 
 
-def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
+def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
     """A chain of comparisons with the value of the subject.
 
     Without `else`, the last value is for itself alone: any other one is refused at run time.
@@ -56,42 +62,40 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
     if len(choices.values) > MOST_CHOICES:
         raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
     subject = check(choices.subject, scope)
-    keys = [_key(name, subject, scope) for name, _ in choices.values]
+    keys: list[Node] = [_key(name, subject, scope) for name, _ in choices.values]
     _want_different(choices, keys)
     values = [check(value, scope, expected) for _, value in choices.values]
     if choices.otherwise is not None:
         made = check(choices.otherwise, scope, expected)
     else:
         _want_all(subject, keys, span, scope)
-        made, last = replace(values[-1], node=copy.deepcopy(values[-1].node)), keys[-1]
+        made, last = values[-1], keys[-1]
         if isinstance(subject.kind, EnumKind):
-            fitted = call("fit", copy.deepcopy(subject.node), copy.deepcopy(last.node), copy.deepcopy(last.node))
-            keys[-1] = Typed.at(last.span, last.kind, fitted)
+            keys[-1] = Call(last.kind, last.span, "fit", (subject, last, last))
     for (name, _), key, value in reversed(list(zip(choices.values, keys, values, strict=True))):
-        test = operators.comparison([ast.Eq()], [replace(subject, node=copy.deepcopy(subject.node)), key], name.span)
-        made = operators.choice(test, value, made, value.span)
+        made = operators.choice(operators.equality(subject, key, name.span), value, made, value.span)
     return replace(made, span=span)
 
 
-def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
+def _key(name: Located[str], subject: Node, scope: Scope) -> Node:
     """The value that a key of a map stands for: a name of the subject's enum, or a constant."""
     if isinstance(subject.kind, EnumKind):
         values = dict(subject.kind.enum.values)
         if name.value in values:
-            return Typed.at(name.span, subject.kind, ast.Constant(values[name.value]))
+            return Constant(subject.kind, name.span, values[name.value])
         message = f"'{subject.kind.enum.name}' has no value '{name.value}'"
         raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, values))
     if isinstance(subject.kind, StringKind):
-        key = Typed.at(name.span, StringKind(), ast.Constant(name.value))
+        key = Constant(StringKind(), name.span, name.value)
         want_senders([subject, key], scope)
         return key
     if name.value in scope.message.constants:
         return constant(scope.message.constants[name.value], name.span)
-    key = check(Expression(name.value, TextPlace(name.span)), scope)
-    if key.constant is None:
+    checked = check(Expression(name.value, TextPlace(name.span)), scope)
+    if constant_of(checked) is None:
         message = f"'{name.value}' is no constant"
         raise ExpressionError(name.span, Code.TYPE_MISMATCH, message, "the keys of a map are values, not fields")
-    return key
+    return checked
 
 
 def _key_hint(name: str, values: Mapping[str, int]) -> str:
@@ -103,20 +107,20 @@ def _key_hint(name: str, values: Mapping[str, int]) -> str:
     return "write `else` for all other values" if name in ("default", "_", "*", "other") else did_you_mean(name, values)
 
 
-def _want_different(choices: Choices, keys: Sequence[Typed]) -> None:
+def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
     """Refuse a map in which two keys are one value, such as two names of an enum's number."""
     names: dict[object, str] = {}
     for (name, _), key in zip(choices.values, keys, strict=True):
-        first = names.setdefault(key.constant, name.value)
+        first = names.setdefault(constant_of(key), name.value)
         if first != name.value:
             message = f"'{name.value}' is the same value as '{first}'"
             raise ExpressionError(name.span, Code.DUPLICATE_KEY, message, "remove one of the two")
 
 
-def _want_all(subject: Typed, keys: Sequence[Typed], span: SourceSpan, scope: Scope) -> None:
+def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
     """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
     hint = "list them, or say what they become: `else: VALUE`"
-    covered = {key.constant for key in keys}
+    covered = {constant_of(key) for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
         return
     if is_source(subject) and scope.sources and covered == {*scope.sources}:
@@ -142,18 +146,18 @@ class _Checker:
     scope: Scope
     depth: int = 0
 
-    def check(self, node: ast.expr, expected: Type | None = None) -> Typed:
+    def check(self, node: ast.expr, expected: Type | None = None) -> Node:
         span = self.text.span(node)
         self.depth += 1
         if self.depth > DEEPEST:
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, "not an expression: nested too deeply")
-        typed = self._rule(node, span, expected)
+        checked = self._rule(node, span, expected)
         self.depth -= 1
-        return typed
+        return checked
 
     def _rule(  # noqa: C901, PLR0912 - a case a syntax
         self, node: ast.expr, span: SourceSpan, expected: Type | None
-    ) -> Typed:
+    ) -> Node:
         match node:
             case ast.Constant():
                 return operators.constant(node.value, span)
@@ -162,16 +166,16 @@ class _Checker:
             case ast.Name():
                 return named(node.id, span, self.scope, expected)
             case ast.Attribute() if path := constant_path(node, self.scope):
-                return constant_of(path, node, self.text, self.scope)
+                return constant_at(path, node, self.text, self.scope)
             case ast.Attribute():
-                return field_of(self.check(node.value), node, self.text, self.scope)
+                return member_of(self.check(node.value), node, self.text)
             case ast.Subscript():
                 return operators.element_of(self.check(node.value), self.check(node.slice), span)
             case ast.UnaryOp():
                 return operators.unary(node.op, self.check(node.operand), span)
             case ast.BinOp():
-                operators.want_binary(node.op, span)
-                return operators.binary(node.op, self.check(node.left), self.check(node.right), span)
+                operator = operators.want_binary(node.op, span)
+                return operators.binary(operator, self.check(node.left), self.check(node.right), span)
             case ast.BoolOp():
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
             case ast.Compare():
@@ -187,37 +191,36 @@ class _Checker:
             case _:
                 raise forbidden(node, span)
 
-    def _call(self, node: ast.Call, span: SourceSpan, expected: Type | None) -> Typed:
+    def _call(self, node: ast.Call, span: SourceSpan, expected: Type | None) -> Node:
         name = called_name(node, self.text)
         if name == HAS:
             return self._has(node, span)
         function = function_named(name, self.text.span(node.func))
         return call_of(function, [self.check(argument) for argument in node.args], span, expected)
 
-    def _has(self, node: ast.Call, span: SourceSpan) -> Typed:
+    def _has(self, node: ast.Call, span: SourceSpan) -> Node:
         """`has(field)` takes the path of its argument instead of the value; the argument is checked as well."""
         path = field_path(node.args[0], self.scope) if len(node.args) == 1 else None
         if not path:
             raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes one field")
-        argument = self.check(node.args[0])
-        return presence(path, argument.span, span, self.scope)
+        return presence(self.check(node.args[0]), path, span)
 
 
-def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
+def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
     """A name that stands alone. `expected` is the type of the field that it fills."""
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
-        return scope.read((), member, span)
+        return field_of(scope.whole_message(span), member, span)
     if text in scope.given:
         return _given(text, span, scope)
     if text in ("true", "false"):  # as YAML spells them
         return constant(text == "true", span)
     values = dict(expected.values) if isinstance(expected, Enum) else {}
     if isinstance(expected, Enum) and text in values:
-        return Typed.at(span, EnumKind(expected), ast.Constant(values[text]))
+        return Constant(EnumKind(expected), span, values[text])
     if text in NOT_FINITE:
-        return Typed.at(span, FloatKind(32), ast.Constant(NOT_FINITE[text]))
+        return Constant(FloatKind(32), span, NOT_FINITE[text])
     raise _unknown(text, span, scope, expected)
 
 
@@ -256,25 +259,28 @@ def _of_an_enum(text: str, scope: Scope) -> str:
     return f"did you mean '{values[near]}.{near}'?" if near else ""
 
 
-def _given(text: str, span: SourceSpan, scope: Scope) -> Typed:
+def _given(text: str, span: SourceSpan, scope: Scope) -> Node:
     if text == MESSAGE:
         return scope.whole_message(span)
-    return Typed.at(span, StringKind() if text == SOURCE else TimeKind(), load(text))
+    return Variable(StringKind() if text == SOURCE else TimeKind(), span, text)
 
 
-def is_source(operand: Typed) -> bool:
+def is_source(operand: Node) -> bool:
     """Whether an operand is the name of the endpoint that sent the message."""
-    return isinstance(operand.node, ast.Name) and operand.node.id == SOURCE
+    return isinstance(operand, Variable) and operand.name == SOURCE
 
 
-def want_senders(operands: Sequence[Typed], scope: Scope) -> None:
+def want_senders(operands: Sequence[Node], scope: Scope) -> None:
     """Refuse texts that are compared with the name of the sender, and that no sender of the message has."""
     if not scope.sources or not any(map(is_source, operands)):
         return
-    for each in (each for operand in operands for each in (operand, *(operand.items or ()))):
-        if isinstance(each.constant, str) and each.constant not in scope.sources:
-            message = f"'{each.constant}' is no source of this route"
-            raise ExpressionError(each.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(each.constant, scope.sources))
+    for each in (
+        each for operand in operands for each in (operand.items if isinstance(operand, Listed) else (operand,))
+    ):
+        name = constant_of(each)
+        if isinstance(name, str) and name not in scope.sources:
+            message = f"'{name}' is no source of this route"
+            raise ExpressionError(each.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, scope.sources))
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
@@ -285,7 +291,7 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
     return path
 
 
-def field_of(holder: Typed, node: ast.Attribute, text: Parsed, scope: Scope) -> Typed:
+def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """`holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
@@ -296,10 +302,10 @@ def field_of(holder: Typed, node: ast.Attribute, text: Parsed, scope: Scope) -> 
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         message = f"{holder.kind.type} has no field '{node.attr}'"
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
-    return scope.field_of(holder, member, span)
+    return field_of(holder, member, span)
 
 
-def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Typed:
+def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
     """`SensorState.SENSOR_ERROR`: an enum's value or a ROS type's constant, at `path`."""
     holder_name = ".".join(path[:-1])
     holders = scope.holders(holder_name)
@@ -320,7 +326,7 @@ def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
         raise ExpressionError(text.span(node), Code.UNKNOWN_ENUM_VALUE, message, "write the enum's full name")
     holder, value = found[0]
     literal = constant(value, text.span(node))
-    return Typed(EnumKind(holder), literal.node, literal.span) if isinstance(holder, Enum) else literal
+    return replace(literal, kind=EnumKind(holder)) if isinstance(holder, Enum) else literal
 
 
 def _without_root(path: tuple[str, ...], scope: Scope) -> str:
@@ -342,20 +348,14 @@ def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
     return path[1:] if path[0] == MESSAGE and scope.message.field(MESSAGE) is None else path
 
 
-def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, scope: Scope) -> Typed:
-    """`has(path)`. Raises ExpressionError for a path that is no field which can be missing."""
-    holder = scope.message
-    for part in path[:-1]:
-        inner = holder.field(part)
-        if inner is None or not isinstance(inner.type, MessageType):
-            raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
-        holder = inner.type
-    member = holder.field(path[-1])
-    if member is None or not member.has_presence:
+def presence(argument: Node, path: tuple[str, ...], span: SourceSpan) -> Present:
+    """`has(path)`. Raises ExpressionError for what is no field that can be missing."""
+    if not isinstance(argument, Read) and len(path) > 1:
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
+    if not isinstance(argument, Read) or not argument.field.has_presence:
         hint = "has() is for a payload's submessages and optional fields"
-        raise ExpressionError(field_span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
-    has_field = attribute(scope.reads.message(path[:-1]), "HasField")
-    return Typed.at(span, BoolKind(), ast.Call(has_field, [ast.Constant(path[-1])], []))
+        raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
+    return Present(BoolKind(), span, argument.holder, argument.field)
 
 
 def called_name(node: ast.Call, text: Parsed) -> str:
@@ -380,7 +380,7 @@ def function_named(name: str, span: SourceSpan) -> Function:
     return function
 
 
-def call_of(function: Function, arguments: Sequence[Typed], span: SourceSpan, expected: Type | None) -> Typed:
+def call_of(function: Function, arguments: Sequence[Node], span: SourceSpan, expected: Type | None) -> Node:
     """The call as a checked expression; bounds that it leaves out are those of the field `expected`."""
     if function.optional and len(arguments) == len(function.parameters) - function.optional:
         arguments = [*arguments, *_bounds(function, span, expected)]
@@ -392,14 +392,14 @@ def call_of(function: Function, arguments: Sequence[Typed], span: SourceSpan, ex
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, f"{function.name}(): {error}") from None
     if function.gives_an_argument:
         arguments = [operators.as_float(argument, kind) for argument in arguments]
-    return Typed.at(span, kind, call(function.name, *[argument.node for argument in arguments]))
+    return Call(kind, span, function.name, tuple(arguments))
 
 
-def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Typed]:
+def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Node]:
     if not isinstance(expected, Int):
         message = f"{function.name}() needs bounds here, where no integer field is filled"
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
-    return [Typed.at(span, IntKind(bound, bound), ast.Constant(bound)) for bound in (expected.low, expected.high)]
+    return [Constant(IntKind(bound, bound), span, bound) for bound in (expected.low, expected.high)]
 
 
 def _want_count(function: Function, count: int, span: SourceSpan) -> None:
@@ -410,7 +410,7 @@ def _want_count(function: Function, count: int, span: SourceSpan) -> None:
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
 
 
-def _want_accepted(function: Function, arguments: Sequence[Typed]) -> None:
+def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:
     repeated = [function.parameters[-1]] * (len(arguments) - len(function.parameters))
     for parameter, argument in zip([*function.parameters, *repeated], arguments, strict=True):
         if not isinstance(argument.kind, parameter.accepts):

@@ -7,6 +7,7 @@ which lists, and what is made of their elements.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum as Enumeration
 from typing import Union
@@ -14,6 +15,9 @@ from typing import Union
 from router.compiler.expressions.kinds import Kind, ListKind
 from router.errors import SourceSpan
 from router.types.model import Field
+
+Path = tuple[str, ...]
+"""The names that lead from the source message to a field of it; the empty path is the message."""
 
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 """Variables that every expression can name beside the fields; a field of the same name wins."""
@@ -206,6 +210,52 @@ Node = Union[
 def constant_of(node: Node) -> bool | int | float | str | None:
     """The value of a Constant, None for everything else (there is no None in the language)."""
     return node.value if isinstance(node, Constant) else None
+
+
+def path_of(node: Node) -> Path | None:
+    """The path of a field of the source message, or of the message itself; None for everything else."""
+    names: list[str] = []
+    while isinstance(node, Read):
+        names.append(node.field.name)
+        node = node.holder
+    return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
+
+
+def parts_of(node: Node) -> tuple[Node, ...]:
+    """The nodes directly in this one."""
+    match node:
+        case Constant() | Variable():
+            return ()
+        case Read() | Present():
+            return (node.holder,)
+        case Element():
+            return (node.values,)
+        case Listed():
+            return node.items
+        case Each():
+            return (*(values for _, values in node.lists), node.element)
+        case Unary():
+            return (node.operand,)
+        case Binary():
+            return node.left, node.right
+        case Compare() | Logic():
+            return node.operands
+        case Contains():
+            return node.sought, node.values
+        case Choice():
+            return node.test, node.body, node.orelse
+        case Call():
+            return node.arguments
+
+
+def paths_in(node: Node) -> Iterator[Path]:
+    """The paths of the fields that an expression reads, each as far as names lead: `a.b` alone for `a.b`."""
+    path = path_of(node)
+    if path is not None:
+        yield path
+        return
+    for part in parts_of(node):
+        yield from paths_in(part)
 
 
 CHECKS = ("fit", "fit_text", "octets", "named", "member")

@@ -13,7 +13,6 @@ from google.protobuf.descriptor import Descriptor
 
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.executors import CARRIER, Executor, Executors
-from router.compiler.expressions import ParsedReads
 from router.compiler.lowering.expressions import Lowering, Names, readable
 from router.compiler.lowering.messages import MessageWriter, Unlowered
 from router.compiler.lowering.operations import (
@@ -68,31 +67,12 @@ class LoweredTopics:
 
 def lower_topics(routes: Sequence[CheckedRoute], envelope: Envelope) -> LoweredTopics:
     """Lower what can be lowered of a table without errors."""
-    lowered: dict[str, LoweredRoute] = {}
-    own: dict[tuple[str, str], Executor] = {}
-    needs_python: dict[str, tuple[str, SourceSpan]] = {}  # by topic: the first route that does, and its target
+    executors = _executors(routes, envelope)
+    lowered = {}
     for checked in routes:
-        route = checked.route.name
-        made, reasons = _lower_what_can_be(checked, envelope)
-        if made is not None:
-            lowered[route] = made
-        for target in _published(checked):
-            executor = own[route, target.label] = reasons.get(target.label, CARRIER)
-            if not executor.is_carrier:
-                needs_python.setdefault(target.label, (route, target.span))
-    executors: Executors = {
-        (route, topic, None): _shared(topic, *needs_python[topic])
-        if executor.is_carrier and topic in needs_python
-        else executor
-        for (route, topic), executor in own.items()
-    }
-    for checked in routes:
-        route = checked.route.name
-        carried = [target for target in _published(checked) if executors[route, target.label, None].is_carrier]
-        if not carried:
-            lowered.pop(route, None)
-        elif len(carried) < len(lowered[route].targets):  # fewer fields are read
-            lowered[route] = lower(checked, carried, envelope)
+        carried = [to for to in _published(checked) if executors[checked.route.name, to.label, None].is_carrier]
+        if carried:
+            lowered[checked.route.name] = lower(checked, carried, envelope)
     return LoweredTopics(lowered, executors)
 
 
@@ -100,34 +80,34 @@ def _published(checked: CheckedRoute) -> list[CheckedTarget]:
     return [target for target in checked.targets if target.topic]
 
 
-def _lower_what_can_be(checked: CheckedRoute, envelope: Envelope) -> tuple[LoweredRoute | None, dict[str, Executor]]:
-    """Lower the topics of a route that do not need Python, whatever others of the topic do, and say why the rest does.
-
-    All are lowered together, and one by one only where that fails.
-    """
-    reasons = {target.label: reason for target in _published(checked) if (reason := _python_in(checked, target))}
-    immediate = [target for target in _published(checked) if target.label not in reasons]
-    try:
-        return (lower(checked, immediate, envelope) if immediate else None), reasons
-    except Unlowered:
-        pass
-    carried = []
-    for target in immediate:
-        try:
-            lower(checked, [target], envelope)
-            carried.append(target)
-        except Unlowered as reason:
-            reasons[target.label] = Executor(str(reason), reason.span)
-    return (lower(checked, carried, envelope) if carried else None), reasons
+def _executors(routes: Sequence[CheckedRoute], envelope: Envelope) -> Executors:
+    own: dict[tuple[str, str], Executor] = {}
+    needs_python: dict[str, tuple[str, SourceSpan]] = {}  # by topic: the first route that does, and its target
+    for checked in routes:
+        for target in _published(checked):
+            executor = own[checked.route.name, target.label] = _own_executor(checked, target, envelope)
+            if not executor.is_carrier:
+                needs_python.setdefault(target.label, (checked.route.name, target.span))
+    return {
+        (route, topic, None): _shared(topic, *needs_python[topic])
+        if executor.is_carrier and topic in needs_python
+        else executor
+        for (route, topic), executor in own.items()
+    }
 
 
-def _python_in(checked: CheckedRoute, target: CheckedTarget) -> Executor | None:
-    """Return the executor of a target that the table has Python serve, whatever its message is."""
+def _own_executor(checked: CheckedRoute, target: CheckedTarget, envelope: Envelope) -> Executor:
+    """The executor of a target, without regard to others of its topic."""
+    return Executor("typed trees are not lowered yet", target.span)
     if checked.collect is not None:
         return Executor("`collect` needs it", checked.collect.span)
     if target.declared.on_limit is OnLimit.LATEST:
         return Executor("`on_limit: latest` needs it", target.span)
-    return None
+    try:
+        lower(checked, [target], envelope)
+    except Unlowered as reason:
+        return Executor(str(reason), reason.span)
+    return CARRIER
 
 
 def _shared(topic: str, route: str, span: SourceSpan) -> Executor:

@@ -1,0 +1,219 @@
+"""The oracle's kinds and values: what docs/reference/table.md says of numbers, and how expressions see fields."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Union
+
+from router.errors import MappingError
+from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
+
+NS = 1_000_000_000
+MAPPING_ERROR, NON_FINITE = "mapping_error", "non_finite"
+
+
+class Refused(MappingError):
+    """There is no result. `reasons` has more than one where it depends on what is computed first."""
+
+    def __init__(self, *reasons: str) -> None:
+        super().__init__(" or ".join(sorted(reasons)))
+        self.reasons = frozenset(reasons)
+
+
+class Nanoseconds(int):
+    """A time, told apart from a number."""
+
+
+class EnumNumber(int):
+    """The value of a protobuf enum, told apart from a number: it saturates."""
+
+
+# kinds
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, slots=True)
+class Real:
+    """`low` and `high` are what clamp() leaves of it, if its bounds are constants."""
+
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Time:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    enum: Enum
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    type: MessageType
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """`length` is None where it is not known from the type. An empty literal has no `element`."""
+
+    element: Kind | None
+    length: int | None = None
+
+
+Kind = Union[Truth, Whole, Real, Text, Time, Member, Message, Listing]
+
+INT32 = Whole(-(1 << 31), (1 << 31) - 1)
+SIGNED = Whole(-(1 << 63), (1 << 63) - 1)
+UNSIGNED = Whole(0, (1 << 64) - 1)
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+"""Messages that are read as one value."""
+
+
+def kind_of(declared: Type) -> Kind:
+    match declared:
+        case Bool():
+            return Truth()
+        case Int():
+            return Whole(declared.low, declared.high)
+        case Float():
+            return Real()
+        case String():
+            return Text()
+        case Bytes():
+            return Listing(Whole(0, 255))
+        case Enum():
+            return Member(declared)
+        case List():
+            return Listing(kind_of(declared.element), declared.length)
+        case MessageType():
+            return Time() if declared.name in TIMES else Message(declared)
+
+
+def whole(bounds: Iterable[int]) -> Whole:
+    """The integers between these, as far as 64 bits hold them."""
+    made = [*bounds]
+    limits = SIGNED if min(made) < 0 else UNSIGNED
+    return Whole(max(min(made), limits.low), min(max(made), limits.high))
+
+
+def number(kind: Kind) -> Whole | Real:
+    """The kind of a number; an enum is any int32."""
+    if isinstance(kind, Member):
+        return INT32
+    if isinstance(kind, (Whole, Real)):
+        return kind
+    raise TypeError(f"{kind} is no number")
+
+
+def joined(kinds: Sequence[Kind]) -> Kind:
+    """The kind of what is of one of these kinds."""
+    first, *others = kinds
+    if all(kind == first for kind in others):
+        return first
+    if all(isinstance(kind, Listing) for kind in kinds):
+        lists = [kind for kind in kinds if isinstance(kind, Listing)]
+        elements = [kind.element for kind in lists if kind.element is not None]
+        lengths = {kind.length for kind in lists}
+        return Listing(joined(elements) if elements else None, lengths.pop() if len(lengths) == 1 else None)
+    numbers = [number(kind) for kind in kinds]
+    wholes = [kind for kind in numbers if isinstance(kind, Whole)]
+    if len(wholes) < len(numbers):
+        return Real()
+    return whole([bound for kind in wholes for bound in (kind.low, kind.high)])
+
+
+def shaped(value: Any, kind: Kind) -> Any:
+    """A value as one of this kind. Raises Refused for an integer that does not fit."""
+    match kind:
+        case Whole(low, high):
+            if not low <= value <= high:
+                raise Refused(MAPPING_ERROR)
+            return int(value)
+        case Real():
+            return float(value)
+        case Member():
+            return EnumNumber(value)
+        case Time():
+            return Nanoseconds(value)
+        case Listing(element) if element is not None:
+            return all_of([lambda each=each: shaped(each, element) for each in value])
+        case _:
+            return value
+
+
+def all_of(computations: Iterable[Any]) -> list[Any]:
+    """What each computation gives. If some are refused, it is for one of their reasons."""
+    made: list[Any] = []
+    reasons: set[str] = set()
+    for compute in computations:
+        try:
+            made.append(compute())
+        except Refused as refused:
+            reasons |= refused.reasons
+    if reasons:
+        raise Refused(*reasons)
+    return made
+
+
+# messages
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A message, as an object or a mapping, together with what its type model says about it."""
+
+    message: Any
+    type: MessageType
+
+    def read(self, name: str) -> Any:
+        """The value of a field. Raises KeyError when the type has none of this name."""
+        field = self.type.field(name)
+        if field is None:
+            raise KeyError(f"{self.type} has no field '{name}'")
+        return seen(self.raw(name), field.type)
+
+    def raw(self, name: str) -> Any:
+        return self.message[name] if isinstance(self.message, Mapping) else getattr(self.message, name)
+
+
+def seen(raw: Any, declared: Type) -> Any:
+    """A field's value as expressions see it. Raises Refused for text that is not UTF-8, which comes as bytes."""
+    match declared:
+        case MessageType() if declared.name in TIMES:
+            time = View(raw, declared)
+            return Nanoseconds(time.raw("sec") * NS + time.raw("nanosec"))
+        case MessageType():
+            return View(raw, declared)
+        case Enum():
+            return EnumNumber(raw)
+        case Bytes():
+            return list(raw)
+        case List():
+            elements = [*raw]
+            return all_of([lambda each=each: seen(each, declared.element) for each in elements])
+        case String() if isinstance(raw, bytes):
+            try:
+                return raw.decode()
+            except UnicodeDecodeError:
+                raise Refused(MAPPING_ERROR) from None
+        case _:
+            return raw
