@@ -12,12 +12,12 @@ from router.cli.tool_options import add_table, seconds, table_path
 from router.compiler import check_table
 from router.compiler.checked import CheckedRoute
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
+from router.tools.listing import listed_route, python_of
 
 _DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides, and
-largest sizes; with --code, also the code that the router runs. Of a gateway, show what it sends how often, and what
+largest sizes; with --code, also the operations that the router executes, with their places in the table. Of a gateway, show what it sends how often, and what
 it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or with --live of
 all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
 _EXAMPLES = (
@@ -38,7 +38,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
     )
-    parser.add_argument("--code", action="store_true", help="show the generated code as well")
+    parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
     parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
     about = f"look for them for so long, as 5s (default: {_LIVE:g}s)"
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
@@ -73,7 +73,9 @@ def _explain(args: argparse.Namespace) -> int:
         for route in routes.get(name, ()):
             print(*explained_route(route, checked, program.executors), sep="\n")
             if args.code:
-                _print_code(route, program)
+                print(*listed_route(route, program), sep="\n")
+                for source in python_of(route, program):
+                    _print_python(source)
             print()
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
@@ -94,14 +96,8 @@ def _diff(old: Path, new: Path) -> int:
     return OK
 
 
-def _print_code(route: CheckedRoute, program: Program) -> None:
-    for handler in program.handlers:
-        if handler.route == route.route.name:
-            print()
-            _print_python(handler.source.text())
-
-
 def _print_python(source: str) -> None:
+    print()
     if is_coloured(sys.stdout):
         from rich.console import Console
         from rich.syntax import Syntax
