@@ -19,12 +19,14 @@ static const uint8_t wanted = 1;
 static const uint8_t *const topics[] = {&wanted};
 static const struct waiting target = {1, WAITING, QUEUE_FULL, FILTERED};
 static struct sender nowhere = {.fd = -1};
-static const struct destination destinations[] = {
-    {.sender = &nowhere, .limit = &limit, .trims = 1, .sent = SENT, .sent_bytes = SENT_BYTES, .stale = STALE,
-     .rate_limited = LIMITED, .send_buffer_full = FULL, .send_error = FAILED}};
+static const struct target destinations[] = {
+    {.sender = &nowhere, .limit = &limit, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
+     .dropped = {[LOSS_STALE] = STALE, [LOSS_RATE_LIMITED] = LIMITED, [LOSS_SEND_BUFFER_FULL] = FULL,
+                 [LOSS_SEND_ERROR] = FAILED}}};
 static struct part part = {.wanted = topics, .targets = &target, .wanted_count = 1, .target_count = 1};
-static const struct route only = {.ttl = 1000000000, .destinations = destinations, .parts = &part, .destination_count = 1,
-                                  .part_count = 1, .last_message = LAST_MESSAGE, .duration = DURATION};
+static const struct route only = {
+    .sends = {.ttl = 1000000000, .targets = destinations, .count = 1, .topic = NO_NAME}, .parts = &part, .part_count = 1,
+    .last_message = LAST_MESSAGE, .duration = DURATION};
 static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
 static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];

@@ -1,6 +1,6 @@
 /* Commands come on two topics while programs change, deadmen are served and counters are read; then the thread stops.
  * What was put is counted once. */
-#include "commands.h"
+#include "from_ros.h"
 
 #include <assert.h>
 #include <sys/eventfd.h>
@@ -13,10 +13,11 @@
 enum { MESSAGES = 2000, RECEIVED = 0, LAST, SENT, BYTES, LOST, DURATION, COUNTERS = 64 };
 
 static const uint8_t MESSAGE[] = {0, 1, 0, 0, 7, 0, 0, 0};
-static const struct read_op READS[] = {{READ_SCALARS, 4, 0, 1}};
-static const struct write_op WRITES[] = {
-    {.kind = WRITE_SCALAR, .scalar = SCALAR_UINT32, .encoding = AS_VARINT, .tag = 8},
-};
+static const struct read_operation STEPS[] = {{.kind = READ_SCALAR, .type = SCALAR_UINT32, .slot = 2}};
+static const struct node NODE = {.steps = STEPS, .count = 1};
+static const struct value DEFAULTS[3];
+static const struct layout LAYOUT = {.nodes = &NODE, .defaults = DEFAULTS, .slot_count = 3, .is_cdr = 1};
+static const struct operation OPERATIONS[] = {{.kind = OP_LOAD, .slot = 2}, {.kind = OP_WRITE_VARINT, .size = 8}};
 
 struct source {
     struct subscription *subscription;
@@ -53,35 +54,33 @@ int main(void) {
     struct deadman_destination braking = {.sender = sender, .datagram = MESSAGE, .size = 1, .sent = 2, .send_errors = 3};
     struct deadman *deadman = deadman_open(deadmen, 1000, 1000000, true, 0, 1, 0, &braking, 1);
     struct feed feed = {deadman, 0, 0};
-    struct command_target target = {
-        .destination = {.sender = sender, .feeds = &feed, .feed_count = 1, .sent = SENT, .sent_bytes = BYTES,
-                        .stale = LOST, .rate_limited = LOST, .send_buffer_full = LOST, .send_error = LOST},
-        .writes = WRITES, .write_count = 1, .mapping_error = LOST,
-    };
-    struct command_route route = {.ttl = 1000000000, .reads = READS, .targets = &target, .read_count = 1,
-                                  .target_count = 1, .seconds = NO_SLOT, .nanoseconds = NO_SLOT, .received = RECEIVED,
-                                  .last_message = LAST, .duration = DURATION};
-    struct commands *commands = commands_open(deadmen, counters, events, take, middleware_reset, true);
+    struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,
+                            .delivered = SENT, .delivered_bytes = BYTES};
+    for (int reason = 0; reason < LOSSES; reason++) target.dropped[reason] = LOST;
+    struct ros_route route = {
+        .targets = {.ttl = 1000000000, .layout = &LAYOUT, .targets = &target, .count = 1, .topic = NO_NAME},
+        .seconds = NONE, .nanoseconds = NONE, .received = RECEIVED, .last_message = LAST, .duration = DURATION};
+    struct from_ros *thread = from_ros_open(deadmen, counters, events, take, middleware_reset, true);
     struct source sources[2];
-    struct command_topic topics[2];
+    struct ros_topic topics[2];
     for (int index = 0; index < 2; index++) {
         sources[index] = (struct source){middleware_open(), eventfd(0, 0)};
-        assert(!commands_watch(commands, sources[index].eventfd));
-        topics[index] = (struct command_topic){sources[index].subscription, &route, 1, MESSAGES, sources[index].eventfd, 0};
+        assert(!from_ros_watch(thread, sources[index].eventfd));
+        topics[index] = (struct ros_topic){sources[index].subscription, &route, 1, MESSAGES, sources[index].eventfd, 0};
     }
-    struct command_set both = {topics, 2, 0}, one = {topics, 1, 0};
+    struct ros_set both = {topics, 2, 0}, one = {topics, 1, 0};
     pthread_t publishing[2], draining;
     pthread_create(&draining, NULL, drain, &pair[1]);
     for (int index = 0; index < 2; index++) pthread_create(&publishing[index], NULL, publish, &sources[index]);
     for (int times = 200; times; times--) {
         int64_t copy[COUNTERS];
-        assert(commands_serve(commands, times % 2 ? &one : &both));
+        assert(from_ros_serve(thread, times % 2 ? &one : &both));
         deadmen_serve(deadmen, boottime_ns());
-        if (commands_counters(commands, copy, COUNTERS)) assert(copy[RECEIVED] == copy[SENT] + copy[LOST]);
+        if (from_ros_counters(thread, copy, COUNTERS)) assert(copy[RECEIVED] == copy[SENT] + copy[LOST]);
     }
     for (int index = 0; index < 2; index++) pthread_join(publishing[index], NULL);
-    assert(commands_serve(commands, &both));
-    assert(commands_stop(commands));
+    assert(from_ros_serve(thread, &both));
+    assert(from_ros_stop(thread));
     assert(counters[RECEIVED] == 2 * MESSAGES && counters[SENT] + counters[LOST] == 2 * MESSAGES);
     for (int index = 0; index < 2; index++) {
         close(sources[index].eventfd);

@@ -21,9 +21,9 @@ if SANITIZED in os.environ:
 
 from rclpy.node import Node
 
-from router.carrier.commands import CommandThread, native_commands
 from router.carrier.deadmen import Deadmen
-from router.carrier.program import Names, Outlets
+from router.carrier.from_ros import FromRosThread, native_from_ros
+from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Program
@@ -57,7 +57,7 @@ class Router:
 
     program: Program
     library: ctypes.CDLL
-    thread: CommandThread
+    thread: FromRosThread
     deadmen: Deadmen
     board: socket.socket
 
@@ -72,7 +72,7 @@ class Router:
 
 @pytest.fixture
 def node() -> Iterator[Node]:
-    made = open_node("commands_test")
+    made = open_node("from_ros_test")
     yield made
     close_node(made)
 
@@ -94,7 +94,7 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         outlets = Outlets(
             listeners={},
             senders={endpoint: sender.address for endpoint, sender in senders.items()},
-            wanted={},
+            publications={},
             feeds=lambda *_: [(deadman.address, False)],
             limit=lambda *_: pytest.fail("no target has one"),
             carried=lambda _: (),
@@ -104,9 +104,9 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         (plan,) = made.subscriptions
         subscription = RawSubscription(node, installed_class(TYPE), plan.topic, qos_profile(plan.qos))
         stack.callback(subscription.close)
-        thread = CommandThread(library, deadmen.address, counters, Ring(library, 1 << 12), TAKE, RESET)
+        thread = FromRosThread(library, deadmen.address, counters, Ring(library, 1 << 12), TAKE, RESET)
         stack.callback(thread.stop)
-        thread.serve(native_commands(made, outlets), {plan.label: subscription})
+        thread.serve(native_from_ros(made, 1, outlets), {plan.label: subscription})
         yield Router(made, library, thread, deadmen, board)
 
 

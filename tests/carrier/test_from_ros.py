@@ -1,9 +1,10 @@
-"""The thread for commands from ROS: what becomes of each message, reloads, stops, a middleware that is stuck."""
+"""The threads for messages from ROS: what becomes of each message, reloads, stops, a middleware that is stuck."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
+import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -12,14 +13,14 @@ from time import monotonic, sleep
 
 import pytest
 
-from router.carrier.commands import NativeCommands
+from router.carrier.from_ros import NativeFromRos
 from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
 from tests.carrier.whole import library as clocked_library
-from tests.engine.rig import Rig, program
+from tests.engine.rig import Ledger, Rig, program
 
 ROUTES = """\
   drive_motor:
@@ -47,6 +48,33 @@ STAMPED = """\
     destinations: [driving_board]
     ttl: 200ms
     deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], repeat: 100ms}
+"""
+CALCULATED = """\
+  drive_motor:
+    source: {topic: drive, type: comms/msg/DrivingBoardMotorMessage, when: turning_radius < 100}
+    fields: {distance_to_go: float32(round(clamp(100 / (distance_to_go - turning_radius), -100, 100)))}
+    destinations:
+      - {endpoint: driving_board, when: 1 / turning_radius > -1}
+      - {endpoint: recorder, fields: {turning_radius: turning_radius}}
+    ttl: 200ms
+    deadman: {none: for tests}
+"""
+EACH = """\
+  arm_ctrl:
+    source: {topic: poses, type: geometry_msgs/msg/PoseArray, when: item.position.y < 1 or index > 0}
+    for_each: poses
+    fields: {control_base: float32(item.position.x + 100 * index + 1000 * count)}
+    destinations:
+      - driving_board
+      - {endpoint: recorder, when: index == count - 1, fields: {control_base: float32(1 / item.position.x)}}
+    ttl: 200ms
+    deadman: {none: for tests}
+  arm_target:
+    source: {topic: arm, type: comms/msg/ArmBoardTargetMovement}
+    for_each: [target_x, 1 / target_x, target_y]
+    fields: {target_x: float32(item), target_y: float32(index)}
+    destinations: [driving_board]
+    deadman: {none: for tests}
 """
 SECOND = 1_000_000_000
 
@@ -93,6 +121,11 @@ def twist(x: float, stamp: int) -> bytes:
     return b"\0\1\0\0" + head + struct.pack("<6d", x, 0, 0, 0, 0, -0.0)
 
 
+def poses(*points: tuple[float, float], stamp: int = 0) -> bytes:
+    head = b"\0\1\0\0" + struct.pack("<iIIB3xI4x", *divmod(stamp, SECOND), 1, 0, len(points))
+    return head + b"".join(struct.pack("<7d", *point, 0, 0, 0, 0, 1) for point in points)
+
+
 def of(datagram: bytes) -> float:
     """The distance of a drive command that is not zero, behind the heads of envelope and field."""
     distance: float = struct.unpack_from("<f", datagram, 3)[0]
@@ -109,16 +142,14 @@ def compare(commanding: Commanding, messages: Messages) -> None:
     """Both engines serve the messages: the same counts and the same datagrams."""
     rig = Rig(commanding.program)
     rig.now = SECOND * 1000
-    taken = 0
     for topic, sent in messages.items():
         for make, age in sent:
             now = wall_ns()
             commanding.subscriptions[topic].put(make(now), now - age)
             rig.arrived_before = age
             rig.take(topic, make(rig.WALL + rig.now))
-        handlers = commanding.program.outbound[topic]
-        taken += len(sent) * len(handlers)
-        wait_until(lambda: commanding.ledger().total("messages_received") == taken)  # noqa: B023 - at once
+            last = Ledger(commanding.program, rig.counts).total("messages_received")
+        wait_until(lambda: commanding.ledger().total("messages_received") == last)  # noqa: B023 - at once
     counted = ("messages_", "datagrams_", "sent_")
     assert commanding.ledger().counted(*counted) == rig.counted(*counted)
     for endpoint, board in commanding.boards.items():
@@ -126,14 +157,18 @@ def compare(commanding: Commanding, messages: Messages) -> None:
     assert list(commanding.ledger().imbalances()) == []
     losses = [(route, target) for route, target, *_ in commanding.losses()]
     assert losses == [(report.place, report.target) for report in rig.reports]
-    for route in {handler.route for handlers in commanding.program.outbound.values() for handler in handlers}:
+    topics_of: dict[str, set[str]] = {}
+    for topic, handlers in commanding.program.outbound.items():
+        for handler in handlers:
+            topics_of.setdefault(handler.route, set()).add(topic)
+    for route in topics_of:
         timed = sum(
             commanding.thread.counters(1 << 16)[
                 commanding.program.counters.index("route_duration_seconds", route) + part
             ]
             for part in range(HISTOGRAM_CELLS - 1)
         )
-        assert timed == commanding.ledger().total("messages_received", route)
+        assert timed == sum(len(sent) for topic, sent in messages.items() if topic in topics_of[route])
         last = commanding.count("route_last_message_timestamp_seconds", route)
         assert abs(wall_ns() - last) < 60 * SECOND if timed else last == 0
 
@@ -170,6 +205,69 @@ def test_the_age_counts_from_the_stamp_where_there_is_one(opened: Open) -> None:
             ]
         },
     )
+
+
+def test_fields_are_calculated_and_conditions_evaluated(opened: Open) -> None:
+    compare(
+        opened(CALCULATED),
+        {
+            "drive": [
+                (lambda _: drive(1.5, -2), 0),
+                (lambda _: drive(2, 2), 0),  # divided by zero
+                (lambda _: drive(2, 200), 0),  # filtered for both
+                (lambda _: drive(2, -0.5), 0),  # filtered for the board
+                (lambda _: drive(2, 0), 0),  # whose condition divides by zero
+                (lambda _: drive(math.nan, 1), 0),
+                (lambda _: drive(5, 1), SECOND),  # stale
+                (lambda _: drive(3)[:9], 0),  # cut
+            ],
+        },
+    )
+
+
+def test_a_refusal_names_its_place(opened: Open) -> None:
+    commanding = opened(CALCULATED)
+    (feed,) = commanding.program.lowered.from_ros["drive"]
+    for message in (drive(2, 2), drive(2, 0)):
+        commanding.subscriptions["drive"].put(message, wall_ns())
+    wait_until(lambda: commanding.ledger().total("messages_received") == 2)
+    found = [(feed.targets[target].places[place], reason) for _, target, reason, _, place in commanding.refusals()]
+    (board,) = (place for place, _ in found if "when" in place)
+    fields = [place for place, _ in found if place != board]
+    assert {reason for _, reason in found} == {0}
+    assert len(fields) == 2
+    assert all("distance_to_go" in place for place in fields)
+
+
+def test_each_element_is_a_message(opened: Open) -> None:
+    commanding = opened(EACH)
+    compare(
+        commanding,
+        {
+            "poses": [
+                (lambda now: poses((1, 0), (2, 0), (3, 0), stamp=now), 0),
+                (lambda _: poses((1, 5), (0, 0)), 0),  # one is filtered, and one has no inverse
+                (lambda _: poses(), 0),
+                (lambda now: poses((1, 0), stamp=now - SECOND), 0),  # stale
+                (lambda _: poses((1, 0), (2, 0))[:100], 0),  # cut
+                (lambda _: poses(*[(number, 0) for number in range(1, 300)]), 0),
+            ],
+            "arm": [(lambda _: arm(4), 0), (lambda _: arm(0), 0), (lambda _: arm(2)[:7], 0)],
+        },
+    )
+    assert commanding.count("messages_received", "arm_ctrl", "poses") == 3 + 2 + 0 + 1 + 1 + 299
+    assert commanding.count("messages_received", "arm_target", "arm") == 3 + 1 + 1
+    assert commanding.count("messages_dropped", "arm_target", "driving_board", "mapping_error") == 2
+
+
+def test_a_list_that_is_refused_is_reported_with_its_place(opened: Open) -> None:
+    commanding = opened(EACH)
+    commanding.subscriptions["arm"].put(arm(0), wall_ns())
+    wait_until(lambda: commanding.ledger().total("messages_received") == 1)
+    ((route, target, _, topic, place),) = commanding.refusals()
+    (feed,) = commanding.program.lowered.from_ros[topic]
+    assert "for_each" in feed.targets[target].places[place]
+    assert (route, target) == ("arm_target", "driving_board")
 
 
 def test_a_message_without_times_is_as_old_as_its_receipt(opened: Open) -> None:
@@ -251,7 +349,7 @@ def test_a_subscription_that_is_left_is_emptied_before_and_not_used_afterwards(
 
 def test_what_came_before_a_topic_is_served_is_served_then(opened: Open) -> None:
     commanding = opened()
-    commanding.thread.serve(NativeCommands(), {})
+    commanding.thread.serve(NativeFromRos(), {})
     commanding.subscriptions["drive"].put(drive(1), wall_ns())
     assert commanding.count("messages_received", "drive_motor", "drive") == 0
     commanding.serve()
@@ -325,19 +423,19 @@ def test_a_middleware_that_refuses_is_counted(opened: Open) -> None:
     ["", pytest.param(RACES, marks=pytest.mark.slow), pytest.param(MEMORY, marks=pytest.mark.slow)],
 )
 def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) -> None:
-    run_program("commands", tmp_path, sanitizers=sanitizers)
+    run_program("from_ros", tmp_path, sanitizers=sanitizers)
 
 
-# ---- what is lowered
+# ---- who serves what
 
 
 def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
     """What one of its routes needs Python for, all of them do."""
-    routes = ROUTES.replace("{control_base: target_x}", "{control_base: target_x * 2}")
-    made = program(tmp_path, routes)
-    assert list(made.commands) == ["drive"]
+    later = "destinations: [{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}]\n    deadman: {none: for tests}"
+    made = program(tmp_path, ROUTES.replace("destinations: [driving_board]\n    deadman: {none: for tests}", later))
+    assert list(made.lowered.from_ros) == ["drive"]
     reasons = {key: executor.reason for key, executor in made.executors.items()}
-    needs_it = "`control_base: target_x * 2` needs it; its freshness is Python's"
+    needs_it = "`on_limit: latest` needs it; its freshness is Python's"
     assert reasons == {
         ("drive_motor", "drive", "driving_board"): None,
         ("drive_motor", "drive", "recorder"): None,
@@ -347,22 +445,17 @@ def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("earlier", "later", "reason"),
+    ("earlier", "later"),
     [
-        ("BoardMotorMessage}", "BoardMotorMessage, when: turning_radius > 0}",
-         "`when: turning_radius > 0` needs it"),
-        ("[driving_board, {", "[{endpoint: driving_board, when: turning_radius > 0}, {",
-         "`when: turning_radius > 0` needs it"),
-        ("max_rate: 0.001 Hz}", "max_rate: 0.001 Hz, on_limit: latest}", "`on_limit: latest` needs it"),
+        ("BoardMotorMessage}", "BoardMotorMessage, when: turning_radius > 0}"),
+        ("[driving_board, {", "[{endpoint: driving_board, when: turning_radius > 0}, {"),
+        ("{control_base: target_x}", "{control_base: target_x * 2}"),
     ],
-)  # fmt: skip
-def test_what_may_be_sent_later_or_not_at_all_needs_python(
-    tmp_path: Path, earlier: str, later: str, reason: str
-) -> None:
+)
+def test_conditions_and_calculations_are_the_carriers(tmp_path: Path, earlier: str, later: str) -> None:
     made = program(tmp_path, ROUTES.replace(earlier, later))
-    executor = made.executors["drive_motor", "drive", "driving_board"]
-    assert executor.reason == f"{reason}; its freshness is Python's"
-    assert list(made.commands) == ["arm"]
+    assert all(executor.is_carrier for executor in made.executors.values())
+    assert list(made.lowered.from_ros) == ["drive", "arm"]
 
 
 def test_messages_without_freshness_are_not_urgent(tmp_path: Path) -> None:
@@ -373,12 +466,9 @@ def test_messages_without_freshness_are_not_urgent(tmp_path: Path) -> None:
     destinations: [basestation]
 """
     made = program(tmp_path, ROUTES + routes)
-    urgent = {topic: [command.is_urgent for command in commands] for topic, commands in made.commands.items()}
+    urgent = {topic: [feed.is_urgent for feed in feeds] for topic, feeds in made.lowered.from_ros.items()}
     assert urgent == {"drive": [True], "arm": [True, False], "where": [False]}
     assert made.executors["rover_localization", "where", "basestation"].is_carrier
-    slowly = program(tmp_path, routes.replace("auto", "{x: x + 1}"))
-    executor = slowly.executors["rover_localization", "where", "basestation"]
-    assert executor.reason == "`x: x + 1` needs it"
 
 
 class Clocks:

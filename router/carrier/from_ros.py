@@ -1,10 +1,10 @@
-"""Messages from ROS that native threads take, convert and send: neither Python nor a publisher can hold them up."""
+"""Messages from ROS that native threads take and deliver: neither Python nor a publisher can hold them up."""
 
 from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from threading import Lock
@@ -12,9 +12,12 @@ from time import sleep
 from typing import Protocol
 
 from router.carrier import structures as c
-from router.carrier.program import Outlets, native_destination
+from router.carrier.lowered import Programs
+from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
-from router.compiler.commands import NO_SLOT, Command, CommandTarget, WriteOp
+from router.carrier.targets import TargetWriter
+from router.compiler.lowering import LoweredElements, LoweredFeed
+from router.compiler.lowering.operations import NONE
 from router.compiler.program import Handler, Program
 from router.threads import StuckError
 
@@ -37,112 +40,80 @@ class Subscription(Protocol):
 
 
 @dataclass(slots=True)
-class NativeCommands:
-    """The routes of each topic, an array of `struct command_route`, with all that they refer to.
+class NativeFromRos:
+    """The routes of each topic, an array of `struct ros_route`, with all that they refer to.
 
     `urgent` are the topics of which one route is.
     """
 
-    topics: dict[str, ctypes.Array[c.CommandRoute]] = field(default_factory=dict)
+    topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)
     urgent: set[str] = field(default_factory=set)
     arrays: list[object] = field(default_factory=list)
 
-    def only(self, *, urgent: bool) -> NativeCommands:
+    def only(self, *, urgent: bool) -> NativeFromRos:
         """Those for the thread of urgent messages, or those for the other one."""
         topics = {topic: routes for topic, routes in self.topics.items() if (topic in self.urgent) is urgent}
-        return NativeCommands(topics, self.urgent, self.arrays)
+        return NativeFromRos(topics, self.urgent, self.arrays)
 
 
-def native_commands(program: Program, outlets: Outlets) -> NativeCommands:
+def native_from_ros(program: Program, generation: int, outlets: Outlets) -> NativeFromRos:
     """Make the arrays of all topics that the carrier takes. `outlets` serve the targets of routes from ROS, too."""
-    made = NativeCommands()
-    for topic, commands in program.commands.items():
+    made = NativeFromRos()
+    writer = TargetWriter(program, outlets, generation, made.arrays)
+    for topic, feeds in program.lowered.from_ros.items():
         handlers = {handler.route: handler for handler in program.outbound[topic]}
-        writer = _Writer(program, outlets, made.arrays, topic)
-        routes = [writer.route(handlers[command.route], command) for command in commands]
-        made.topics[topic] = (c.CommandRoute * len(routes))(*routes)
-        if any(command.is_urgent for command in commands):
+        routes = [_route(writer, handlers[feed.route], feed) for feed in feeds]
+        made.topics[topic] = (c.RosRoute * len(routes))(*routes)
+        if any(feed.is_urgent for feed in feeds):
             made.urgent.add(topic)
     return made
 
 
-@dataclass(frozen=True, slots=True)
-class _Writer:
-    program: Program
-    outlets: Outlets
-    arrays: list[object]
-    topic: str
-
-    def route(self, handler: Handler, command: Command) -> c.CommandRoute:
-        counters = self.program.counters
-        targets = [self._target(handler, target) for target in command.targets]
-        made = native_reads(command)
-        made.ttl = handler.ttl or 0
-        made.targets, made.target_count = (c.CommandTarget * len(targets))(*targets), len(targets)
-        made.id = self.outlets.names.number(handler.route)
-        made.received = counters.index("messages_received", handler.route, self.topic)
-        made.last_message = counters.index("route_last_message_timestamp_seconds", handler.route)
-        made.duration = counters.index("route_duration_seconds", handler.route)
-        self.arrays.append(made)
-        return made
-
-    def _target(self, handler: Handler, target: CommandTarget) -> c.CommandTarget:
-        (plan,) = (plan for plan in handler.targets if plan.label == target.label)
-        made = native_writes(target)
-        made.destination = native_destination(self.program, self.outlets, self.arrays, handler, plan)
-        counters = self.program.counters
-        made.mapping_error = counters.index("messages_dropped", handler.route, target.label, "mapping_error")
-        self.arrays.append(made)
-        return made
-
-
-def native_reads(command: Command) -> c.CommandRoute:
-    """A route with its first program only."""
-    ops = [c.ReadOp(op.kind, op.size, op.slot, op.elements) for op in command.reads]
-    seconds, nanoseconds = command.stamp or (NO_SLOT, NO_SLOT)
-    return c.CommandRoute(
-        reads=(c.ReadOp * len(ops))(*ops), read_count=len(ops), seconds=seconds, nanoseconds=nanoseconds
+def _route(writer: TargetWriter, handler: Handler, feed: LoweredFeed) -> c.RosRoute:
+    assert handler.topic is not None  # noqa: S101 - of a route from ROS
+    counters, programs = writer.program.counters, Programs(feed.layout, writer.arrays)
+    targets = writer.targets(handler, handler.targets, feed.targets, programs)
+    for_each = native_for_each(feed.for_each, programs)
+    targets.layout = programs.layout()
+    seconds, nanoseconds = feed.stamp or (NONE, NONE)
+    return c.RosRoute(
+        targets=targets,
+        for_each=for_each,
+        seconds=seconds,
+        nanoseconds=nanoseconds,
+        received=counters.index("messages_received", handler.route, handler.topic),
+        last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
+        duration=counters.index("route_duration_seconds", handler.route),
     )
 
 
-def native_writes(target: CommandTarget) -> c.CommandTarget:
-    """A target with its second program only."""
-    literals = bytearray()
-    ops = list(_write_ops(target.writes, literals))
-    text = ctypes.create_string_buffer(bytes(literals))
-    return c.CommandTarget(writes=(c.WriteOp * len(ops))(*ops), literals=text, write_count=len(ops))
-
-
-def _write_ops(writes: Sequence[WriteOp], literals: bytearray) -> Iterator[c.WriteOp]:
-    for op in writes:
-        yield c.WriteOp(
-            kind=op.kind,
-            scalar=op.scalar,
-            encoding=op.encoding,
-            flags=op.flags,
-            slot=op.slot,
-            tag=op.tag,
-            least=op.least,
-            most=op.most,
-            start=len(literals),
-            count=len(op.literal),
-        )
-        literals += op.literal
+def native_for_each(elements: LoweredElements | None, programs: Programs) -> c.ForEach:
+    """`for_each` of a route, None without."""
+    if elements is None:
+        return c.ForEach()
+    return c.ForEach(
+        list=programs.code(elements.code),
+        stored=elements.stored,
+        node=elements.node,
+        item=elements.item,
+        index=elements.index,
+        count=elements.count,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Served:
     """What the thread serves, and the eventfd of each subscription. `structure` refers to `topics`."""
 
-    commands: NativeCommands
+    messages: NativeFromRos
     subscriptions: Mapping[str, Subscription]
     eventfds: Mapping[Subscription, int]
-    topics: ctypes.Array[c.CommandTopic]
-    structure: c.CommandSet
+    topics: ctypes.Array[c.RosTopic]
+    structure: c.RosSet
 
 
-class CommandThread:
-    """Takes the messages of subscriptions, and sends what they command. It starts at once, and stops once.
+class FromRosThread:
+    """Takes the messages of subscriptions, and sends what routes make of them. It starts at once, and stops once.
 
     `deadmen` is the address of the carrier's, `counters` the array that the thread counts in. `take` and `reset` are
     addresses of functions: those of `ros.receiving`. A thread for urgent messages runs before others.
@@ -164,15 +135,15 @@ class CommandThread:
         self._counters, self._events = counters, events
         self._served: _Served | None = None
         self._in_use = Lock()  # for those who read counters while the thread may be stopped
-        self._address: int = library.commands_open(deadmen, counters, events.address, take, reset, is_urgent)
+        self._address: int = library.from_ros_open(deadmen, counters, events.address, take, reset, is_urgent)
         if not self._address:
-            raise MemoryError("the thread for commands from ROS cannot be started")
+            raise MemoryError("the thread for messages from ROS cannot be started")
 
     @property
     def failures(self) -> int:
         """How often the middleware refused to hand out a message."""
         with self._in_use:
-            return int(self._library.commands_failures(self._address)) if self._address else 0
+            return int(self._library.from_ros_failures(self._address)) if self._address else 0
 
     def counters(self, count: int) -> list[int]:
         """Return the first counters, as they are between two messages."""
@@ -180,11 +151,11 @@ class CommandThread:
         with self._in_use:
             if not self._address:
                 return list(self._counters[:count])
-            self._library.commands_counters(self._address, copy, count)
+            self._library.from_ros_counters(self._address, copy, count)
         return list(copy)
 
-    def serve(self, commands: NativeCommands, subscriptions: Mapping[str, Subscription]) -> None:
-        """Serve the topics of `commands` from these subscriptions, and no others: between two messages.
+    def serve(self, messages: NativeFromRos, subscriptions: Mapping[str, Subscription]) -> None:
+        """Serve the topics of `messages` from these subscriptions, and no others: between two messages.
 
         What has arrived on subscriptions that are left is served before; they may be closed afterwards. Where another
         subscription takes over a topic, a command that comes meanwhile may be sent twice. Raises StuckError after 1 s,
@@ -199,9 +170,9 @@ class CommandThread:
                     adding.callback(self._leave, subscription, eventfd)
             if earlier:
                 forget_what_is_served(earlier.subscriptions, subscriptions)
-            served = _served(commands, subscriptions, {each: eventfds[each] for each in subscriptions.values()})
-            if not self._library.commands_serve(self._address, ctypes.byref(served.structure)):
-                raise StuckError("the thread for commands from ROS is stuck in the middleware: try again")
+            served = _served(messages, subscriptions, {each: eventfds[each] for each in subscriptions.values()})
+            if not self._library.from_ros_serve(self._address, ctypes.byref(served.structure)):
+                raise StuckError("the thread for messages from ROS is stuck in the middleware: try again")
             adding.pop_all()
         self._served = served
         for subscription in eventfds.keys() - served.eventfds.keys():
@@ -217,7 +188,7 @@ class CommandThread:
             address, self._address = self._address, 0
         if not address:
             return self not in _left
-        if not self._library.commands_stop(address):
+        if not self._library.from_ros_stop(address):
             _left.append(self)
             return False
         for subscription, eventfd in (self._served.eventfds if self._served else {}).items():
@@ -230,38 +201,38 @@ class CommandThread:
         with ExitStack() as opening:
             eventfd = os.eventfd(0, os.EFD_CLOEXEC)
             opening.callback(os.close, eventfd)
-            if error := self._library.commands_watch(self._address, eventfd):
+            if error := self._library.from_ros_watch(self._address, eventfd):
                 raise OSError(error, os.strerror(error))
-            opening.callback(self._library.commands_unwatch, self._address, eventfd)
+            opening.callback(self._library.from_ros_unwatch, self._address, eventfd)
             subscription.announce_to(eventfd)
             opening.pop_all()
         return eventfd
 
     def _leave(self, subscription: Subscription, eventfd: int) -> None:
         subscription.announce_to(None)
-        self._library.commands_unwatch(self._address, eventfd)
+        self._library.from_ros_unwatch(self._address, eventfd)
         os.close(eventfd)
 
 
-_left: list[CommandThread] = []
+_left: list[FromRosThread] = []
 """Those that are stuck: what they refer to has to live until the process ends."""
 
 
 def _served(
-    commands: NativeCommands, subscriptions: Mapping[str, Subscription], eventfds: Mapping[Subscription, int]
+    messages: NativeFromRos, subscriptions: Mapping[str, Subscription], eventfds: Mapping[Subscription, int]
 ) -> _Served:
     topics = [
-        c.CommandTopic(
+        c.RosTopic(
             subscription=subscriptions[topic].address,
             routes=routes,
             route_count=len(routes),
             capacity=subscriptions[topic].capacity,
             eventfd=eventfds[subscriptions[topic]],
         )
-        for topic, routes in commands.topics.items()
+        for topic, routes in messages.topics.items()
     ]
-    array = (c.CommandTopic * len(topics))(*topics)
-    return _Served(commands, subscriptions, eventfds, array, c.CommandSet(topics=array, count=len(topics)))
+    array = (c.RosTopic * len(topics))(*topics)
+    return _Served(messages, subscriptions, eventfds, array, c.RosSet(topics=array, count=len(topics)))
 
 
 def forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:

@@ -20,7 +20,7 @@ if os.environ.get("ROUTER_CARRIER") == "python":
 
 from router.app import Router
 from router.app.native_datapath import NativeWiring
-from router.carrier.commands import CommandThread
+from router.carrier.from_ros import FromRosThread
 from router.threads import StuckError
 from tests.app.conftest import BRAKE, Site
 from tests.ros.peers import Publisher, wait_until
@@ -155,9 +155,9 @@ def test_a_topic_comes_and_goes(site: Site) -> None:
 def test_a_reload_is_refused_while_the_middleware_holds_the_thread(
     site: Site, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    serve, is_stuck = CommandThread.serve, True
+    serve, is_stuck = FromRosThread.serve, True
 
-    def stuck_once(self: CommandThread, *arguments: object) -> None:
+    def stuck_once(self: FromRosThread, *arguments: object) -> None:
         nonlocal is_stuck
         if is_stuck:
             is_stuck = False
@@ -166,7 +166,7 @@ def test_a_reload_is_refused_while_the_middleware_holds_the_thread(
 
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
-        monkeypatch.setattr(CommandThread, "serve", stuck_once)
+        monkeypatch.setattr(FromRosThread, "serve", stuck_once)
         site.write(IN_PYTHON)
         result = router.reload()
         assert not result.ok
@@ -184,8 +184,8 @@ def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
     with site.router(drive()) as router, capture_logs() as logs:
         ros = router._runtime._ros
         assert ros is not None
-        stop = CommandThread.stop
-        monkeypatch.setattr(CommandThread, "stop", lambda thread: stop(thread) and False)
+        stop = FromRosThread.stop
+        monkeypatch.setattr(FromRosThread, "stop", lambda thread: stop(thread) and False)
         router.__exit__(None, None, None)
         assert len([line for line in logs if "stuck, and the router ends without it" in line["event"]]) == 1
         assert [each.raw.take() for each in ros._subscriptions.values()] == [None]  # it is open

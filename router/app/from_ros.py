@@ -10,7 +10,7 @@ import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from router.carrier.commands import CommandThread, NativeCommands, Subscription, forget_what_is_served
+from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription, forget_what_is_served
 from router.carrier.ring import Ring
 from router.errors import StartError
 from router.log import logger
@@ -21,15 +21,15 @@ from router.threads import StuckError
 class RosTopics:
     """What a program has a native thread make of messages from ROS, and all of its subscriptions by topic."""
 
-    commands: NativeCommands
+    messages: NativeFromRos
     subscriptions: Mapping[str, Subscription]
 
     def only(self, *, urgent: bool) -> RosTopics:
         """With those for the thread of urgent messages, or those for the other one."""
-        return RosTopics(self.commands.only(urgent=urgent), self.subscriptions)
+        return RosTopics(self.messages.only(urgent=urgent), self.subscriptions)
 
 
-class RosCommands:
+class FromRos:
     """The thread, which starts with the first program that has messages for it.
 
     `deadmen` is the address of the carrier's, `counts` the array that the thread counts in. Urgent messages have a
@@ -50,8 +50,8 @@ class RosCommands:
         self._deadmen = deadmen
         self._counts = counts
         self._events = events
-        self._thread: CommandThread | None = None
-        self._served = RosTopics(NativeCommands(), {})
+        self._thread: FromRosThread | None = None
+        self._served = RosTopics(NativeFromRos(), {})
         self._refused = 0
         self.has_passed = True
         """Whether the thread serves what it was last told to serve."""
@@ -60,14 +60,14 @@ class RosCommands:
         """Return the first counters, as they are between two messages."""
         return self._thread.counters(count) if self._thread else list(self._counts[:count])
 
-    def open(self, commands: NativeCommands) -> None:
+    def open(self, messages: NativeFromRos) -> None:
         """Start the thread if these need it. Raises StartError."""
-        if self._thread is not None or not commands.only(urgent=self.is_urgent).topics:
+        if self._thread is not None or not messages.only(urgent=self.is_urgent).topics:
             return
         from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
 
         try:
-            self._thread = CommandThread(
+            self._thread = FromRosThread(
                 self._library, self._deadmen, self._counts, self._events, TAKE, RESET, is_urgent=self.is_urgent
             )
         except MemoryError as error:
@@ -81,13 +81,13 @@ class RosCommands:
         if self._thread is None:
             return
         now, then = self._served, next_one.subscriptions
-        own = next_one.only(urgent=self.is_urgent).commands.topics
-        kept = [topic for topic in now.commands.topics if keeps and topic in own]
+        own = next_one.only(urgent=self.is_urgent).messages.topics
+        kept = [topic for topic in now.messages.topics if keeps and topic in own]
         kept = [topic for topic in kept if then[topic] is now.subscriptions[topic]]
-        forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.commands.topics if topic in then})
-        topics = {topic: now.commands.topics[topic] for topic in kept}
-        commands = NativeCommands(topics, now.commands.urgent, now.commands.arrays)
-        self._thread.serve(commands, {topic: then[topic] for topic in kept})
+        forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.messages.topics if topic in then})
+        topics = {topic: now.messages.topics[topic] for topic in kept}
+        messages = NativeFromRos(topics, now.messages.urgent, now.messages.arrays)
+        self._thread.serve(messages, {topic: then[topic] for topic in kept})
 
     def stay(self) -> None:
         """Undo `leave`."""
@@ -99,8 +99,8 @@ class RosCommands:
             return
         next_one = next_one.only(urgent=self.is_urgent)
         try:
-            commands, subscriptions = next_one.commands, next_one.subscriptions
-            self._thread.serve(commands, {topic: subscriptions[topic] for topic in commands.topics})
+            messages, subscriptions = next_one.messages, next_one.subscriptions
+            self._thread.serve(messages, {topic: subscriptions[topic] for topic in messages.topics})
         except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
             logger.error("messages from ROS are not served as the table says until it is reloaded", why=str(error))
             self.has_passed = False
