@@ -9,17 +9,19 @@ from pathlib import Path
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import add_table, seconds, table_path
-from router.compiler import check_table
+from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
 from router.compiler.lookup import Definitions
+from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 from router.tools.listing import listed_route, python_of
 
-_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides, and
-largest sizes; with --code, also the operations that the router executes, with their places in the table. Of a gateway, show what it sends how often, and what
-it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or with --live of
-all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
+_DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
+mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
+with their places in the table. Of a gateway, show what it sends how often, and what it lets in: with a ~ in front each
+topic that its patterns match, of those that the table names, or with --live of all that there are. With --diff, say
+what one table does otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -71,12 +73,7 @@ def _explain(args: argparse.Namespace) -> int:
     topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            print(*explained_route(route, checked, program.executors), sep="\n")
-            if args.code:
-                print(*listed_route(route, program), sep="\n")
-                for source in python_of(route, program):
-                    _print_python(source)
-            print()
+            _print_route(route, checked, program, with_code=args.code)
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
@@ -94,6 +91,15 @@ def _diff(old: Path, new: Path) -> int:
     lines = list(diff(before, after))
     print(*([f"--- {old}", f"+++ {new}", *lines] if lines else [f"{new} does what {old} does"]), sep="\n")
     return OK
+
+
+def _print_route(route: CheckedRoute, checked: Checked, program: Program, *, with_code: bool) -> None:
+    code = listed_route(route, program) if with_code else ()
+    print(*explained_route(route, checked, program.executors), *code, sep="\n")
+    if with_code:
+        for source in python_of(route, program):
+            _print_python(source)
+    print()
 
 
 def _print_python(source: str) -> None:

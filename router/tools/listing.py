@@ -1,4 +1,4 @@
-"""What `router explain --code` lists: the fields that the carrier reads of a message, and its operations with their places.
+"""What `router explain --code` lists: what the carrier reads of a message, and its operations with their places.
 
 Operations have the names of `native/operations.h`, which says what they do.
 """
@@ -6,13 +6,15 @@ Operations have the names of `native/operations.h`, which says what they do.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
 
 from router.compiler.checked import CheckedRoute
 from router.compiler.lowering import Lowered, LoweredElements, LoweredTarget
 from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
 from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
-from router.compiler.program import Program
+from router.compiler.program import Handler, Program, TargetPlan
 from router.errors import plural
 
 _INDENT = "  "
@@ -33,7 +35,7 @@ def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
         for feed in feeds:
             if feed.route == name:
                 yield ""
-                yield f"from topic {topic}"
+                yield f"  from topic {topic}"
                 yield from _layout(feed.layout)
                 if feed.for_each is not None:
                     yield from _for_each(feed.for_each, feed.layout, next(iter(feed.targets.values())))
@@ -44,18 +46,15 @@ def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
 def python_of(checked: CheckedRoute, program: Program) -> Iterator[str]:
     """The functions of the targets that need Python."""
     for handler in program.handlers:
-        if handler.route == checked.route.name:
-            by_python = [
-                target
-                for target in handler.targets
-                if not program.executors[
-                    handler.route,
-                    target.label if target.is_topic else handler.topic,
-                    None if target.is_topic else target.label,
-                ].is_carrier
-            ]
-            if by_python:
-                yield handler.part(by_python).source.text()
+        if handler.route == checked.route.name and (by_python := _by_python(handler, program)):
+            yield handler.part(by_python).source.text()
+
+
+def _by_python(handler: Handler, program: Program) -> list[TargetPlan]:
+    def place(target: TargetPlan) -> tuple[str, str | None, str | None]:
+        return (handler.route, target.label, None) if target.is_topic else (handler.route, handler.topic, target.label)
+
+    return [target for target in handler.targets if not program.executors[place(target)].is_carrier]
 
 
 # ---- what is read
@@ -65,24 +64,26 @@ def _layout(layout: Layout) -> Iterator[str]:
     for number, (node, message) in enumerate(zip(layout.nodes, layout.messages, strict=True)):
         if node.entries:
             yield ""
-            yield f"reads {message}, node {number}"
-        depth = 1
-        for entry in node.entries:
-            if isinstance(entry, NodeField):
-                yield _INDENT + _field(entry, layout)
-                continue
-            depth -= entry.kind is ReadKind.AGAIN
-            yield _INDENT * depth + _step(entry, layout)
-            depth += entry.kind in (ReadKind.EACH, ReadKind.EACH_SEQUENCE)
+            yield f"  reads {message}, node {number}"
+        yield from _fields([entry for entry in node.entries if isinstance(entry, NodeField)], layout)
+        depth = 2
+        for step in node.entries:
+            if isinstance(step, ReadOperation):
+                depth -= step.kind is ReadKind.AGAIN
+                yield _INDENT * depth + _step(step, layout)
+                depth += step.kind in (ReadKind.EACH, ReadKind.EACH_SEQUENCE)
 
 
-def _field(entry: NodeField, layout: Layout) -> str:
-    """One field of a protobuf message, and where what is read of it goes."""
-    repeated = "repeated " * entry.is_repeated
-    places = [_slot(each, layout) for each in (entry.slot, entry.presence, entry.choice) if each != NONE]
-    if entry.node != NONE:
-        places.append(f"node {entry.node}")
-    return f"field {entry.number}: {repeated}{_word(entry.type)} -> {', '.join(places) or 'nothing'}"
+def _fields(fields: list[NodeField], layout: Layout) -> Iterator[str]:
+    """The fields of a protobuf message of which something is read, and the slots that say which member a oneof has."""
+    for field in fields:
+        places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
+        places += [f"node {field.node}"] if field.node != NONE else []
+        if places:
+            repeated = "repeated " * field.is_repeated
+            yield f"    field {field.number}: {repeated}{_word(field.type)} -> {', '.join(places)}"
+    for choice in dict.fromkeys(field.choice for field in fields if field.choice != NONE):
+        yield f"    oneof -> {_slot(choice, layout)}"
 
 
 def _step(step: ReadOperation, layout: Layout) -> str:
@@ -92,15 +93,16 @@ def _step(step: ReadOperation, layout: Layout) -> str:
         case ReadKind.SCALAR:
             return f"{_word(step.type)}{to}"
         case ReadKind.SKIP:
-            return f"skip {step.count} of {step.size} bytes"
+            aligned = f", aligned to {step.size}" if step.size > 1 else ""
+            return f"skip {plural(step.elements * step.size, 'byte')}{aligned}"
         case ReadKind.ARRAY:
-            return f"{_word(step.type)}[{step.count}]{to}"
+            return f"{_word(step.type)}[{step.elements}]{to}"
         case ReadKind.SEQUENCE if to:
             return f"{_word(step.type)}[]{to}"
         case ReadKind.SEQUENCE:
-            return f"skip a sequence of {step.size} bytes each"
+            return f"skip a sequence, of {plural(step.size, 'byte')} each"
         case ReadKind.EACH:
-            return f"each of {step.count}{to}"
+            return f"each of {step.elements}{to}"
         case ReadKind.EACH_SEQUENCE:
             return f"each of a sequence{to}"
         case _:
@@ -112,7 +114,7 @@ def _step(step: ReadOperation, layout: Layout) -> str:
 
 def _target(kind: str, target: LoweredTarget, layout: Layout) -> Iterator[str]:
     yield ""
-    yield f"{kind} {target.label}"
+    yield f"  {kind} {target.label}"
     _, when, _, *places = target.places
     yield from _listed(target.condition, [when] * len(target.condition), layout)
     yield from _listed(target.message, places, layout)
@@ -121,66 +123,26 @@ def _target(kind: str, target: LoweredTarget, layout: Layout) -> Iterator[str]:
 def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) -> Iterator[str]:
     _, _, place, *_ = target.places
     yield ""
-    yield f"elements, {_stored(elements.scalar)}"
+    yield f"  elements, {_stored(elements.scalar)}"
     yield from _listed(elements.code, [place] * len(elements.code), layout)
     slots = [_slot(each, layout) for each in (elements.item, elements.index, elements.count) if each != NONE]
     into = [f"node {elements.node}"] * (elements.node != NONE) + slots
-    yield f"{_INDENT}each -> {', '.join(into)}" if into else f"{_INDENT}each"
+    yield f"    each -> {', '.join(into)}" if into else "    each"
 
 
 def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:
     """One operation a line, by number; a line for each place where that changes. Loops are indented."""
-    depth = 1
+    depth = 0
     before = ""
     for number, (operation, place) in enumerate(zip(code, places, strict=True)):
         if place != before:
             span, _, field = place.partition(": ")
-            yield f"{_INDENT}# {field}  ({span})" if field else f"{_INDENT}# {span}"
+            yield f"    # {field}  ({span})" if field else f"    # {span}"
             before = place
         depth -= operation.kind is Op.AGAIN
-        words = _operands(operation, number, layout)
-        yield f"{number:5}  {_INDENT * (depth - 1)}{_word(operation.kind):16}  {words}".rstrip()
+        words = _OPERANDS.get(operation.kind, _signs)(_Line(number, operation, layout))
+        yield f"    {number:4}  {_INDENT * depth}{_word(operation.kind):16}  {words}".rstrip()
         depth += operation.kind is Op.REPEAT
-
-
-def _operands(operation: Operation, number: int, layout: Layout) -> str:  # noqa: PLR0911 - one case after another
-    slot = operation.slot if isinstance(operation.slot, int) else operation.slot.index
-    match operation.kind:
-        case Op.INTEGER | Op.REAL:
-            return repr(operation.number)
-        case Op.TEXT:
-            return _text(operation.data)
-        case Op.KNOWN:
-            aligned = f", aligned to {slot}" if slot > 1 else ""
-            return _hex(operation.data) + aligned
-        case Op.LOAD | Op.KEEP | Op.NEXT | Op.APPEND:
-            return _slot(slot, layout)
-        case Op.ENTER:
-            return f"node {slot}, {layout.messages[slot]}"
-        case Op.JUMP | Op.UNLESS | Op.AND | Op.OR:
-            return f"to {number + 1 + operation.size}"
-        case Op.REPEAT:
-            return f"up to {number + operation.size}" + ", keeping what is made" * bool(operation.flag)
-        case Op.COMPARE:
-            return f"{_RELATIONS[Relation(operation.flag)]}  {_word(Compared(slot))}"
-        case Op.ELEMENT:
-            return f"[{operation.number}], {_stored(Scalar(operation.flag))}"
-        case Op.OCTETS | Op.UNPACK:
-            return _stored(Scalar(operation.flag))
-        case Op.LIST:
-            return f"of {operation.size}"
-        case Op.MEMBER:
-            return ", ".join(map(str, struct.unpack(f"<{operation.size}i", operation.data)))
-        case Op.DIGITS:
-            return f"{slot} decimals"
-        case Op.FIT_SIZE:
-            return f"at most {operation.number} bytes"
-        case Op.PUT:
-            return plural(slot, "byte")
-        case kind if kind >= Op.OPEN:
-            return _written(operation)
-        case _:
-            return _signs(operation.flag)
 
 
 _RELATIONS = {
@@ -193,20 +155,118 @@ _RELATIONS = {
 }
 
 
-def _written(operation: Operation) -> str:
-    """A field of a protobuf message, or an element that is packed."""
-    if operation.kind is Op.CLOSE:
-        return ""
-    field = f"field {operation.size >> 3}" if operation.size else "no tag"
-    if operation.kind is Op.OPEN:
-        return field + ", left out if empty" * (not operation.flag)
-    return field + ", also if 0 or empty" * bool(operation.flag)
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """An operation and its number in the code."""
+
+    number: int
+    operation: Operation
+    layout: Layout
+
+    @property
+    def index(self) -> int:
+        """The operation's `slot` as a number."""
+        slot = self.operation.slot
+        return slot if isinstance(slot, int) else slot.index
 
 
-def _signs(flag: int) -> str:
+def _of_slot(line: _Line) -> str:
+    return _slot(line.index, line.layout)
+
+
+def _jump(line: _Line) -> str:
+    return f"to {line.number + 1 + line.operation.size}"
+
+
+def _number(line: _Line) -> str:
+    return repr(line.operation.number)
+
+
+def _text(line: _Line) -> str:
+    return repr(line.operation.data.decode("utf-8", "backslashreplace"))
+
+
+def _known(line: _Line) -> str:
+    data = line.operation.data
+    shown = data[:_MOST_SHOWN].hex(" ")
+    rest = f" ... ({len(data)} bytes)" if len(data) > _MOST_SHOWN else ""
+    return shown + rest + (f", aligned to {line.index}" if line.index > 1 else "")
+
+
+def _repeat(line: _Line) -> str:
+    return f"up to {line.number + line.operation.size}" + ", keeping what is made" * bool(line.operation.flag)
+
+
+def _compare(line: _Line) -> str:
+    return f"{_RELATIONS[Relation(line.operation.flag)]}  {_word(Compared(line.index))}"
+
+
+def _member(line: _Line) -> str:
+    numbers = struct.unpack(f"<{line.operation.size}i", line.operation.data)
+    return f"of {', '.join(map(str, numbers))}"
+
+
+def _of_stored(line: _Line) -> str:
+    return _stored(Scalar(line.operation.flag))
+
+
+def _element(line: _Line) -> str:
+    return f"[{line.operation.number}], {_of_stored(line)}"
+
+
+def _tag(line: _Line) -> str:
+    """The field of a protobuf message; packed elements have none."""
+    return f"field {line.operation.size >> 3}" if line.operation.size else "no tag"
+
+
+def _open(line: _Line) -> str:
+    return _tag(line) + ", left out if empty" * (not line.operation.flag)
+
+
+def _write(line: _Line) -> str:
+    return _tag(line) + ", also if 0 or empty" * bool(line.operation.flag)
+
+
+def _signs(line: _Line) -> str:
     """Which integers are unsigned."""
-    named = [_word(sign) for sign in Sign if flag & sign]
+    named = [_word(sign) for sign in Sign if line.operation.flag & sign]
     return f"unsigned: {', '.join(named)}" if named else ""
+
+
+_OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
+    Op.INTEGER: _number,
+    Op.REAL: _number,
+    Op.TEXT: _text,
+    Op.LOAD: _of_slot,
+    Op.KEEP: _of_slot,
+    Op.JUMP: _jump,
+    Op.UNLESS: _jump,
+    Op.AND: _jump,
+    Op.OR: _jump,
+    Op.COMPARE: _compare,
+    Op.DIGITS: lambda line: plural(line.index, "decimal"),
+    Op.FIT_SIZE: lambda line: f"at most {_number(line)} bytes",
+    Op.OCTETS: _of_stored,
+    Op.MEMBER: _member,
+    Op.ELEMENT: _element,
+    Op.ENTER: lambda line: f"node {line.index}, {line.layout.messages[line.index]}",
+    Op.REPEAT: _repeat,
+    Op.NEXT: _of_slot,
+    Op.LIST: lambda line: f"of {line.operation.size}",
+    Op.UNPACK: _of_stored,
+    Op.APPEND: _of_slot,
+    Op.KNOWN: _known,
+    Op.PUT: lambda line: plural(line.index, "byte"),
+    Op.OPEN: _open,
+    Op.WRITE_VARINT: _write,
+    Op.WRITE_ZIGZAG: _write,
+    Op.WRITE_FIXED32: _write,
+    Op.WRITE_FIXED64: _write,
+    Op.WRITE_FLOAT: _write,
+    Op.WRITE_DOUBLE: _write,
+    Op.WRITE_BYTES: _write,
+}
+"""What is said of an operation; of others, which integers are unsigned."""
 
 
 def _slot(slot: int, layout: Layout) -> str:
@@ -217,14 +277,5 @@ def _stored(scalar: Scalar) -> str:
     return "in cells" if scalar is Scalar.IN_CELLS else f"{_word(scalar)} in a row"
 
 
-def _word(member: Op | Compared | Scalar | Sign | ReadKind) -> str:
-    return str(member.name).lower()
-
-
-def _text(data: bytes) -> str:
-    return repr(data.decode("utf-8", "backslashreplace"))
-
-
-def _hex(data: bytes) -> str:
-    shown = data[:_MOST_SHOWN].hex(" ")
-    return f"{shown} ... ({len(data)} bytes)" if len(data) > _MOST_SHOWN else shown
+def _word(member: Enum) -> str:
+    return member.name.lower()

@@ -431,7 +431,9 @@ def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) ->
 
 def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
     """What one of its routes needs Python for, all of them do."""
-    later = "destinations: [{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}]\n    deadman: {none: for tests}"
+    later = (
+        "destinations: [{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}]\n    deadman: {none: for tests}"
+    )
     made = program(tmp_path, ROUTES.replace("destinations: [driving_board]\n    deadman: {none: for tests}", later))
     assert list(made.lowered.from_ros) == ["drive"]
     reasons = {key: executor.reason for key, executor in made.executors.items()}

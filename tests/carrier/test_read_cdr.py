@@ -75,7 +75,9 @@ def test_scalars_are_aligned_to_their_size(evaluating: CDLL, names: list[str], d
         values.append(data.draw(_value_of(name)))
         written.scalar(SCALARS[name], values[-1])
         wanted = data.draw(st.booleans())
-        steps.append(Step("READ_SCALAR", slot, type=f"SCALAR_{name}") if wanted else Step("READ_SKIP", size=_size(name), count=1))
+        steps.append(
+            Step("READ_SCALAR", slot, type=f"SCALAR_{name}") if wanted else Step("READ_SKIP", size=_size(name), count=1)
+        )
     machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
     message = written.message()
     assert machine.read(message)
@@ -201,7 +203,12 @@ def test_other_representations_are_refused(evaluating: CDLL, message: bytes) -> 
 def test_a_length_beyond_the_end_is_refused(evaluating: CDLL, count: int, size: int) -> None:
     message = Written().scalar("I", count).message() + bytes(4)
     loop = [Step("READ_EACH_SEQUENCE", 0), Step("READ_SKIP", size=size, count=1), Step("READ_AGAIN")]
-    for steps in ([Step("READ_SEQUENCE", 0, size=size)], [Step("READ_SEQUENCE", size=size)], [Step("READ_TEXT", 0)], loop):
+    for steps in (
+        [Step("READ_SEQUENCE", 0, size=size)],
+        [Step("READ_SEQUENCE", size=size)],
+        [Step("READ_TEXT", 0)],
+        loop,
+    ):
         assert not Machine(evaluating, Layout((Node(steps),), is_cdr=True)).read(message)
 
 

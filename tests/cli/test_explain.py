@@ -53,7 +53,6 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "    when is_calibrated\n"
         "    dropped when older than 1 s\n"
         "    at most 5 Hz, keeping the first\n"
-        f"    by Python: `when: is_calibrated` needs it  ({table}:7:58)\n"
         "\n"
         f"  topic x: std_msgs/msg/Float32  ({table}:9:10)\n"
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
@@ -196,8 +195,16 @@ def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
 ) -> None:
     out = explained(capsys, table, "--code")
     assert "imu_info: SensorBoardIMUInfo" in out
-    assert "\ndef route_imu_info(" in out
+    assert "\n  topic x\n    # when  (" in out
+    assert "\ndef " not in out
     assert "  ignored: not part of this test\n" in out
+
+
+def test_the_code_of_what_needs_python_is_python(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = explained(capsys, own, "--code")
+    assert "\ndef route_newest(" in out
+    assert "\n  topic p\n    # " in out
+    assert "def route_plain(" not in out
 
 
 def test_an_unknown_name_and_a_bad_table_are_told_instead(
