@@ -93,7 +93,7 @@ def native_for_each(elements: LoweredElements | None, programs: Programs) -> c.F
         return c.ForEach()
     return c.ForEach(
         list=programs.code(elements.code),
-        stored=elements.stored,
+        stored=elements.scalar,
         node=elements.node,
         item=elements.item,
         index=elements.index,

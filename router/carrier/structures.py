@@ -164,10 +164,10 @@ class ReadOperation(ctypes.Structure):
 
 
 class Node(ctypes.Structure):
-    """`struct node` in operations.h; `entries` are fields of protobuf, or steps through CDR."""
+    """`struct node` in operations.h; `fields` of protobuf, or steps through CDR."""
 
     _fields_ = (
-        ("entries", c_void_p),
+        ("fields", c_void_p),
         ("count", c_uint32),
         ("first_slot", c_uint16),
         ("slot_count", c_uint16),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from router.compiler.expressions import ExpressionError, Scope
-from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, TIME_END, clamp
+from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, INT64_END, clamp
 from router.compiler.expressions.kinds import (
     INT32,
     OCTET,
@@ -87,7 +87,7 @@ def _to_time(value: Node, target: MessageType) -> Record:
         return member, Leaf(member.type, _within(made, member.type), value.span)
 
     sec, nanosec = target.fields
-    seconds = part(sec, Operator.FLOOR_DIVIDE, -TIME_END // NS_PER_SECOND, TIME_END // NS_PER_SECOND)
+    seconds = part(sec, Operator.FLOOR_DIVIDE, -INT64_END // NS_PER_SECOND, INT64_END // NS_PER_SECOND)
     return Record(target, (seconds, part(nanosec, Operator.MODULO, 0, NS_PER_SECOND - 1)), value.span)
 
 

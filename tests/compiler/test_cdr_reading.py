@@ -129,6 +129,11 @@ def test_bad_string_fails_where_it_is_used_and_nowhere_else(text: bytes) -> None
     _, read_text = reader(declared, [("text",)])
     with pytest.raises(MAPPING_FAILURES):
         read_text(data)
+    _, read_elements = reader(message(elements=List(declared, length=1)), [("elements",)])
+    ((element,),) = read_elements(data)
+    assert element.after == 7
+    with pytest.raises(MAPPING_FAILURES):
+        _ = element.text
 
 
 def test_what_follows_the_last_wanted_field_is_not_looked_at() -> None:

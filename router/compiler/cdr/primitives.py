@@ -8,11 +8,12 @@ struct.error or UnicodeError.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
+from typing import Any
 
 from router.errors import MappingError
-from router.types.model import Bool, Float, Int, MessageType, Type
+from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
 HEADER = b"\x00\x01\x00\x00"
 """Representation identifier CDR_LE and two option bytes."""
@@ -83,13 +84,30 @@ def numbers(letter: str, size: int, data: bytes) -> tuple[int | float, ...]:
     return struct.unpack(f"<{len(data) // size}{letter}", data)
 
 
+def decoder(declared: Type) -> Callable[[Any], object] | None:
+    """The function that decodes the text of a field, None for other types."""
+    match declared:
+        case String():
+            return read_wide_text if declared.wide else read_text
+        case List(element=String(wide=wide)):
+            return read_wide_texts if wide else read_texts
+        case _:
+            return None
+
+
 def object_class(declared: MessageType) -> type[tuple[object, ...]]:
     """A class whose objects are made of a tuple of all fields, which are its attributes.
 
-    It is a tuple since that is the fastest to make. Fields may have the names of Python keywords.
+    Text in the tuple is not decoded, text that an attribute gives is. It is a tuple since that is the fastest to make.
+    Fields may have the names of Python keywords.
     """
-    fields = {member.name: property(itemgetter(index)) for index, member in enumerate(declared.fields)}
+    fields = {member.name: property(_getter(index, member.type)) for index, member in enumerate(declared.fields)}
     return type(declared.short_name, (tuple,), {"__slots__": (), **fields})
+
+
+def _getter(index: int, declared: Type) -> Callable[[Any], object]:
+    decode = decoder(declared)
+    return itemgetter(index) if decode is None else lambda values: decode(values[index])
 
 
 # writing

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Union
 
-from router.compiler.cdr.primitives import HEADER, object_class, scalar_format
+from router.compiler.cdr.primitives import HEADER, decoder, object_class, scalar_format
 from router.compiler.expressions.kinds import OCTET, TIME_TYPES
 from router.compiler.expressions.tree import Path
 from router.compiler.source import Source, call, load
@@ -67,7 +67,7 @@ class Leap:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """An object made for a message, from the expressions `fields`."""
+    """An object made for a message, from the variables `fields`. It decodes text where it is used."""
 
     variable: str
     type: MessageType
@@ -121,12 +121,6 @@ class _Walk:
     wanted: Collection[Path]
     variable: Callable[[Path], str]
 
-    def value(self, declared: Type, path: Path) -> str:
-        """The expression that is a field's whole value after its steps."""
-        variable = self.variable(path)
-        decode = decoder(declared)
-        return f"{decode}({variable})" if decode else variable
-
     def steps(self, declared: Type, path: Path, whole: bool) -> Iterator[Step]:
         """The steps of one field. `whole` says that all of a message around it is wanted."""
         whole = whole or path in self.wanted
@@ -151,7 +145,7 @@ class _Walk:
             # Read where objects are made, so that a list cannot claim more of them than there are bytes.
             yield Take("B", 1, self.variable((*path, "nothing")) if whole else None)
         if whole:
-            fields = tuple(self.value(member.type, (*path, member.name)) for member in declared.fields)
+            fields = tuple(self.variable((*path, member.name)) for member in declared.fields)
             is_moment = path != () and declared.name in TIME_TYPES  # a topic of times gives messages as others do
             yield Moment(self.variable(path), *fields) if is_moment else Object(self.variable(path), declared, fields)
 
@@ -182,17 +176,6 @@ class _Walk:
             yield Leap(fixed)
         else:
             yield from fixed * declared.length
-
-
-def decoder(declared: Type) -> str | None:
-    """The function that decodes the text of a field, None for other types."""
-    match declared:
-        case String():
-            return "read_wide_text" if declared.wide else "read_text"
-        case List(element=String(wide=wide)):
-            return "read_wide_texts" if wide else "read_texts"
-        case _:
-            return None
 
 
 _PHASES = range(8)
@@ -392,7 +375,7 @@ class CdrReads:
             assert member is not None  # noqa: S101 - a path of a checked expression
             declared = member.type
         variable, decode = load(self._variable(path)), decoder(declared)
-        return call(decode, variable) if decode else variable
+        return call(decode.__name__, variable) if decode else variable
 
     def _variable(self, path: Path) -> str:
         """The variable for a path, the same each time."""

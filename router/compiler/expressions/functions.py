@@ -35,8 +35,8 @@ NS_PER_MILLISECOND = 1_000_000
 FLOAT32_END = 3.4028235677973366e38
 """The smallest magnitude that does not round to a finite float32."""
 
-TIME_END = 1 << 63
-"""The first time, in ns, that 64 bits do not hold."""
+INT64_END = 1 << 63
+"""The first integer that does not fit 64 bits with a sign."""
 
 # implementations
 
@@ -58,10 +58,17 @@ def ceil(x: float) -> int:
 
 
 def _to_int(convert: Callable[[float], int], x: float) -> int:
-    try:
-        return convert(x)
-    except (ValueError, OverflowError):
-        raise NonFiniteError(f"{x} is no integer") from None
+    if isinstance(x, int):
+        return x
+    if not math.isfinite(x):
+        raise NonFiniteError(f"{x} is no integer")
+    return _within_64_bits(convert(x))
+
+
+def _within_64_bits(x: int) -> int:
+    if -INT64_END <= x < INT64_END:
+        return x
+    raise MappingError(f"{x} does not fit 64 bits")
 
 
 def clamp(x: float, low: float, high: float) -> float:
@@ -69,6 +76,8 @@ def clamp(x: float, low: float, high: float) -> float:
 
 
 def wrap(x: int, low: int, high: int) -> int:
+    if low > high:
+        raise MappingError(f"the low bound {low} is above the high bound {high}")
     return (x - low) % (high - low + 1) + low
 
 
@@ -92,22 +101,19 @@ def to_float32(x: float) -> float:
 
 
 def seconds(time: int) -> float:
-    return time / NS_PER_SECOND
+    return float(time) / NS_PER_SECOND
 
 
 def time_from_seconds(x: float) -> int:
-    return _to_time(x * NS_PER_SECOND)
+    return _within_64_bits(_to_int(round, x * NS_PER_SECOND))
 
 
 def time_from_milliseconds(x: float) -> int:
-    return _to_time(x * NS_PER_MILLISECOND)
+    return _within_64_bits(_to_int(round, x * NS_PER_MILLISECOND))
 
 
-def _to_time(ns: float) -> int:
-    time = _to_int(round, ns)
-    if -TIME_END <= time < TIME_END:
-        return time
-    raise MappingError(f"{time} ns are no time: it has 64 bits")
+def fixed(x: float, digits: int) -> str:
+    return f"{float(x):.{digits}f}"
 
 
 # kinds of results

@@ -221,7 +221,7 @@ def path_of(node: Node) -> Path | None:
     return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
 
 
-def parts_of(node: Node) -> tuple[Node, ...]:
+def parts_of(node: Node) -> tuple[Node, ...]:  # noqa: C901 - a case a node
     """The nodes directly in this one."""
     match node:
         case Constant() | Variable():

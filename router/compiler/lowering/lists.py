@@ -47,6 +47,10 @@ if TYPE_CHECKING:
     from router.compiler.lowering.expressions import Lowering
 
 
+_MOST_STACKED = 32
+"""Elements of a literal that are on the stack at a time."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stored:
     """A list, which `code` puts on the stack, and how it is stored.
@@ -109,8 +113,16 @@ def _listed(lowering: Lowering, node: Listed) -> Stored:
     message: Node | None = None
     if isinstance(element, MessageKind):
         message = Node(element.type, None, "[].")  # only those of ROS are values
-    made = code(*items, Operation(Op.LIST, size=len(items)))
-    return Stored(made, Scalar.IN_CELLS, element, message)
+    if len(items) <= _MOST_STACKED:
+        return Stored(code(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
+    made = lowering.names.temporary()
+    appended = (code(item, Operation(Op.APPEND, made)) for item in items)
+    return Stored(code(_begun(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
+
+
+def _begun(made: Slot) -> Code:
+    """An empty list in a slot."""
+    return Operation(Op.LIST, size=0), keep(made), DROP
 
 
 def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
@@ -125,8 +137,7 @@ def _computed(lowering: Lowering, node: Each) -> Stored:
         assert element is not None  # noqa: S101 - it is computed
         return code(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
 
-    start = Operation(Op.LIST, size=0), keep(made), DROP
-    filled = code(start, looped(lowering, node.lists, append, keeps=True), load(made))
+    filled = code(_begun(made), looped(lowering, node.lists, append, keeps=True), load(made))
     return Stored(filled, Scalar.IN_CELLS, node.kind.element)
 
 
@@ -157,7 +168,7 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
         return values
     made, each = lowering.names.temporary(), lowering.names.temporary()
-    start = code(Operation(Op.LIST, size=0), keep(made), DROP, values.code, keep(each), SIZE)
+    start = code(_begun(made), values.code, keep(each), SIZE)
     taken, meaning = _taken(lowering, values, each)
     one = lowering.time((), meaning) if isinstance(meaning, Node) else ()
     body = code(taken, one, *_as(kind, element), Operation(Op.APPEND, made))

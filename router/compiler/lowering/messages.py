@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from router.compiler.expressions.kinds import Kind, ListKind
 from router.compiler.lowering import lists
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
@@ -49,15 +48,11 @@ def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
-    if declared.length is not None and not any(_length(values.kind) == declared.length for _, values in made.lists):
+    if declared.length is not None:
         return code(count, _wanted(lowering, declared.length, Relation.EQUAL)), taken
-    if declared.length is None and declared.bound is not None:
+    if declared.bound is not None:
         return code(count, _wanted(lowering, declared.bound, Relation.LESS_OR_EQUAL)), taken
     return count, taken
-
-
-def _length(kind: Kind) -> int | None:
-    return kind.length if isinstance(kind, ListKind) else None
 
 
 def _wanted(lowering: Lowering, limit: int, relation: Relation) -> Code:
