@@ -236,7 +236,8 @@ def test_real_clamp_lets_nan_through(machine: Machine, x: float, low: float, hig
 
 
 @pytest.mark.parametrize(
-    ("name", "plain"), [("OP_ROUND", round), ("OP_TRUNCATE", math.trunc), ("OP_FLOOR", math.floor), ("OP_CEIL", math.ceil)]
+    ("name", "plain"),
+    [("OP_ROUND", round), ("OP_TRUNCATE", math.trunc), ("OP_FLOOR", math.floor), ("OP_CEIL", math.ceil)],
 )
 def test_rounding_gives_an_integer_or_says_why_not(machine: Machine, name: str, plain: Callable[[float], int]) -> None:
     @given(DOUBLES)
@@ -443,7 +444,13 @@ def test_sum_of_a_list(machine: Machine, values: list[int]) -> None:
 
 @given(st.lists(st.integers(-1000, 1000), max_size=9))
 def test_a_list_made_element_by_element(machine: Machine, values: list[int]) -> None:
-    keep = [Operation("OP_KEEP", 1), Operation("OP_DROP"), Operation("OP_LIST"), Operation("OP_KEEP", 2), Operation("OP_DROP")]
+    keep = [
+        Operation("OP_KEEP", 1),
+        Operation("OP_DROP"),
+        Operation("OP_LIST"),
+        Operation("OP_KEEP", 2),
+        Operation("OP_DROP"),
+    ]
     double = [integer(2), Operation("OP_MULTIPLY"), Operation("OP_APPEND", 2)]
     assert machine.value(*_listed(*values), *keep, *_each(1, *double, keeps=True), load(2), of=LIST) == [
         2 * value for value in values

@@ -216,7 +216,9 @@ def test_random_expressions_have_the_same_values(
     wire = source_wire()
     case = wire[1].cases["source"]
     try:
-        python, carrier = to_ros(delivering, wire, case, field_map(it=text), target_of(before=Bool(), it=declared), when)
+        python, carrier = to_ros(
+            delivering, wire, case, field_map(it=text), target_of(before=Bool(), it=declared), when
+        )
     except (Misfit, ExpressionError):
         event("does not fit")
         return
