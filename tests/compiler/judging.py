@@ -42,7 +42,7 @@ Plane = Callable[["Question"], Callable[[bytes], Answer]]
 """Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
 
 _ABOUT_VALUES = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS, Code.LOSSY_CONVERSION, Code.UNKNOWN_ENUM_VALUE}
-_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing")
+_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds")
 
 
 def is_about_values(finding: Diagnostic) -> bool:
