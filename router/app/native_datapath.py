@@ -3,7 +3,7 @@
 What the receive thread does not send itself comes by rings to others: a native one publishes (`publishing`), `topics`
 and `destinations` serve what needs Python (`parts`). Each of those two has its own engine with its own state, and
 changes to another program when it has served all that the earlier one received. Messages from ROS have two native
-threads, one of them for commands (`ros_commands`); those that need Python have the one in `ros`.
+threads, one of them for commands (`from_ros`); those that need Python have the one in `ros`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from struct import Struct
 from time import sleep
 from typing import TYPE_CHECKING, cast
 
+from router.app.from_ros import FromRos, RosTopics
 from router.app.parts import OF_PYTHON, Part, Parts, divided
 from router.app.publishing import Publishing
-from router.app.ros_commands import RosCommands, RosTopics
 from router.app.sockets import SocketChange
 from router.app.wiring import (
     RouterContext,
@@ -36,16 +36,17 @@ from router.app.wiring import (
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
-from router.carrier.commands import native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
-from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
-from router.carrier.publishing import PublishRoutes
+from router.carrier.from_ros import native_from_ros
+from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.program import NativeProgram, native_program
 from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker
 from router.clock import boottime_ns
+from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import OutboundEngine, PartEngine
@@ -112,8 +113,8 @@ class NativeDatapath:
         from_ros = [(_fixed_counts(), Ring(library, _EVENTS)) for _ in (True, False)]
         self._deadmen = Deadmen(library, deadman_counts, braked, self._names)
         self._carrier = Carrier(library, self._deadmen.address, receive_counts, received)
-        self._commands = [
-            RosCommands(library, self._deadmen.address, counts, events, is_urgent=is_urgent)
+        self._from_ros = [
+            FromRos(library, self._deadmen.address, counts, events, is_urgent=is_urgent)
             for is_urgent, (counts, events) in zip((True, False), from_ros, strict=True)
         ]
         self._publishing = Publishing(library, Ring(library, _QUEUE), publish_counts, published, self._names)
@@ -124,8 +125,8 @@ class NativeDatapath:
             context.counts.add(worker.counts, worker.copy_counts, worker.forget_copy)
         context.counts.add(_as_list(publish_counts), self._publishing.counters)
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
-        for commands, (counts, _) in zip(self._commands, from_ros, strict=True):
-            context.counts.add(_as_list(counts), commands.counters)
+        for thread, (counts, _) in zip(self._from_ros, from_ros, strict=True):
+            context.counts.add(_as_list(counts), thread.counters)
         self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
@@ -152,8 +153,8 @@ class NativeDatapath:
 
     def _pulse(self) -> None:
         self._carrier.pulse()
-        for commands in self._commands:
-            commands.report_failures()
+        for thread in self._from_ros:
+            thread.report_failures()
 
     def open_listener(self, settings: model.Listener, has_senders: bool) -> Listener:
         return Listener(settings, is_stamped=True, has_senders=has_senders)
@@ -197,7 +198,7 @@ class NativeDatapath:
         shared = engine_context(program, context, topics, errors, send, command, pacers)
         of_ros = replace(shared, counts=context.counts.ros, state=states[_ROS])
         outbound = OutboundEngine(program, of_ros, ros.freshness if ros else Freshness())
-        parts = divided(program, publishes=self._publishing.open(has_topics=bool(program.lowered)))
+        parts = divided(program, publishes=self._publishing.open(has_topics=bool(program.lowered.topics)))
         engines = {
             part: PartEngine(
                 program, replace(shared, counts=self._workers[part].counts, state=states[user]), parts[part]
@@ -208,15 +209,14 @@ class NativeDatapath:
         limit = partial(_limit, states[_ENDPOINTS])
         publications = topics.publications if topics else {}
         generation = next(self._generations)
-        routes = PublishRoutes(program, publications, self._names.number, limit, generation)
         outlets = Outlets(
             listeners=sockets.listeners,
             senders={endpoint: sender.address for endpoint, sender in senders.items()},
-            wanted={topic: each.wanted for topic, each in publications.items()},
+            publications=publications,
             feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
             limit=limit,
             carried=lambda handler: parts[Part.SENT].get(handler.route, ()),
-            parts=lambda handler: list(self._parts_of(handler, parts, routes)),
+            parts=lambda handler: list(self._parts_of(handler, parts)),
             names=self._names,
         )
         try:
@@ -225,7 +225,7 @@ class NativeDatapath:
         except CannotCarry as error:
             what = f"the carrier, which runs, cannot take these messages: {error}"
             raise StartError(what, "restart the router, and Python serves them") from error
-        native.arrays += [senders, deadmen, routes]
+        native.arrays += [senders, deadmen]
         numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
         now = self._wiring.program if self._wiring else program
         leaves_native = bool(_topics(now, by_carrier=True) & _topics(program, by_carrier=False))
@@ -238,10 +238,10 @@ class NativeDatapath:
             )
             for part in OF_PYTHON
         }
-        commands = native_commands(program, outlets)
-        commands.arrays += [senders, deadmen]
-        for thread in self._commands:
-            thread.open(commands)
+        messages = native_from_ros(program, generation, outlets)
+        messages.arrays += [senders, deadmen]
+        for thread in self._from_ros:
+            thread.open(messages)
         self._ros = ros
         for part, stage in stages.items():
             self._workers[part].prepare(stage)
@@ -250,7 +250,7 @@ class NativeDatapath:
             take={
                 plan.label: outbound.taker(plan.label)
                 for plan in program.subscriptions
-                if plan.label not in commands.topics
+                if plan.label not in messages.topics
             },
             feed=feeder(behind_gateways, timers.inbound_deadman.locked),
             states=states,
@@ -259,18 +259,16 @@ class NativeDatapath:
             engines=(outbound, *engines.values()),
             native=native,
             topics=RosTopics(
-                commands, {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {}
+                messages, {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {}
             ),
             deadmen=deadmen,
             stages=stages,
         )
 
-    def _parts_of(self, handler: Handler, parts: Parts, routes: PublishRoutes) -> Iterator[PartTargets]:
+    def _parts_of(self, handler: Handler, parts: Parts) -> Iterator[PartTargets]:
         """The parts of a route that get their messages by a ring."""
         if targets := parts[Part.PUBLISHED].get(handler.route):
-            yield PartTargets(
-                self._publishing.ring.address, targets, is_always_wanted=False, publishes=routes.route(handler, targets)
-            )
+            yield PartTargets(self._publishing.ring.address, targets, is_always_wanted=False, is_native=True)
         for part, worker in self._workers.items():
             if targets := parts[part].get(handler.route):
                 is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
@@ -309,9 +307,9 @@ class NativeDatapath:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
         assert self._wiring is not None  # noqa: S101 - another program runs
         with ExitStack() as undo:
-            for commands in self._commands:
-                commands.leave(wiring.topics, keeps=wiring.deadmen == self._wiring.deadmen)
-                undo.callback(commands.stay)
+            for thread in self._from_ros:
+                thread.leave(wiring.topics, keeps=wiring.deadmen == self._wiring.deadmen)
+                undo.callback(thread.stay)
             swap()
             undo.pop_all()
 
@@ -323,8 +321,8 @@ class NativeDatapath:
             for listener in left:
                 listener.end_input()
             self._change(wiring, earlier)
-        for commands in self._commands:
-            commands.serve(wiring.topics)
+        for thread in self._from_ros:
+            thread.serve(wiring.topics)
         self._wiring = wiring
 
     def _change(self, wiring: NativeWiring, earlier: NativeWiring) -> None:
@@ -374,7 +372,7 @@ class NativeDatapath:
             late.append("publish")
         if late:
             logger.error("a thread is stuck, and what it uses stays open", threads=late)
-        return not late and self._has_turned() and all(commands.has_passed for commands in self._commands)
+        return not late and self._has_turned() and all(thread.has_passed for thread in self._from_ros)
 
     def _has_turned(self) -> bool:
         """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
@@ -405,7 +403,7 @@ class NativeDatapath:
         self._stop_threads_of_ros()
 
     def _stop_threads_of_ros(self) -> None:
-        have_ended = [self._publishing.stop(), *(commands.stop() for commands in self._commands)]
+        have_ended = [self._publishing.stop(), *(thread.stop() for thread in self._from_ros)]
         if not all(have_ended) and self._ros is not None:
             self._ros.leave_open()
         self._has_stopped = True
@@ -435,12 +433,24 @@ class NativeDatapath:
             return str(rejected)
         return case
 
-    def _where_refused(self, route: str, topic: str, generation: int, place: int) -> str:
-        """Say which place of the table refused a message; nothing if it is not of the program that runs."""
+    def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
+        """Say which place of the table refused a message of `topic`, None for a datagram.
+
+        Nothing if it is not of the program that runs.
+        """
         wiring = self._wiring
-        if wiring is None or wiring.native.generation & 0xFFFF != generation:
+        if wiring is None or wiring.native.generation != generation:
             return ""
-        return wiring.program.lowered[route].targets[topic].places[place]
+        return _lowered_target(wiring.program.lowered, route, topic, target).places[place]
+
+
+def _lowered_target(lowered: Lowered, route: str, topic: str | None, target: str) -> LoweredTarget:
+    """What was lowered of a target, for messages from `topic`, None for datagrams."""
+    if topic is not None:
+        serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
+    else:
+        serving = [by_route[route] for by_route in (lowered.topics, lowered.conditions) if route in by_route]
+    return next(each.targets[target] for each in serving if target in each.targets)
 
 
 def _fixed_counts() -> ctypes.Array[ctypes.c_int64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-from router.carrier.program import Names
+from router.carrier.outlets import Names
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.errors import StartError

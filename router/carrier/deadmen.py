@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 
 from router.carrier import structures as c
-from router.carrier.program import Names
+from router.carrier.outlets import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.metrics import Counters

@@ -9,8 +9,9 @@ from dataclasses import replace
 from socket import inet_ntoa
 from struct import Struct
 
-from router.carrier.program import Names
+from router.carrier.outlets import Names
 from router.carrier.ring import Ring
+from router.carrier.structures import LOSSES, NO_NAME
 from router.compiler.metrics import REJECT_REASONS
 from router.engine.delivery import Report
 from router.threads import Thread, join_or_leave
@@ -18,24 +19,11 @@ from router.threads import Thread, join_or_leave
 _TRIPPED, _RELEASED, _DEADMAN_ERROR, _REJECTED, _LOST = range(1, 6)
 """`enum event_kind`."""
 
-_LOSSES = (
-    "mapping_error",
-    "non_finite",
-    "stale",
-    "rate_limited",
-    "queue_full",
-    "send_buffer_full",
-    "send_error",
-    "publish_error",
-    "too_large",
-)
-"""`enum loss`."""
-
 _REASONS = tuple(REJECT_REASONS)
 _HEAD = Struct("@II")
 _DEADMAN = Struct("@IIIIiI")
 _REJECT = Struct("@IIIIIIII")
-_LOSS = Struct("@IIIIIiIHH")
+_LOSS = Struct("@IIIIIIiIII")
 
 _PULSE_MS = 5000
 
@@ -45,8 +33,8 @@ class EventThread:
 
     Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
     that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
-    `detail(listener, data, length)` returns in words why a datagram was rejected, `place(route, topic, program, place)`
-    which place of the table refused a message, or "". It gets the lowest 16 bits of the program's generation.
+    `detail(listener, data, length)` returns in words why a datagram was rejected. `place(route, topic, target,
+    generation, place)` returns which place of the table refused a message of `topic`, None of a datagram; or "".
     """
 
     def __init__(
@@ -56,7 +44,7 @@ class EventThread:
         report: Callable[[Report], None],
         changed: Callable[[str, bool], None],
         detail: Callable[[str, bytes, int], str],
-        place: Callable[[str, str, int, int], str],
+        place: Callable[[str, str | None, str, int, int], str],
         pulse: Callable[[], None],
     ) -> None:
         self._rings = rings
@@ -115,12 +103,13 @@ class EventThread:
             detail = f"{sender}: {what}" if what else sender
             self._count(counter, Report("reject", place, "", _REASONS[reason], None, detail), counters, last)
         elif kind == _LOST:
-            _, _, of_route, of_target, loss, number, counter, program, place = _LOSS.unpack_from(record)
+            _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
             route, target = self._name(of_route), self._name(of_target)
             detail = bytes(record[_LOSS.size :]).partition(b"\0")[0].decode(errors="replace")
             if place:
-                detail = self._place(route, target, program, place)
-            lost = Report("drop", route, target, _LOSSES[loss], _error(number), detail)
+                topic = self._name(of_topic) if of_topic != NO_NAME else None
+                detail = self._place(route, topic, target, generation, place)
+            lost = Report("drop", route, target, LOSSES[loss], _error(number), detail)
             self._count(counter, lost, counters, last)
         else:
             _, _, route, target, number, counter = _DEADMAN.unpack_from(record)

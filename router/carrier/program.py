@@ -7,69 +7,18 @@ from __future__ import annotations
 
 import ctypes
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
-from router.carrier.boards import NativeBoards
+from router.carrier.outlets import Outlets, PartTargets
 from router.carrier.schema import wire_schema
+from router.carrier.targets import TargetWriter
 from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
-from router.net.udp import Listener
 from router.table.model import Framing
-
-
-class Names:
-    """Numbers for names, in both directions. A name keeps its number as long as the process lives."""
-
-    def __init__(self) -> None:
-        self._numbers: dict[str, int] = {}
-        self._names: list[str] = []
-
-    def number(self, name: str) -> int:
-        if name not in self._numbers:
-            self._numbers[name] = len(self._names)
-            self._names.append(name)
-        return self._numbers[name]
-
-    def name(self, number: int) -> str:
-        return self._names[number]
-
-
-@dataclass(frozen=True, slots=True)
-class PartTargets:
-    """The targets of a route that one thread serves, and the ring by which it gets the messages.
-
-    `publishes` is what the native thread does with them, None for a thread of Python.
-    """
-
-    ring: int
-    targets: Sequence[TargetPlan]
-    is_always_wanted: bool
-    publishes: c.PublishRoute | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Outlets:
-    """What is open for a program. Pointers are addresses of C structures.
-
-    `senders` are by endpoint, `wanted` by topic. `feeds(route, names)` returns the deadmen that a command feeds
-    (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`. `carried(handler)` are
-    the targets that the carrier serves, `parts(handler)` all others. Without
-    `boards`, endpoints that are boards get everything.
-    """
-
-    listeners: Mapping[str, Listener]
-    senders: Mapping[str, int]
-    wanted: Mapping[str, ctypes.Array[Any]]
-    feeds: Callable[[str, Sequence[str]], Sequence[tuple[int, bool]]]
-    limit: Callable[[Handler, TargetPlan], c.Limit]
-    carried: Callable[[Handler], Sequence[TargetPlan]]
-    parts: Callable[[Handler], Sequence[PartTargets]]
-    names: Names
-    boards: NativeBoards | None = None
 
 
 @dataclass(slots=True)
@@ -90,7 +39,8 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
     handlers = [handler for several in program.inbound.values() for handler in several]
     endpoints = list(program.table.endpoints)
     made = NativeProgram(generation, handlers, [*endpoints, source_label(STRANGER)], [schema])
-    writer = _Writer(program, made, outlets, {name: column for column, name in enumerate(endpoints)})
+    targets = TargetWriter(program, outlets, generation, made.arrays)
+    writer = _Writer(program, made, outlets, targets, {name: column for column, name in enumerate(endpoints)})
     made.structure = c.Program(
         generation=generation,
         listener_count=len(program.listeners),
@@ -109,6 +59,7 @@ class _Writer:
     program: Program
     made: NativeProgram
     outlets: Outlets
+    targets: TargetWriter
     columns: Mapping[str, int]
 
     @property
@@ -190,31 +141,24 @@ class _Writer:
     # routes
 
     def route(self, number: int, handler: Handler) -> c.Route:
-        arrays = self.made.arrays
-        destinations = [
-            native_destination(self.program, self.outlets, arrays, handler, target)
-            for target in self.outlets.carried(handler)
-        ]
         parts = [self._part(number, handler, part) for part in self.outlets.parts(handler)]
+        conditions = self.program.lowered.conditions.get(handler.route)
         return c.Route(
-            ttl=handler.ttl or 0,
-            destinations=self.array(c.Destination, destinations),
+            sends=self.targets.of_datagrams(handler, self.outlets.carried(handler), conditions),
             parts=self.array(c.Part, parts),
-            destination_count=len(destinations),
             part_count=len(parts),
-            id=self.outlets.names.number(handler.route),
             last_message=self.counters.index("route_last_message_timestamp_seconds", handler.route),
             duration=self.counters.index("route_duration_seconds", handler.route),
         )
 
     def _part(self, number: int, handler: Handler, part: PartTargets) -> c.Part:
-        topics = [self.outlets.wanted[target.label] for target in part.targets if target.is_topic]
+        topics = [self.outlets.publications[target.label].wanted for target in part.targets if target.is_topic]
         flags = [ctypes.addressof(flag) for flag in topics]
         self.made.arrays.append(topics)
         targets = [self._waiting(handler, target) for target in part.targets]
         return c.Part(
             ring=part.ring,
-            publishes=ctypes.pointer(part.publishes) if part.publishes is not None else None,
+            publishes=ctypes.pointer(self._published(handler, part)) if part.is_native else None,
             wanted=self.array(ctypes.c_void_p, flags),
             targets=self.array(c.Waiting, targets),
             wanted_count=len(flags),
@@ -224,6 +168,9 @@ class _Writer:
             route=self.outlets.names.number(handler.route),
         )
 
+    def _published(self, handler: Handler, part: PartTargets) -> c.Targets:
+        return self.targets.of_datagrams(handler, part.targets, self.program.lowered.topics[handler.route])
+
     def _waiting(self, handler: Handler, target: TargetPlan) -> c.Waiting:
         counters, place = self.counters, (handler.route, target.label)
         return c.Waiting(
@@ -232,41 +179,6 @@ class _Writer:
             queue_full=counters.index("messages_dropped", *place, "queue_full"),
             filtered=counters.index("messages_filtered", *place),
         )
-
-
-def native_destination(
-    program: Program, outlets: Outlets, arrays: list[object], handler: Handler, target: TargetPlan
-) -> c.Destination:
-    """A target that the carrier serves. `arrays` gets what has to live as long."""
-    counters, place = program.counters, (handler.route, target.label)
-    made = c.Destination(
-        sender=outlets.senders[target.label],
-        trims=program.table.endpoints[target.label].trim_trailing_zeros,
-        id=outlets.names.number(target.label),
-        sent=counters.index("datagrams_sent", *place),
-        sent_bytes=counters.index("sent_bytes", *place),
-        stale=counters.index("messages_dropped", *place, "stale"),
-        rate_limited=counters.index("messages_dropped", *place, "rate_limited"),
-        send_buffer_full=counters.index("messages_dropped", *place, "send_buffer_full"),
-        send_error=counters.index("messages_dropped", *place, "send_error"),
-        too_large=counters.index("messages_dropped", *place, "too_large"),
-        non_finite=counters.index("messages_dropped", *place, "non_finite"),
-    )
-    if outlets.boards is not None:
-        made.board = outlets.boards.pointer(target.label)
-        arrays.append(outlets.boards)
-    if target.deadmen:
-        feeds = [
-            c.Feed(deadman=deadman, disarms=disarms)
-            for deadman, disarms in outlets.feeds(handler.route, target.deadmen)
-        ]
-        made.feeds, made.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
-        arrays.append(made.feeds)
-    if target.max_rate is not None:
-        limit = outlets.limit(handler, target)
-        made.limit = ctypes.pointer(limit)
-        arrays.append(limit)
-    return made
 
 
 def _number(host: str) -> int:

@@ -8,6 +8,22 @@ from ctypes import POINTER, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_uin
 REASONS = 8
 """Reasons to reject a datagram: those of REJECT_REASONS, in the same order."""
 
+LOSSES = (
+    "mapping_error",
+    "non_finite",
+    "stale",
+    "rate_limited",
+    "queue_full",
+    "send_buffer_full",
+    "send_error",
+    "publish_error",
+    "too_large",
+)
+"""`enum loss` in events.h, as DROP_REASONS names them."""
+
+NO_NAME = 0xFFFF_FFFF
+"""In events: no name belongs here."""
+
 
 class WireField(ctypes.Structure):
     """`struct wire_field` in envelope.h."""
@@ -86,29 +102,6 @@ class Board(ctypes.Structure):
     _fields_ = (("messages", POINTER(BoardMessage)), ("longest", c_uint32), ("allows_non_finite", c_uint32))
 
 
-class Destination(ctypes.Structure):
-    """`struct destination` in carrier.h."""
-
-    _fields_ = (
-        ("sender", c_void_p),
-        ("limit", POINTER(Limit)),
-        ("feeds", POINTER(Feed)),
-        ("board", POINTER(Board)),
-        ("feed_count", c_uint32),
-        ("trims", c_uint32),
-        ("id", c_uint32),
-        ("sent", c_uint32),
-        ("sent_bytes", c_uint32),
-        ("stale", c_uint32),
-        ("rate_limited", c_uint32),
-        ("send_buffer_full", c_uint32),
-        ("send_error", c_uint32),
-        ("too_large", c_uint32),
-        ("non_finite", c_uint32),
-        ("reserved", c_uint32),
-    )
-
-
 class Waiting(ctypes.Structure):
     """`struct waiting` in carrier.h."""
 
@@ -116,13 +109,25 @@ class Waiting(ctypes.Structure):
 
 
 class Value(ctypes.Structure):
-    """`struct value` in fields.h, with its union as bits."""
+    """`struct value` in operations.h, with its union as bits."""
 
     _fields_ = (("bits", c_uint64), ("size", c_uint32), ("reserved", c_uint32))
 
 
+class Operation(ctypes.Structure):
+    """`struct operation` in operations.h, with its union as bits."""
+
+    _fields_ = (("kind", c_uint8), ("flag", c_uint8), ("slot", c_uint16), ("size", c_uint32), ("bits", c_uint64))
+
+
+class Code(ctypes.Structure):
+    """`struct code` in operations.h."""
+
+    _fields_ = (("operations", POINTER(Operation)), ("count", c_uint32), ("reserved", c_uint32))
+
+
 class NodeField(ctypes.Structure):
-    """`struct node_field` in fields.h."""
+    """`struct node_field` in operations.h."""
 
     _fields_ = (
         ("number", c_uint32),
@@ -134,68 +139,94 @@ class NodeField(ctypes.Structure):
         ("choice", c_uint16),
         ("cleared", c_uint16),
         ("cleared_count", c_uint16),
-        ("reserved", c_uint16),
+        ("closed", c_uint16),
+    )
+
+
+class ClosedEnum(ctypes.Structure):
+    """`struct closed_enum` in operations.h."""
+
+    _fields_ = (("numbers", POINTER(c_int32)), ("count", c_uint32), ("reserved", c_uint32))
+
+
+class ReadOperation(ctypes.Structure):
+    """`struct read_operation` in operations.h."""
+
+    _fields_ = (
+        ("kind", c_uint8),
+        ("size", c_uint8),
+        ("type", c_uint8),
+        ("reserved", c_uint8),
+        ("slot", c_uint16),
+        ("padding", c_uint16),
+        ("count", c_uint32),
     )
 
 
 class Node(ctypes.Structure):
-    """`struct node` in fields.h."""
+    """`struct node` in operations.h; `fields` of protobuf, or steps through CDR."""
 
     _fields_ = (
-        ("fields", POINTER(NodeField)),
+        ("fields", c_void_p),
         ("count", c_uint32),
         ("first_slot", c_uint16),
         ("slot_count", c_uint16),
     )
 
 
-class Operation(ctypes.Structure):
-    """`struct operation` in compose.h, with its union as bits."""
-
-    _fields_ = (("kind", c_uint8), ("flag", c_uint8), ("slot", c_uint16), ("size", c_uint32), ("bits", c_uint64))
-
-
-class PublishTopic(ctypes.Structure):
-    """`struct publish_topic` in publishing.h."""
-
-    _fields_ = (("publisher", c_void_p), ("wanted", c_void_p), ("id", c_uint32), ("reserved", c_uint32))
-
-
-class PublishTarget(ctypes.Structure):
-    """`struct publish_target` in publishing.h."""
+class Layout(ctypes.Structure):
+    """`struct layout` in operations.h."""
 
     _fields_ = (
-        ("topic", POINTER(PublishTopic)),
-        ("condition", POINTER(Operation)),
-        ("operations", POINTER(Operation)),
-        ("limit", POINTER(Limit)),
-        ("condition_count", c_uint32),
-        ("operation_count", c_uint32),
-        ("published", c_uint32),
-        ("waiting", c_uint32),
-        ("filtered", c_uint32),
-        ("stale", c_uint32),
-        ("rate_limited", c_uint32),
-        ("mapping_error", c_uint32),
-        ("non_finite", c_uint32),
-        ("publish_error", c_uint32),
+        ("nodes", POINTER(Node)),
+        ("defaults", POINTER(Value)),
+        ("closed", POINTER(ClosedEnum)),
+        ("literals", c_void_p),
+        ("slot_count", c_uint32),
+        ("is_cdr", c_uint32),
     )
 
 
-class PublishRoute(ctypes.Structure):
-    """`struct publish_route` in publishing.h."""
+class Topic(ctypes.Structure):
+    """`struct topic` in deliver.h."""
+
+    _fields_ = (("publisher", c_void_p), ("wanted", c_void_p))
+
+
+class Target(ctypes.Structure):
+    """`struct target` in deliver.h."""
+
+    _fields_ = (
+        ("condition", Code),
+        ("message", Code),
+        ("limit", POINTER(Limit)),
+        ("topic", POINTER(Topic)),
+        ("sender", c_void_p),
+        ("board", POINTER(Board)),
+        ("feeds", POINTER(Feed)),
+        ("feed_count", c_uint32),
+        ("trims", c_uint32),
+        ("id", c_uint32),
+        ("waiting", c_uint32),
+        ("filtered", c_uint32),
+        ("delivered", c_uint32),
+        ("delivered_bytes", c_uint32),
+        ("dropped", c_uint32 * len(LOSSES)),
+    )
+
+
+class Targets(ctypes.Structure):
+    """`struct targets` in deliver.h."""
 
     _fields_ = (
         ("ttl", c_int64),
-        ("nodes", POINTER(Node)),
-        ("defaults", POINTER(Value)),
+        ("layout", POINTER(Layout)),
         ("sources", POINTER(Value)),
-        ("literals", c_void_p),
-        ("targets", POINTER(PublishTarget)),
-        ("slot_count", c_uint32),
-        ("target_count", c_uint32),
-        ("id", c_uint32),
-        ("program", c_uint32),
+        ("targets", POINTER(Target)),
+        ("count", c_uint32),
+        ("route", c_uint32),
+        ("topic", c_uint32),
+        ("generation", c_uint32),
     )
 
 
@@ -204,7 +235,7 @@ class Part(ctypes.Structure):
 
     _fields_ = (
         ("ring", c_void_p),
-        ("publishes", POINTER(PublishRoute)),
+        ("publishes", POINTER(Targets)),
         ("wanted", POINTER(c_void_p)),
         ("targets", POINTER(Waiting)),
         ("wanted_count", c_uint32),
@@ -220,12 +251,9 @@ class Route(ctypes.Structure):
     """`struct route` in carrier.h."""
 
     _fields_ = (
-        ("ttl", c_int64),
-        ("destinations", POINTER(Destination)),
+        ("sends", Targets),
         ("parts", POINTER(Part)),
-        ("destination_count", c_uint32),
         ("part_count", c_uint32),
-        ("id", c_uint32),
         ("last_message", c_uint32),
         ("duration", c_uint32),
         ("reserved", c_uint32),
@@ -305,67 +333,40 @@ class Change(ctypes.Structure):
     )
 
 
-class ReadOp(ctypes.Structure):
-    """`struct read_op` in convert.h."""
-
-    _fields_ = (("kind", c_uint8), ("size", c_uint8), ("slot", c_uint16), ("count", c_uint32))
-
-
-class WriteOp(ctypes.Structure):
-    """`struct write_op` in convert.h."""
+class ForEach(ctypes.Structure):
+    """`struct for_each` in from_ros.h."""
 
     _fields_ = (
-        ("kind", c_uint8),
-        ("scalar", c_uint8),
-        ("encoding", c_uint8),
-        ("flags", c_uint8),
-        ("slot", c_uint16),
-        ("reserved", c_uint16),
-        ("tag", c_uint32),
-        ("least", c_uint32),
-        ("most", c_uint32),
-        ("start", c_uint32),
-        ("count", c_uint32),
+        ("list", Code),
+        ("stored", c_uint16),
+        ("node", c_uint16),
+        ("item", c_uint16),
+        ("index", c_uint16),
+        ("count", c_uint16),
+        ("reserved", c_uint16 * 3),
     )
 
 
-class CommandTarget(ctypes.Structure):
-    """`struct command_target` in commands.h."""
+class RosRoute(ctypes.Structure):
+    """`struct ros_route` in from_ros.h."""
 
     _fields_ = (
-        ("destination", Destination),
-        ("writes", POINTER(WriteOp)),
-        ("literals", POINTER(ctypes.c_char)),
-        ("write_count", c_uint32),
-        ("mapping_error", c_uint32),
-    )
-
-
-class CommandRoute(ctypes.Structure):
-    """`struct command_route` in commands.h."""
-
-    _fields_ = (
-        ("ttl", c_int64),
-        ("reads", POINTER(ReadOp)),
-        ("targets", POINTER(CommandTarget)),
-        ("read_count", c_uint32),
-        ("target_count", c_uint32),
-        ("id", c_uint32),
+        ("targets", Targets),
+        ("for_each", ForEach),
         ("seconds", c_uint16),
         ("nanoseconds", c_uint16),
         ("received", c_uint32),
         ("last_message", c_uint32),
         ("duration", c_uint32),
-        ("reserved", c_uint32),
     )
 
 
-class CommandTopic(ctypes.Structure):
-    """`struct command_topic` in commands.h."""
+class RosTopic(ctypes.Structure):
+    """`struct ros_topic` in from_ros.h."""
 
     _fields_ = (
         ("subscription", c_void_p),
-        ("routes", POINTER(CommandRoute)),
+        ("routes", POINTER(RosRoute)),
         ("route_count", c_uint32),
         ("capacity", c_uint32),
         ("eventfd", c_int32),
@@ -373,10 +374,10 @@ class CommandTopic(ctypes.Structure):
     )
 
 
-class CommandSet(ctypes.Structure):
-    """`struct command_set` in commands.h."""
+class RosSet(ctypes.Structure):
+    """`struct ros_set` in from_ros.h."""
 
-    _fields_ = (("topics", POINTER(CommandTopic)), ("count", c_uint32), ("reserved", c_uint32))
+    _fields_ = (("topics", POINTER(RosTopic)), ("count", c_uint32), ("reserved", c_uint32))
 
 
 class MessageRecord(ctypes.Structure):
@@ -422,18 +423,22 @@ class MirrorRecord(ctypes.Structure):
 
 
 __all__ = [
+    "LOSSES",
+    "NO_NAME",
     "REASONS",
+    "Board",
+    "BoardField",
+    "BoardMessage",
     "Born",
     "Case",
     "Change",
-    "CommandRoute",
-    "CommandSet",
-    "CommandTarget",
-    "CommandTopic",
+    "ClosedEnum",
+    "Code",
     "DeadmanDestination",
-    "Destination",
     "Entry",
     "Feed",
+    "ForEach",
+    "Layout",
     "Limit",
     "Listener",
     "MessageRecord",
@@ -444,15 +449,17 @@ __all__ = [
     "Part",
     "Peer",
     "Program",
-    "PublishRoute",
-    "PublishTarget",
-    "PublishTopic",
-    "ReadOp",
+    "ReadOperation",
+    "RosRoute",
+    "RosSet",
+    "RosTopic",
     "Route",
     "Schema",
+    "Target",
+    "Targets",
+    "Topic",
     "Value",
     "Waiting",
     "WireField",
     "WireType",
-    "WriteOp",
 ]

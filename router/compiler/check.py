@@ -5,7 +5,7 @@ The same check serves `validate`, `explain` and `run`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ from pathlib import Path
 from router.compiler.checked import CheckedRoute
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
+from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.program import GatewayPlan, Program
@@ -40,10 +41,11 @@ class Checked:
     gateways: Sequence[GatewayPlan] = ()
     boards: Mapping[str, BoardLimits] = field(default_factory=dict)
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
+    lowered: Lowered | None = None
 
     @property
     def has_errors(self) -> bool:
-        return any(finding.severity is Severity.ERROR for finding in self.diagnostics)
+        return _has_errors(self.diagnostics)
 
     @cached_property
     def program(self) -> Program | None:
@@ -54,7 +56,7 @@ class Checked:
         """Compile the program, which counts in `counters` if they are given; None while there are errors."""
         from router.compiler.link import link
 
-        if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
+        if self.lowered is None or self.table is None or self.schema is None or self.envelope is None:
             return None
         return link(
             self.table,
@@ -64,6 +66,7 @@ class Checked:
             self.gateways,
             self.boards,
             self.own_topics,
+            self.lowered,
             counters,
         )
 
@@ -103,7 +106,16 @@ def check_table(
         *topic_findings(table, [checked.route for checked in routes]),
     ]
     own_topics = [(own, own_type)] if own and own_type else []
-    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics)
+    lowered = None
+    if not _has_errors(findings):
+        lowered, limits = lower_table(routes, envelope)
+        findings += limits
+        lowered = None if limits else lowered
+    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)
+
+
+def _has_errors(findings: Iterable[Diagnostic]) -> bool:
+    return any(finding.severity is Severity.ERROR for finding in findings)
 
 
 def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: int) -> Mapping[str, BoardLimits]:

@@ -1,18 +1,18 @@
-"""Which executor serves a destination: the carrier, or Python.
+"""Which targets Python serves: those that hold messages back or collect them, and what shares its order with one.
 
-The carrier forwards envelopes as they were encoded. It knows `ttl`, `max_rate`, deadmen, `trim_trailing_zeros` and what
-a board can take, but evaluates no expression and holds nothing back. An endpoint gets datagrams in the order of their
-arrival, whatever routes they take, so all its targets from UDP have the same executor: Python, if one of them needs it.
+The carrier serves all others. An endpoint gets datagrams in the order of their arrival, whatever routes they take, and
+a topic its messages: so all that goes from UDP to one endpoint or topic has one executor. So has all that one topic of
+ROS feeds, since one thread takes its messages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.errors import SourceSpan
-from router.table.model import OnLimit
+from router.table.model import OnLimit, Route
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,32 +34,58 @@ CARRIER = Executor()
 
 
 def executors(routes: Sequence[CheckedRoute]) -> Executors:
-    """The executors of all targets that send datagrams from UDP, in a table without errors."""
-    needs_python: dict[str, tuple[str, SourceSpan]] = {}  # by endpoint: the first route that does, and its target
-    own: dict[tuple[str, str], Executor] = {}
-    for route, target in _forwarded(routes):
-        own[route, target.label] = executor = _own_executor(target)
-        if not executor.is_carrier:
-            needs_python.setdefault(target.label, (route, target.span))
+    """The executors of all targets of a table without errors."""
+    from_udp = [(checked, target) for checked in routes for target in checked.targets]
+    published = [(checked, target) for checked, target in from_udp if target.topic]
+    sent = [(checked, target) for checked, target in from_udp if not target.topic]
     return {
-        (route, None, endpoint): _shared(endpoint, *needs_python[endpoint])
-        if executor.is_carrier and endpoint in needs_python
-        else executor
-        for (route, endpoint), executor in own.items()
+        **{(route, None, endpoint): executor for route, endpoint, executor in _in_one_order(sent)},
+        **{(route, topic, None): executor for route, topic, executor in _in_one_order(published)},
+        **dict(_of_topics(routes)),
     }
 
 
-def _forwarded(routes: Sequence[CheckedRoute]) -> Iterator[tuple[str, CheckedTarget]]:
+def _in_one_order(
+    targets: Sequence[tuple[CheckedRoute, CheckedTarget]],
+) -> Iterator[tuple[str, str, Executor]]:
+    """The executors by route and label: Python's, if it serves one target of that label."""
+    own = [(checked.route.name, target, _own_executor(checked, target)) for checked, target in targets]
+    needs_python: dict[str, tuple[str, SourceSpan]] = {}  # the first route that does, and its target
+    for route, target, executor in own:
+        if not executor.is_carrier:
+            needs_python.setdefault(target.label, (route, target.span))
+    for route, target, executor in own:
+        is_shared = executor.is_carrier and target.label in needs_python
+        yield route, target.label, _shared(target.label, *needs_python[target.label]) if is_shared else executor
+
+
+def _of_topics(
+    routes: Iterable[CheckedRoute],
+) -> Iterator[tuple[tuple[str, str | None, str | None], Executor]]:
+    """The executors of all that topics of ROS feed."""
+    topics: dict[str, list[tuple[CheckedRoute, CheckedSubscription]]] = {}
     for checked in routes:
-        for target in checked.targets:
-            if not target.topic:
-                yield checked.route.name, target
+        for feed in checked.subscriptions:
+            topics.setdefault(feed.topic.topic.value, []).append((checked, feed))
+    for topic, feeds in topics.items():
+        targets = [(checked, target) for checked, feed in feeds for target in feed.targets]
+        own = (_own_executor(checked, target) for checked, target in targets)
+        executor = next((each for each in own if not each.is_carrier), CARRIER)
+        if not executor.is_carrier and any(is_urgent(checked.route, feed) for checked, feed in feeds):
+            executor = Executor(f"{executor.reason}; its freshness is Python's", executor.span)
+        for checked, target in targets:
+            yield (checked.route.name, topic, target.label), executor
 
 
-def _own_executor(target: CheckedTarget) -> Executor:
-    """The executor of a target, without regard to the others of its endpoint."""
-    if target.when is not None:
-        return Executor(f"`when: {target.declared.when}` needs it", target.when.span)
+def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
+    """Whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
+    return route.ttl is not None or any(target.deadmen for target in feed.targets)
+
+
+def _own_executor(checked: CheckedRoute, target: CheckedTarget) -> Executor:
+    """The executor of a target, without regard to others."""
+    if target.topic and checked.collect is not None:
+        return Executor("`collect` needs it", checked.collect.span)
     if target.declared.on_limit is OnLimit.LATEST:
         return Executor("`on_limit: latest` needs it", target.span)
     if target.endpoint is not None and target.endpoint.bandwidth is not None:
@@ -67,5 +93,5 @@ def _own_executor(target: CheckedTarget) -> Executor:
     return CARRIER
 
 
-def _shared(endpoint: str, route: str, span: SourceSpan) -> Executor:
-    return Executor(f"it shares '{endpoint}' with {route}, which needs Python", span)
+def _shared(label: str, route: str, span: SourceSpan) -> Executor:
+    return Executor(f"it shares '{label}' with {route}, which needs Python", span)

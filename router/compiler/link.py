@@ -9,12 +9,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import count
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.commands import lower_commands
 from router.compiler.deadmen import deadman_plan
-from router.compiler.executors import executors
 from router.compiler.handlers import HandlerSource, function_name
 from router.compiler.lookup import layout
-from router.compiler.lowering import lower_topics
+from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
 from router.compiler.program import (
     STRANGER,
@@ -43,16 +41,16 @@ def link(
     gateways: Sequence[GatewayPlan],
     boards: Mapping[str, BoardLimits],
     own_topics: Sequence[tuple[Topic, MessageType]],
+    lowered: Lowered,
     counters: Counters | None,
 ) -> Program:
-    """Make the program of a checked table.
+    """Make the program of a checked table, of which `lowered` is what the carrier runs.
 
     `own_topics` are published by the router itself, whatever its routes do. A program that takes over from another
     one counts in `counters`, which continue those of the other (`Counters.continued`).
     """
     counters = counters or Counters()
     served = [checked for checked in routes if not checked.route.ignore]
-    commands, topics = lower_commands(served), lower_topics(served, envelope)
     handlers = [handler for checked in served for handler in _handlers(checked, table, counters)]
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
@@ -78,9 +76,7 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
-        executors={**executors(served), **commands.executors, **topics.executors},
-        commands=commands.commands,
-        lowered=topics.routes,
+        lowered=lowered,
         boards=boards,
         gateways=tuple(gateways),
     )

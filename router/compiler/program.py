@@ -12,9 +12,8 @@ from functools import cached_property
 from itertools import chain
 from types import CodeType
 
-from router.compiler.commands import Commands
 from router.compiler.executors import Executors
-from router.compiler.lowering import LoweredRoute
+from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
 from router.compiler.namespace import NAMESPACE
 from router.compiler.source import Source
@@ -166,12 +165,11 @@ class Handler:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A compiled table. `senders` are the endpoints that something is sent to, `executors` say who does that.
+    """A compiled table. `senders` are the endpoints that something is sent to, `lowered` is what the carrier runs.
 
-    `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
-    in their sources. `outbound` has them by topic, and `commands` the topics that the carrier can take. `lowered` has
-    the routes with topics that it can publish on, by name. `ignored` are the numbers of cases that the table ignores,
-    `boards` what each endpoint that is a board can take, by name.
+    `inbound` has the handlers by envelope field number: several where a case has several routes, which differ in their
+    sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores, `boards` what each
+    endpoint that is a board can take, by name.
     """
 
     table: RouteTable
@@ -185,11 +183,14 @@ class Program:
     deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
     protos: ProtoSchema
-    executors: Executors
-    commands: Commands
-    lowered: Mapping[str, LoweredRoute]
+    lowered: Lowered
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
+
+    @property
+    def executors(self) -> Executors:
+        """Who serves which target."""
+        return self.lowered.executors
 
     @property
     def listeners(self) -> tuple[Listener, ...]:

@@ -9,14 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint, c_void_p
 from pathlib import Path
+from struct import Struct
 from typing import Any, cast
 
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.commands import CommandThread, native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
-from router.carrier.program import Names, Outlets
+from router.carrier.from_ros import FromRosThread, native_from_ros
+from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
@@ -24,6 +25,7 @@ from router.engine.pacing import RateLimit
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 16
+_LOST = Struct("@IIIIIIiIII")
 
 
 class Serialized(ctypes.Structure):
@@ -141,7 +143,7 @@ class Commanding:
         outlets = Outlets(
             listeners={},
             senders={endpoint: board.address for endpoint, board in self.boards.items()},
-            wanted={},
+            publications={},
             feeds=lambda route, names: [(self.by_route[name].address, name != route) for name in names],
             limit=self._limit,
             carried=lambda _: (),
@@ -149,12 +151,12 @@ class Commanding:
             names=self.names,
             boards=NativeBoards(program.boards),
         )
-        self.commands = native_commands(program, outlets)
-        self.subscriptions = {topic: Subscription(functions) for topic in self.commands.topics}
+        self.messages = native_from_ros(program, 1, outlets)
+        self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
         assert take
         assert reset
-        self.thread = CommandThread(library, self.deadmen.address, self.counters, self.events, take, reset)
+        self.thread = FromRosThread(library, self.deadmen.address, self.counters, self.events, take, reset)
         stack.callback(self.thread.stop)
 
     def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
@@ -165,7 +167,7 @@ class Commanding:
         )
 
     def serve(self, subscriptions: Mapping[str, Subscription] | None = None) -> None:
-        self.thread.serve(self.commands, subscriptions or self.subscriptions)
+        self.thread.serve(self.messages, subscriptions or self.subscriptions)
 
     def ledger(self) -> Ledger:
         size = max(index for _, index in self.program.counters.series()) + 1
@@ -174,13 +176,21 @@ class Commanding:
     def count(self, metric: str, *labels: str) -> int:
         return self.thread.counters(MOST_COUNTERS)[self.program.counters.index(metric, *labels)]
 
-    def losses(self) -> list[tuple[Any, ...]]:
+    def losses(self) -> list[tuple[str, str, int, int]]:
         """The route, target, reason and errno of each event since the last call."""
-        records, found = bytes(self.events.take()), []
-        for at in range(0, len(records), 32):
-            _, _, route, target, reason, error, _, _ = memoryview(records[at : at + 32]).cast("i")
-            found.append((self.names.name(route), self.names.name(target), reason, error))
-        return found
+        return [(self.names.name(each[2]), self.names.name(each[4]), each[5], each[6]) for each in self._events()]
+
+    def refusals(self) -> list[tuple[str, str, int, str, int]]:
+        """Of each event since the last call: route, target, reason, topic and place in the program."""
+        name = self.names.name
+        return [(name(each[2]), name(each[4]), each[5], name(each[3]), each[9]) for each in self._events()]
+
+    def _events(self) -> Iterator[tuple[int, ...]]:
+        """Each `struct lost_event` since the last call."""
+        records, at = bytes(self.events.take()), 0
+        while at < len(records):
+            yield _LOST.unpack_from(records, at)
+            at += _LOST.unpack_from(records, at)[0]
 
 
 _CALLED = "middleware_take", "middleware_reset"

@@ -11,7 +11,9 @@ import pytest
 from router.carrier.build import LIBRARY, build, is_current
 from router.carrier.library import load
 from router.compiler.lookup import Definitions
-from tests.carrier import building, compositions
+from tests.carrier import building
+from tests.carrier import delivering as of_delivery
+from tests.carrier import evaluating as of_machine
 from tests.carrier.building import sanitized_library
 
 SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
@@ -45,7 +47,14 @@ def definitions() -> Definitions:
 
 
 @pytest.fixture(scope="session")
-def composing(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The publish thread's functions: see composing.c."""
-    made = tmp_path_factory.mktemp("carrier") / "composing.so"
-    return compositions.composing(made, built, is_sanitized=SANITIZED in os.environ)
+def delivering(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """What delivers messages: see delivering.c."""
+    made = tmp_path_factory.mktemp("carrier") / "delivering.so"
+    return of_delivery.delivering(made, built, is_sanitized=SANITIZED in os.environ)
+
+
+@pytest.fixture(scope="session")
+def evaluating(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """The machine's functions: see evaluating.c."""
+    made = tmp_path_factory.mktemp("carrier") / "evaluating.so"
+    return of_machine.evaluating(made, is_sanitized=SANITIZED in os.environ)

@@ -1,6 +1,6 @@
 /* The receive thread and the one that publishes, without threads and sockets: tests give them datagrams, and take what
  * is published. It is compiled with clocked.h. */
-#include "publishing.c"
+#include "publish.c"
 #include "receive.c"
 #include "seams.c"
 
@@ -20,26 +20,19 @@ void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, s
 }
 
 /* The thread that publishes, as it is between two messages. */
-struct publishing *seam_publishing_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish);
-void seam_publish(struct publishing *publishing);
-void seam_publishing_close(struct publishing *publishing);
+struct publish_thread *seam_publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish);
+void seam_publish(struct publish_thread *thread);
+void seam_publish_close(struct publish_thread *thread);
 
-struct publishing *seam_publishing_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish) {
-    struct publishing *made = calloc(1, sizeof *made);
-    *made = (struct publishing){.ring = ring, .counters = counters, .reporter.events = events, .publish = publish};
-    pthread_mutex_init(&made->lock, NULL);
-    composer_open(&made->composer);
-    return made;
+struct publish_thread *seam_publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish) {
+    return publish_prepare(ring, counters, events, publish, NULL, NULL);
 }
 
 /* Serve all that waits. */
-void seam_publish(struct publishing *publishing) {
-    pthread_mutex_lock(&publishing->lock);
-    for (size_t size; (size = take(publishing, false));) serve_all(publishing, size);
-    pthread_mutex_unlock(&publishing->lock);
+void seam_publish(struct publish_thread *thread) {
+    pthread_mutex_lock(&thread->lock);
+    for (size_t size; (size = take(thread, false));) serve_all(thread, size);
+    pthread_mutex_unlock(&thread->lock);
 }
 
-void seam_publishing_close(struct publishing *publishing) {
-    composer_close(&publishing->composer);
-    free(publishing);
-}
+void seam_publish_close(struct publish_thread *thread) { publish_close(thread); }

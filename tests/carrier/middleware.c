@@ -9,7 +9,7 @@
 
 enum { MOST_MESSAGES = 4096, REFUSED = 1 };
 
-struct message {
+struct queued {
     uint8_t *data;
     size_t size;
     int64_t sent, received;
@@ -18,7 +18,7 @@ struct message {
 struct subscription {
     pthread_mutex_t lock;
     pthread_cond_t changed;
-    struct message messages[MOST_MESSAGES];
+    struct queued messages[MOST_MESSAGES];
     size_t first, count;
     bool is_stuck, refuses;
     int takers; /* that are inside now */
@@ -33,8 +33,8 @@ struct subscription *middleware_open(void) {
 
 void middleware_put(struct subscription *to, const void *data, size_t size, int64_t sent, int64_t received) {
     pthread_mutex_lock(&to->lock);
-    struct message *message = &to->messages[(to->first + to->count++) % MOST_MESSAGES];
-    *message = (struct message){malloc(size ? size : 1), size, sent, received};
+    struct queued *message = &to->messages[(to->first + to->count++) % MOST_MESSAGES];
+    *message = (struct queued){malloc(size ? size : 1), size, sent, received};
     memcpy(message->data, data, size);
     pthread_mutex_unlock(&to->lock);
 }
@@ -58,7 +58,7 @@ int middleware_takers(struct subscription *of) {
 static int take_first(struct subscription *from, struct serialized_message *to, struct message_info *info) {
     if (from->refuses) return REFUSED;
     if (!from->count) return TAKE_FAILED;
-    struct message message = from->messages[from->first];
+    struct queued message = from->messages[from->first];
     from->first = (from->first + 1) % MOST_MESSAGES;
     from->count--;
     if (to) {

@@ -16,15 +16,16 @@ from router.app.parts import Part, divided
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
-from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
-from router.carrier.publishing import PublishRoutes, PublishThread
+from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.program import NativeProgram, native_program
+from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine.pacing import RateLimit
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 12
-_LOST = Struct("@IIIIIiII")
+_LOST = Struct("@IIIIIIiIII")
 _CALLED = "middleware_publish", "middleware_error", "middleware_forget_error"
 
 
@@ -119,7 +120,7 @@ class Publishing:
         """The route, target, reason and text of each loss since the last call that the thread has reported."""
         records, found, at = bytes(self._events.take()), [], 0
         while at < len(records):
-            size, _, route, target, reason, *_ = _LOST.unpack_from(records, at)
+            size, _, route, _, target, reason, *_ = _LOST.unpack_from(records, at)
             text = records[at + _LOST.size : at + size].partition(b"\0")[0].decode()
             found.append((self._names.name(route), self._names.name(target), reason, text))
             at += size
@@ -133,27 +134,23 @@ class Publishing:
     def _made(self, program: Program, generation: int) -> NativeProgram:
         parts = divided(program, publishes=True)
         assert not any(parts[part] for part in Part if part is not Part.PUBLISHED)
-        routes = PublishRoutes(program, self.publishers, self._names.number, self._limit)
 
         def parts_of(handler: Handler) -> Sequence[PartTargets]:
             targets = parts[Part.PUBLISHED].get(handler.route, ())
-            made = routes.route(handler, targets) if targets else None
-            return [PartTargets(self._ring.address, targets, is_always_wanted=False, publishes=made)] if made else ()
+            return [PartTargets(self._ring.address, targets, is_always_wanted=False, is_native=True)] if targets else ()
 
         listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         outlets = Outlets(
             listeners=cast("Any", listening),
             senders={},
-            wanted={topic: each.wanted for topic, each in self.publishers.items()},
+            publications=self.publishers,
             feeds=lambda _route, _names: (),
             limit=self._limit,
             carried=lambda _: (),
             parts=parts_of,
             names=self._names,
         )
-        native = native_program(program, generation, outlets)
-        native.arrays.append(routes)
-        return native
+        return native_program(program, generation, outlets)
 
     def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
         assert target.max_rate is not None

@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 
 from router.carrier import structures as c
 from router.carrier.deadmen import Deadmen, NativeDeadman
-from router.carrier.program import Names
+from router.carrier.outlets import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.clock import boottime_ns

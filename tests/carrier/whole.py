@@ -19,8 +19,8 @@ from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.library import load
-from router.carrier.program import Names, Outlets, PartTargets, native_program
-from router.carrier.publishing import PublishRoutes
+from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.program import native_program
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
@@ -105,7 +105,7 @@ def table(folder: Path) -> Program:
 
 def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     """The carrier with clocks that are set, and `seam_handle`. With `sanitizers`, processes must preload libasan."""
-    files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publishing.c", "receive.c"})]
+    files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publish.c", "receive.c"})]
     flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
     flags += ["-fPIC", "-shared", "-include", str(HERE / "clocked.h"), f"-I{NATIVE}"]
     compile_c([*flags, *map(str, files), "-o", str(output)], "gcc" if sanitizers else None)
@@ -114,10 +114,10 @@ def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     loaded.seam_next_due.restype, loaded.seam_next_due.argtypes = c_int64, (c_void_p,)
     loaded.seam_handle.restype = None
     loaded.seam_handle.argtypes = (c_void_p, c_uint32, ctypes.c_char_p, c_size_t, c_uint32, c_uint32, c_int64)
-    loaded.seam_publishing_open.restype = c_void_p
-    loaded.seam_publishing_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
+    loaded.seam_publish_open.restype = c_void_p
+    loaded.seam_publish_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
     loaded.seam_publish.restype, loaded.seam_publish.argtypes = None, (c_void_p,)
-    loaded.seam_publishing_close.restype, loaded.seam_publishing_close.argtypes = None, (c_void_p,)
+    loaded.seam_publish_close.restype, loaded.seam_publish_close.argtypes = None, (c_void_p,)
     return loaded
 
 
@@ -191,10 +191,9 @@ class Whole:
         publications = {
             topic: _Publication(number, topic not in unwanted) for number, topic in enumerate(self._topics, 1)
         }
-        self._routes = PublishRoutes(made, publications, self._names.number, self._limit)
         self._publish = _PUBLISH(self._published_natively)
         self._published = Ring(loaded, 1 << 17)
-        self._publishing = loaded.seam_publishing_open(
+        self._publishing = loaded.seam_publish_open(
             self._published.address, self._publish_counts, self._events.address, self._publish
         )
         listening = SimpleNamespace(socket=SimpleNamespace(fileno=lambda: -1), is_inherited=False)
@@ -204,7 +203,7 @@ class Whole:
             Outlets(
                 listeners=cast("Any", {plan.name: listening for plan in made.listeners}),
                 senders={name: each.address for name, each in self._destinations.items()},
-                wanted={topic: each.wanted for topic, each in publications.items()},
+                publications=publications,
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
@@ -223,7 +222,7 @@ class Whole:
         for engine in self._parts.values():
             engine.close()
         self._library.carrier_close(self._carrier)
-        self._library.seam_publishing_close(self._publishing)
+        self._library.seam_publish_close(self._publishing)
         self._braking.clear()
         for destination in self._destinations.values():
             destination.close()
@@ -312,8 +311,7 @@ class Whole:
             if handler.route in self._functions[part]
         ]
         if targets := self._divided[Part.PUBLISHED].get(handler.route):
-            publishes = self._routes.route(handler, targets)
-            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, publishes=publishes))
+            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, is_native=True))
         return parts
 
     def _serve(self, part: Part) -> None:

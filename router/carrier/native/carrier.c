@@ -18,13 +18,11 @@ static const char ALIVE[] = "WATCHDOG=1";
 struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
     if (!carrier) return NULL;
-    carrier->deadmen = deadmen;
-    carrier->counters = counters;
-    carrier->reporter.events = events;
+    bool is_open = stage_open(&carrier->stage, counters, events, deadmen);
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);
-    if (carrier->epoll < 0 || carrier->wake < 0) {
+    if (!is_open || carrier->epoll < 0 || carrier->wake < 0) {
         carrier_close(carrier);
         return NULL;
     }
@@ -80,11 +78,11 @@ void *timer_thread(void *of) {
     int64_t turn = 0;
     run_first();
     while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->deadmen->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        struct pollfd waiting[] = {{carrier->stage.deadmen->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
         poll(waiting, 2, until_turn(carrier, turn));
         eventfd_t ignored;
         if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) deadmen_serve(carrier->deadmen, boottime_ns());
+        if (waiting[0].revents) deadmen_serve(carrier->stage.deadmen, boottime_ns());
         if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
             turn = monotonic_ns() + atomic_load(&carrier->interval);
@@ -100,7 +98,7 @@ void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
 }
 
 bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count) {
-    return counters_copy(&carrier->edition, carrier->counters, to, count);
+    return counters_copy(&carrier->edition, carrier->stage.counters, to, count);
 }
 
 void carrier_stop_receiving(struct carrier *carrier) {
@@ -119,5 +117,6 @@ void carrier_close(struct carrier *carrier) {
     }
     if (carrier->epoll >= 0) close(carrier->epoll);
     if (carrier->wake >= 0) close(carrier->wake);
+    stage_close(&carrier->stage);
     free(carrier);
 }

@@ -11,28 +11,11 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "board.h"
 #include "counters.h"
 #include "deadman.h"
+#include "deliver.h"
 #include "envelope.h"
-#include "freshness.h"
-#include "limit.h"
 #include "ring.h"
-#include "sender.h"
-
-/* A destination to which a route forwards its datagrams. */
-struct destination {
-    struct sender *sender;
-    struct limit *limit; /* `max_rate`, or NULL */
-    const struct feed *feeds;
-    const struct board *board; /* what it can take, or NULL if it is no board */
-    uint32_t feed_count;
-    uint32_t trims; /* it gets datagrams without their trailing zeros */
-    uint32_t id;    /* of the target, in events */
-    /* Counters: */
-    uint32_t sent, sent_bytes, stale, rate_limited, send_buffer_full, send_error, too_large, non_finite;
-    uint32_t reserved;
-};
 
 /* A target that gets its messages by a ring. */
 struct waiting {
@@ -40,12 +23,10 @@ struct waiting {
     uint32_t waiting, queue_full, filtered; /* counters */
 };
 
-struct publish_route;
-
 /* The targets of a route that one thread serves. */
 struct part {
     struct ring *ring;
-    const struct publish_route *publishes; /* what the native thread does (publishing.h); NULL for one of Python */
+    const struct targets *publishes; /* what the native thread does (publish.h); NULL for one of Python */
     const uint8_t *const *wanted; /* flags, not 0 while somebody subscribes to a topic */
     const struct waiting *targets;
     uint32_t wanted_count, target_count;
@@ -56,11 +37,9 @@ struct part {
 };
 
 struct route {
-    int64_t ttl; /* ns, 0 for none */
-    const struct destination *destinations;
+    struct targets sends; /* destinations that the receive thread serves */
     const struct part *parts;
-    uint32_t destination_count, part_count;
-    uint32_t id;                     /* in events */
+    uint32_t part_count;
     uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
     uint32_t reserved;
 };

@@ -25,16 +25,17 @@ struct rejected_event {
 
 struct lost_event {
     uint32_t size, kind; /* EVENT_LOST; a text that says more may follow, up to a NUL */
-    uint32_t route, target;
+    uint32_t route, topic, target; /* `topic`: of ROS, whose message it was, or NO_NAME */
     uint32_t reason;     /* enum loss */
     int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
     uint32_t counter;    /* of such losses */
-    uint16_t program;    /* the lowest bits of its generation, and the enum place that refused, if one did */
-    uint16_t place;
+    uint32_t generation; /* of the program, if a place in it refused the message: an enum place */
+    uint32_t place;
 };
+#define NO_NAME UINT32_MAX
 
-/* Where a program that publishes refuses a message: `places` of a LoweredTarget in compiler/lowering. */
-enum place { PLACE_UNKNOWN, PLACE_CONDITION, PLACE_OPERATIONS /* and the index of one */ };
+/* Where a program refuses a message: `places` of a LoweredTarget in compiler/lowering. */
+enum place { PLACE_UNKNOWN, PLACE_CONDITION, PLACE_FOR_EACH, PLACE_OPERATIONS /* and the index of one */ };
 
 /* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
 enum loss {
@@ -46,7 +47,8 @@ enum loss {
     LOSS_SEND_BUFFER_FULL,
     LOSS_SEND_ERROR,
     LOSS_PUBLISH_ERROR,
-    LOSS_TOO_LARGE
+    LOSS_TOO_LARGE,
+    LOSSES
 };
 
 #endif

@@ -99,7 +99,7 @@ enum operation_kind {
     OP_REAL_LEAST,
     OP_REAL_GREATEST,
     OP_REAL_CLAMP,
-    OP_SQRT, /* these refuse numbers without a result */
+    OP_SQRT, /* these refuse numbers without a result, and what is finite but for its result */
     OP_SIN,
     OP_COS,
     OP_TAN,
@@ -121,7 +121,7 @@ enum operation_kind {
     OP_AND,    /* likewise, and leave it there; else drop it */
     OP_OR,     /* if it is true */
     OP_EITHER, /* of two, both evaluated */
-    OP_WANT,   /* refuses what is false */
+    OP_WANT,   /* take it off, and refuse what is false */
     /* Text and bytes: */
     OP_JOIN,
     OP_DECIMAL,    /* an integer as text; `flag`: an unsigned one */
@@ -136,14 +136,15 @@ enum operation_kind {
     OP_ELEMENT, /* element `integer` of a list; refused if there is none */
     OP_ENTER,   /* read the message on the stack into node `slot` */
     OP_REPEAT,  /* the next `size` operations, the last of which is its OP_AGAIN, as often as the integer on the stack
-                   says. `flag`: cells that they take are kept */
+                   says. `flag`: cells and text that they take are kept; else they are free again behind each time */
     OP_AGAIN,
     OP_NEXT,   /* take the first element off the list in `slot` */
     OP_LIST,   /* the `size` values on the stack as a list in cells */
     OP_UNPACK, /* a list that is stored otherwise, in cells */
     OP_APPEND, /* to the list in cells in `slot` */
-    /* A message in CDR: */
+    /* A message, from its first byte on; of CDR that is its header, the first of its known bytes: */
     OP_KNOWN, /* `size` bytes of the literals, from `integer`, aligned to `slot`; in protobuf, 1 */
+    /* A message in CDR. Alignment counts from behind the header: */
     OP_PUT,   /* the lowest `slot` bytes of an integer, aligned to their number */
     OP_PUT_FLOAT, /* refuses what is too large */
     OP_PUT_DOUBLE,
@@ -245,7 +246,7 @@ enum read_kind {
                       with all bytes up to the end of the message, or NONE */
     READ_EACH_SEQUENCE, /* likewise, but a length says how often */
     READ_AGAIN,
-    READ_TEXTS /* before READ_AGAIN, in place of READ_TEXT: the list of the loop gets the text */
+    READ_TEXTS /* as READ_TEXT, but the text is added to the list in cells in `slot`, which is never NONE */
 };
 
 /* A step through a message in CDR. */

@@ -37,8 +37,8 @@ static uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(s
 
 static void reject(struct carrier *carrier, const struct received *received, enum reason reason) {
     const struct listener *listener = received->listener;
-    counter_add(carrier->counters, listener->rejected[reason], 1);
-    if (reason == IGNORED || !may_report(&carrier->reporter, received->now)) return;
+    counter_add(carrier->stage.counters, listener->rejected[reason], 1);
+    if (reason == IGNORED || !may_report(&carrier->stage.reporter, received->now)) return;
     struct rejected_event *event = (struct rejected_event *)carrier->record;
     size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
     *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
@@ -50,7 +50,7 @@ static void reject(struct carrier *carrier, const struct received *received, enu
                                      .length = (uint32_t)received->length,
                                      .counter = listener->rejected[reason]};
     memcpy(event + 1, carrier->datagram, kept);
-    ring_put(carrier->reporter.events, event, event->size);
+    ring_put(carrier->stage.reporter.events, event, event->size);
 }
 
 /* ---- the mirror ---- */
@@ -69,23 +69,18 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
     memcpy(record + 1, carrier->datagram, kept);
     uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
-    if (!ring_put(to, record, record->size)) counter_add(carrier->counters, lost, 1);
+    if (!ring_put(to, record, record->size)) counter_add(carrier->stage.counters, lost, 1);
 }
 
 /* ---- targets ---- */
 
-static void forward(struct carrier *carrier, const struct route *route, const struct received *received) {
-    for (uint32_t index = 0; index < route->destination_count; index++) {
-        const struct destination *to = &route->destinations[index];
-        int64_t expires = destination_expiry(to, received->born, route->ttl);
-        if (!destination_may_send(carrier->counters, to, received->now, expires)) continue;
-        if (!destination_takes(carrier->counters, &carrier->reporter, received->now, route->id, to, carrier->datagram,
-                               received->envelope.size))
-            continue;
-        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->envelope.size,
-                                     expires);
-        if (error && error != COMMAND_STALE) report_send_error(&carrier->reporter, received->now, route->id, to, error);
-    }
+static void send_to_all(struct carrier *carrier, const struct targets *to, const struct received *received) {
+    const struct envelope *envelope = &received->envelope;
+    struct datagram datagram = {.data = carrier->datagram, .size = envelope->size, .start = envelope->start,
+                                .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
+                                .received_at = received->received_at};
+    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born};
+    deliver_to_all(&carrier->stage, to, &message);
 }
 
 static bool is_wanted(const struct part *part) {
@@ -100,16 +95,18 @@ static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now)
     if (!ring_drop(ring, &oldest, sizeof oldest)) return;
     for (uint32_t index = 0; index < oldest.part->target_count; index++) {
         const struct waiting *target = &oldest.part->targets[index];
-        counter_add(carrier->counters, target->waiting, -1);
-        counter_add(carrier->counters, target->queue_full, 1);
-        report_loss(&carrier->reporter, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0, target->queue_full);
+        counter_add(carrier->stage.counters, target->waiting, -1);
+        counter_add(carrier->stage.counters, target->queue_full, 1);
+        struct lost_event lost = {.route = oldest.part->route, .topic = NO_NAME, .target = target->id,
+                                  .reason = LOSS_QUEUE_FULL, .counter = target->queue_full};
+        report_loss(&carrier->stage.reporter, now, &lost, "");
     }
 }
 
 static void hand_over(struct carrier *carrier, const struct part *part, const struct received *received) {
     if (!is_wanted(part)) {
         for (uint32_t index = 0; index < part->target_count; index++)
-            counter_add(carrier->counters, part->targets[index].filtered, 1);
+            counter_add(carrier->stage.counters, part->targets[index].filtered, 1);
         return;
     }
     struct message_record *record = (struct message_record *)carrier->record;
@@ -128,7 +125,7 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .handler = part->handler};
     memcpy(record + 1, carrier->datagram, received->envelope.size);
     for (uint32_t index = 0; index < part->target_count; index++)
-        counter_add(carrier->counters, part->targets[index].waiting, 1);
+        counter_add(carrier->stage.counters, part->targets[index].waiting, 1);
     while (!ring_put(part->ring, record, record->size)) drop_oldest(carrier, part->ring, received->now);
 }
 
@@ -163,23 +160,23 @@ static int route(struct carrier *carrier, const struct payload_case *found, cons
     const struct listener *listener = received->listener;
     if (found->row < 0) {
         if (found->is_ignored) return IGNORED;
-        counter_add(carrier->counters, found->unhandled, 1);
+        counter_add(carrier->stage.counters, found->unhandled, 1);
         return UNHANDLED;
     }
     const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
     if (entry->route < 0) return SOURCE_MISMATCH;
     const struct route *chosen = &program->routes[entry->route];
-    counter_add(carrier->counters, entry->received, 1);
-    forward(carrier, chosen, received);
+    counter_add(carrier->stage.counters, entry->received, 1);
+    if (chosen->sends.count) send_to_all(carrier, &chosen->sends, received);
     for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
-    counter_set(carrier->counters, chosen->last_message, received->received_at);
-    count_duration(carrier->counters, chosen->duration, boottime_ns() - received->now);
+    counter_set(carrier->stage.counters, chosen->last_message, received->received_at);
+    count_duration(carrier->stage.counters, chosen->duration, boottime_ns() - received->now);
     return ROUTED;
 }
 
 static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
     const struct listener *listener = received->listener;
-    counter *counters = carrier->counters;
+    counter *counters = carrier->stage.counters;
     received->now = boottime_ns();
     received->received_at = wall_ns();
     received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
@@ -260,10 +257,10 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
 }
 
 static void brake(struct carrier *carrier) {
-    int64_t due = atomic_load_explicit(&carrier->deadmen->next_due, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&carrier->stage.deadmen->next_due, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = boottime_ns();
-    if (due <= now) deadmen_serve(carrier->deadmen, now);
+    if (due <= now) deadmen_serve(carrier->stage.deadmen, now);
 }
 
 static void drain(struct carrier *carrier, const struct listener *listener) {
@@ -294,8 +291,8 @@ static void adopt(struct carrier *carrier, const struct change *change) {
         for (uint32_t index = 0; index < earlier->listener_count; index++)
             if (!has_listener(change->program, earlier->listeners[index].fd)) drain(carrier, &earlier->listeners[index]);
     for (uint32_t index = 0; index < change->replaced_count; index++)
-        deadman_replace(carrier->deadmen, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    for (uint32_t index = 0; index < change->ended_count; index++) deadman_end(carrier->deadmen, change->ended[index]);
+        deadman_replace(carrier->stage.deadmen, change->replaced[2 * index], change->replaced[2 * index + 1]);
+    for (uint32_t index = 0; index < change->ended_count; index++) deadman_end(carrier->stage.deadmen, change->ended[index]);
     struct timeval turn = {0, TURN_MS * 1000};
     for (uint32_t index = 0; index < change->program->listener_count; index++)
         setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);

@@ -1,179 +1,196 @@
-"""Topics that need no Python: from checked routes to programs with which the carrier publishes.
+"""From the routes of a table without errors to the programs that the carrier runs (`native/operations.h`).
 
-A topic gets its messages in order, from whatever route they come. So one executor serves it: Python, if one route that
-publishes on it needs Python.
+Each target is lowered once. What is more than a program can do is a finding, also of targets that Python serves: so
+both planes refuse the same tables.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from google.protobuf.descriptor import Descriptor
-
-from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.executors import CARRIER, Executor, Executors
-from router.compiler.lowering.expressions import Lowering, Names, readable
-from router.compiler.lowering.messages import MessageWriter, Unlowered
-from router.compiler.lowering.operations import (
-    MAX_DATAGRAM,
-    MOST_NODES_DEEP,
-    MOST_SLOTS,
-    MOST_STACKED,
-    Code,
-    Layout,
-    Node,
-    Slot,
-    deepest,
-    layout,
-)
-from router.compiler.lowering.values import INT64, Integer, NeedsPython, Text
-from router.errors import SourceSpan
-from router.table.model import OnLimit
+from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.executors import Executors, executors, is_urgent
+from router.compiler.lowering.layout import Layout, Node
+from router.compiler.lowering.names import TooLargeError
+from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
+from router.compiler.lowering.sources import Datagram, Elements, RosMessage
+from router.errors import Diagnostic
 from router.types.protobuf import Envelope
-
-_MOST_OPERATIONS = 0xFFFF - 2  # an `enum place` has 16 bits
 
 
 @dataclass(frozen=True, slots=True)
 class LoweredTarget:
-    """What makes the message of a topic. `condition` is its `when`, or nothing.
+    """What makes the message of a target. `condition` is its `when`, or empty; `message` is empty for a destination
+    from UDP, which gets the envelope as it was received.
 
     `places` say where in the table a message may be refused, by `enum place` in `native/events.h`: "", the condition,
-    and what each operation fills.
+    `for_each`, and what each operation of `message` fills.
     """
 
     label: str
     condition: Code
-    operations: Code
+    message: Code
     places: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class LoweredRoute:
-    """The topics of a route that the carrier publishes on, by name, and the fields that they read."""
+    """Targets of a route by name, and the fields that they read. Slots 0 and 1 are `received_at` and `source`."""
 
     targets: Mapping[str, LoweredTarget]
     layout: Layout
 
 
 @dataclass(frozen=True, slots=True)
-class LoweredTopics:
-    """`routes` by name; `executors` of all topics that are published on."""
+class LoweredElements:
+    """`for_each`: `code` leaves a list on the stack, which is stored as `scalar` says.
 
-    routes: Mapping[str, LoweredRoute]
+    Each element is read into `node` if it is a message, else it is put into the slot `item`; NONE for what is not used.
+    """
+
+    code: Code
+    scalar: Scalar
+    node: int
+    item: int
+    index: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class LoweredFeed:
+    """What a route makes of the messages of one topic. It is urgent if they expire or feed or disarm a deadman.
+
+    `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
+    """
+
+    route: str
+    is_urgent: bool
+    targets: Mapping[str, LoweredTarget]
+    layout: Layout
+    stamp: tuple[int, int] | None
+    for_each: LoweredElements | None
+
+
+@dataclass(frozen=True, slots=True)
+class Lowered:
+    """All that the carrier runs for a table; `executors` say who serves what.
+
+    By route: `conditions` of its destinations from UDP that have one, and its `topics`. `from_ros` by topic, in the
+    order of the table.
+    """
+
     executors: Executors
+    conditions: Mapping[str, LoweredRoute]
+    topics: Mapping[str, LoweredRoute]
+    from_ros: Mapping[str, tuple[LoweredFeed, ...]]
 
 
-def lower_topics(routes: Sequence[CheckedRoute], envelope: Envelope) -> LoweredTopics:
-    """Lower what can be lowered of a table without errors."""
-    executors = _executors(routes, envelope)
-    lowered = {}
-    for checked in routes:
-        carried = [to for to in _published(checked) if executors[checked.route.name, to.label, None].is_carrier]
-        if carried:
-            lowered[checked.route.name] = lower(checked, carried, envelope)
-    return LoweredTopics(lowered, executors)
+def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Lowered, list[Diagnostic]]:
+    """Lower all targets of a table without errors."""
+    served = [checked for checked in routes if not checked.route.ignore]
+    table = _Table(envelope, executors(served))
+    for checked in served:
+        table.add(checked)
+    carried = {topic: tuple(feeds) for topic, feeds in table.from_ros.items()}
+    return Lowered(table.executors, table.conditions, table.topics, carried), table.findings
 
 
-def _published(checked: CheckedRoute) -> list[CheckedTarget]:
-    return [target for target in checked.targets if target.topic]
+class _Table:
+    def __init__(self, envelope: Envelope, executors: Executors) -> None:
+        self.envelope = envelope
+        self.executors = executors
+        self.conditions: dict[str, LoweredRoute] = {}
+        self.topics: dict[str, LoweredRoute] = {}
+        self.from_ros: dict[str, list[LoweredFeed]] = {}
+        self.findings: list[Diagnostic] = []
 
+    def add(self, checked: CheckedRoute) -> None:
+        conditions = [target for target in checked.targets if not target.topic and target.when is not None]
+        topics = [target for target in checked.targets if target.topic and checked.collect is None]
+        for targets, lowered in ((conditions, self.conditions), (topics, self.topics)):
+            self._lower(checked, targets, lowered)
+        for feed in checked.subscriptions:
+            made = self._feed(checked, feed)
+            if made is not None and all(self._is_carried(checked, target, feed) for target in feed.targets):
+                self.from_ros.setdefault(feed.topic.topic.value, []).append(made)
 
-def _executors(routes: Sequence[CheckedRoute], envelope: Envelope) -> Executors:
-    own: dict[tuple[str, str], Executor] = {}
-    needs_python: dict[str, tuple[str, SourceSpan]] = {}  # by topic: the first route that does, and its target
-    for checked in routes:
-        for target in _published(checked):
-            executor = own[checked.route.name, target.label] = _own_executor(checked, target, envelope)
-            if not executor.is_carrier:
-                needs_python.setdefault(target.label, (checked.route.name, target.span))
-    return {
-        (route, topic, None): _shared(topic, *needs_python[topic])
-        if executor.is_carrier and topic in needs_python
-        else executor
-        for (route, topic), executor in own.items()
-    }
+    def _is_carried(
+        self, checked: CheckedRoute, target: CheckedTarget, feed: CheckedSubscription | None = None
+    ) -> bool:
+        topic = feed.topic.topic.value if feed else target.label if target.topic else None
+        endpoint = None if target.topic else target.label
+        return self.executors[checked.route.name, topic, endpoint].is_carrier
 
+    # from UDP
 
-def _own_executor(checked: CheckedRoute, target: CheckedTarget, envelope: Envelope) -> Executor:
-    """The executor of a target, without regard to others of its topic."""
-    return Executor("typed trees are not lowered yet", target.span)
-    if checked.collect is not None:
-        return Executor("`collect` needs it", checked.collect.span)
-    if target.declared.on_limit is OnLimit.LATEST:
-        return Executor("`on_limit: latest` needs it", target.span)
-    try:
-        lower(checked, [target], envelope)
-    except Unlowered as reason:
-        return Executor(str(reason), reason.span)
-    return CARRIER
+    def _lower(self, checked: CheckedRoute, targets: list[CheckedTarget], to: dict[str, LoweredRoute]) -> None:
+        carried = [target for target in targets if self._is_carried(checked, target)]
+        others = [target for target in targets if target not in carried]
+        if carried and (made := self._route(checked, carried)) is not None:
+            to[checked.route.name] = made
+        if others:
+            self._route(checked, others)
 
-
-def _shared(topic: str, route: str, span: SourceSpan) -> Executor:
-    return Executor(f"it shares '{topic}' with {route}, which needs Python", span)
-
-
-def lower(checked: CheckedRoute, targets: Sequence[CheckedTarget], envelope: Envelope) -> LoweredRoute:
-    """Lower topics of a route. Raises Unlowered."""
-    descriptor: Descriptor = checked.case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's
-    around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]
-    payload = Node(descriptor)
-    received_at, source = Slot(0), Slot(b"")
-    slots, elements = [received_at, source], list[Node]()
-    made = {}
-    for target in targets:
-        names = Names({}, {"received_at": (received_at, Integer(*INT64)), "source": (source, Text(MAX_DATAGRAM))})
-        _name_messages(names, target, payload)
-        made[target.label] = _target(target, Lowering(names))
-        slots += names.temporaries
-        elements += names.elements
-    laid_out = layout(slots, payload, around, checked.case.name, elements)
-    _want_room(laid_out, [payload, *elements], made, targets[0].span)
-    return LoweredRoute(made, laid_out)
-
-
-def _name_messages(names: Names, target: CheckedTarget, payload: Node) -> None:
-    """The variables of the generated handlers, each of which is a message in the payload."""
-    reads = target.reads
-    assert isinstance(reads, ParsedReads)  # noqa: S101 - of a route from UDP
-    for path, variable in reads.variables.items():
-        node = payload
-        for name in path:
-            node = node.message(_readable_message(node, name, target))
-        names.messages[variable] = node
-
-
-def _readable_message(node: Node, name: str, target: CheckedTarget) -> str:
-    try:
-        return readable(node, name).name
-    except NeedsPython as reason:
-        raise Unlowered(target.label, str(reason), target.span) from None
-
-
-def _target(target: CheckedTarget, lowering: Lowering) -> LoweredTarget:
-    assert target.plan is not None  # noqa: S101 - a topic has one
-    condition: Code = ()
-    place = ""
-    if target.when is not None:
-        place = f"{target.when.span}: when"
+    def _route(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute | None:
+        """Targets that share a layout; None with a finding."""
+        source = Datagram(checked.case, self.envelope)
         try:
-            condition = lowering.value(target.when.node).code
-        except NeedsPython as reason:
-            raise Unlowered(f"when: {target.declared.when}", str(reason), target.when.span) from None
-    rows = {row.target: row.expression for row in target.rows}
-    placed = MessageWriter(lowering, rows).message(target.plan)
-    operations, places = zip(*placed, strict=True)
-    return LoweredTarget(target.label, condition, operations, ("", place, *places))
+            made = {target.label: _published_or_forwarded(source, target) for target in targets}
+            return LoweredRoute(made, source.layout(checked.route.span))
+        except TooLargeError as error:
+            self.findings.append(error.diagnostic)
+            return None
+
+    # from ROS
+
+    def _feed(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed | None:
+        try:
+            return _lowered_feed(checked, feed)
+        except TooLargeError as error:
+            self.findings.append(error.diagnostic)
+            return None
 
 
-def _want_room(laid_out: Layout, nodes: Sequence[Node], targets: Mapping[str, LoweredTarget], span: SourceSpan) -> None:
-    """Raise Unlowered for what is larger than the carrier provides for."""
-    codes = [code for target in targets.values() for code in (target.condition, target.operations)]
-    is_small = (
-        len(laid_out.defaults) <= MOST_SLOTS
-        and max(node.depth() for node in nodes) < MOST_NODES_DEEP - 1
-        and all(len(code) <= _MOST_OPERATIONS and deepest(code) <= MOST_STACKED for code in codes)
+def _published_or_forwarded(source: Datagram, target: CheckedTarget) -> LoweredTarget:
+    lowering = source.lowering()
+    condition = source.condition(lowering, [target.when], is_bounded=target.plan is None)
+    if target.plan is None:
+        return LoweredTarget(target.label, condition.code, (), ("", condition.place, ""))
+    message = source.published(lowering, target.plan)
+    return LoweredTarget(target.label, condition.code, message.code, ("", condition.place, "", *message.places))
+
+
+def _lowered_feed(checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
+    source = RosMessage(feed.type, feed.topic.topic.value)
+    elements = source.for_each(feed.for_each) if feed.for_each is not None else None
+    stamp = source.stamp(feed.stamp) if feed.stamp is not None else None
+    place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""
+    targets = {}
+    for target in feed.targets:
+        lowering = source.lowering()
+        condition = source.condition(lowering, [feed.when, target.when])
+        assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
+        message = source.sent(lowering, target.plan, checked.case)
+        places = "", condition.place, place, *message.places
+        targets[target.label] = LoweredTarget(target.label, condition.code, message.code, places)
+    layout = source.layout(feed.topic.span)
+    return LoweredFeed(
+        checked.route.name,
+        is_urgent(checked.route, feed),
+        targets,
+        layout,
+        (stamp[0].index, stamp[1].index) if stamp else None,
+        _elements(elements, targets.values()) if elements else None,
     )
-    if not is_small:
-        raise Unlowered(", ".join(targets), "its expressions are too large", span)
+
+
+def _elements(elements: Elements, targets: Iterable[LoweredTarget]) -> LoweredElements:
+    used = [operation.slot for each in targets for operation in (*each.condition, *each.message)]
+    item = elements.item
+    node = item.index if isinstance(item, Node) and item.wanted else NONE
+    slots = (
+        each.index if isinstance(each, Slot) and any(each is slot for slot in used) else NONE
+        for each in (item, elements.index, elements.count)
+    )
+    return LoweredElements(elements.code, elements.scalar, node, *slots)

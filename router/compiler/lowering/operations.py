@@ -1,152 +1,196 @@
-"""What the carrier executes to publish on a topic: operations on slots, and the fields that are read into these.
-
-`native/compose.h` says what each operation does, `native/fields.h` how fields are read. Slots and nodes are objects
-until `layout` numbers them.
-"""
+"""The operations of a program, as `native/operations.h` declares them, and what is known before it runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
-from itertools import chain
-from typing import NamedTuple, Union
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag, auto
+from typing import TYPE_CHECKING, NamedTuple, Union
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
+if TYPE_CHECKING:
+    from router.compiler.lowering.layout import Node
 
-from router.types.descriptors import message_of
-
-MOST_STACKED, MOST_LOOPS, MOST_TEXT = 255, 8, 1 << 20
-"""As in `native/compose.h`."""
-
-MOST_NODES_DEEP = 32
-"""As in `native/fields.h`."""
+MOST_STACKED, MOST_LOOPS, MOST_OPEN, MOST_TEXT = 255, 8, 32, 1 << 20
+"""As in `native/operations.h`; one place of the stack is not used."""
 
 MAX_DATAGRAM = 16 * 1024
-"""As in `native/envelope.h`: no field is longer."""
+"""As in `native/envelope.h`: no field of a datagram is longer, and no list has more elements."""
 
-MOST_SLOTS = 0xFFFE
-
-
-class Op(IntEnum):
-    """`enum operation_kind`, in the same order."""
-
-    INTEGER = 0
-    REAL = 1
-    TEXT = 2
-    LOAD = 3
-    KEEP = 4
-    DROP = 5
-    ADD = 6
-    SUBTRACT = 7
-    MULTIPLY = 8
-    DIVIDE = 9
-    MODULO = 10
-    NEGATE = 11
-    ABSOLUTE = 12
-    LEAST = 13
-    GREATEST = 14
-    CLAMP = 15
-    FIT = 16
-    WRAP = 17
-    TIME = 18
-    REAL_ADD = 19
-    REAL_SUBTRACT = 20
-    REAL_MULTIPLY = 21
-    REAL_DIVIDE = 22
-    REAL_FLOOR_DIVIDE = 23
-    REAL_MODULO = 24
-    REAL_REMAINDER = 25
-    REAL_POWER = 26
-    REAL_NEGATE = 27
-    REAL_ABSOLUTE = 28
-    REAL_LEAST = 29
-    REAL_GREATEST = 30
-    REAL_CLAMP = 31
-    ROUND = 32
-    TRUNCATE = 33
-    FLOOR = 34
-    CEIL = 35
-    SQRT = 36
-    SIN = 37
-    COS = 38
-    TAN = 39
-    ATAN2 = 40
-    HYPOT = 41
-    FLOAT32 = 42
-    INTEGER_TO_REAL = 43
-    REAL_CLAMP_TO_INTEGER = 44
-    REAL_FIT_TO_INTEGER = 45
-    SECONDS = 46
-    COMPARE = 47
-    NOT = 48
-    JUMP = 49
-    UNLESS = 50
-    AND = 51
-    OR = 52
-    EITHER = 53
-    JOIN = 54
-    DECIMAL = 55
-    CHARACTERS = 56
-    SIZE = 57
-    FIT_SIZE = 58
-    UTF8 = 59
-    COUNT = 60
-    WANT_COUNT = 61
-    ELEMENT = 62
-    ENTER = 63
-    EACH = 64
-    EACH_BYTE = 65
-    AGAIN = 66
-    KNOWN = 67
-    PUT = 68
-    PUT_FLOAT = 69
-    PUT_DOUBLE = 70
-    PUT_TEXT = 71
-    PUT_BYTES = 72
+NONE = 0xFFFF
+"""No such slot, node or enum."""
 
 
-class Relation(IntEnum):
+class Counted(IntEnum):
+    """Members count from 0, in the order of the C enum."""
+
+    @staticmethod
+    def _generate_next_value_(name: str, start: int, count: int, last_values: list[int]) -> int:  # noqa: ARG004
+        return count
+
+
+class Op(Counted):
+    """`enum operation_kind`."""
+
+    # values
+    INTEGER = auto()
+    REAL = auto()
+    TEXT = auto()
+    LOAD = auto()
+    KEEP = auto()
+    DROP = auto()
+    # integers
+    ADD = auto()
+    SUBTRACT = auto()
+    MULTIPLY = auto()
+    CHECKED_ADD = auto()
+    CHECKED_SUBTRACT = auto()
+    CHECKED_MULTIPLY = auto()
+    CHECKED_NEGATE = auto()
+    NEGATE = auto()
+    ABSOLUTE = auto()
+    DIVIDE = auto()
+    MODULO = auto()
+    LEAST = auto()
+    GREATEST = auto()
+    CLAMP = auto()
+    FIT = auto()
+    WRAP = auto()
+    # real numbers
+    REAL_ADD = auto()
+    REAL_SUBTRACT = auto()
+    REAL_MULTIPLY = auto()
+    REAL_DIVIDE = auto()
+    REAL_FLOOR_DIVIDE = auto()
+    REAL_MODULO = auto()
+    REAL_POWER = auto()
+    REAL_NEGATE = auto()
+    REAL_ABSOLUTE = auto()
+    REAL_LEAST = auto()
+    REAL_GREATEST = auto()
+    REAL_CLAMP = auto()
+    SQRT = auto()
+    SIN = auto()
+    COS = auto()
+    TAN = auto()
+    ATAN2 = auto()
+    HYPOT = auto()
+    FLOAT32 = auto()
+    # from one to the other
+    INTEGER_TO_REAL = auto()
+    ROUND = auto()
+    TRUNCATE = auto()
+    FLOOR = auto()
+    CEIL = auto()
+    # truth
+    COMPARE = auto()
+    NOT = auto()
+    JUMP = auto()
+    UNLESS = auto()
+    AND = auto()
+    OR = auto()
+    EITHER = auto()
+    WANT = auto()
+    # text and bytes
+    JOIN = auto()
+    DECIMAL = auto()
+    DIGITS = auto()
+    CHARACTERS = auto()
+    SIZE = auto()
+    FIT_SIZE = auto()
+    UTF8 = auto()
+    OCTETS = auto()
+    MEMBER = auto()
+    # lists
+    ELEMENT = auto()
+    ENTER = auto()
+    REPEAT = auto()
+    AGAIN = auto()
+    NEXT = auto()
+    LIST = auto()
+    UNPACK = auto()
+    APPEND = auto()
+    # a message in CDR
+    KNOWN = auto()
+    PUT = auto()
+    PUT_FLOAT = auto()
+    PUT_DOUBLE = auto()
+    PUT_TEXT = auto()
+    PUT_BYTES = auto()
+    # a message in protobuf
+    OPEN = auto()
+    CLOSE = auto()
+    WRITE_VARINT = auto()
+    WRITE_ZIGZAG = auto()
+    WRITE_FIXED32 = auto()
+    WRITE_FIXED64 = auto()
+    WRITE_FLOAT = auto()
+    WRITE_DOUBLE = auto()
+    WRITE_BYTES = auto()
+
+
+class Relation(Counted):
     """`enum relation`."""
 
-    EQUAL = 0
-    UNEQUAL = 1
-    LESS = 2
-    LESS_OR_EQUAL = 3
-    MORE = 4
-    MORE_OR_EQUAL = 5
+    EQUAL = auto()
+    UNEQUAL = auto()
+    LESS = auto()
+    LESS_OR_EQUAL = auto()
+    MORE = auto()
+    MORE_OR_EQUAL = auto()
 
 
-class Compared(IntEnum):
+class Compared(Counted):
     """`enum compared`."""
 
-    SIGNED_INTEGERS = 0
-    UNSIGNED_INTEGERS = 1
-    REALS = 2
-    TEXTS = 3
+    SIGNED_INTEGERS = auto()
+    UNSIGNED_INTEGERS = auto()
+    SIGNED_WITH_UNSIGNED = auto()
+    SIGNED_WITH_REAL = auto()
+    UNSIGNED_WITH_REAL = auto()
+    REALS = auto()
+    TEXTS = auto()
 
 
-_PUSHES = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.COUNT, Op.ELEMENT, Op.EACH, Op.EACH_BYTE})
-_TAKES_TWO = frozenset({Op.CLAMP, Op.FIT, Op.WRAP, Op.REAL_CLAMP, Op.REAL_CLAMP_TO_INTEGER, Op.REAL_FIT_TO_INTEGER,
-                        Op.WANT_COUNT})  # fmt: skip
-_TAKES_ONE = frozenset({
-    Op.DROP, Op.ADD, Op.SUBTRACT, Op.MULTIPLY, Op.DIVIDE, Op.MODULO, Op.LEAST, Op.GREATEST, Op.REAL_ADD,
-    Op.REAL_SUBTRACT, Op.REAL_MULTIPLY, Op.REAL_DIVIDE, Op.REAL_FLOOR_DIVIDE, Op.REAL_MODULO, Op.REAL_REMAINDER,
-    Op.REAL_POWER, Op.REAL_LEAST, Op.REAL_GREATEST, Op.ATAN2, Op.HYPOT, Op.COMPARE, Op.UNLESS, Op.AND, Op.OR, Op.EITHER,
-    Op.JOIN, Op.ENTER, Op.PUT, Op.PUT_FLOAT, Op.PUT_DOUBLE, Op.PUT_TEXT, Op.PUT_BYTES,
-})  # fmt: skip
+class Scalar(Counted):
+    """`enum scalar`: scalars in CDR, and how a list is stored."""
+
+    BOOL = auto()
+    INT8 = auto()
+    UINT8 = auto()
+    INT16 = auto()
+    UINT16 = auto()
+    INT32 = auto()
+    UINT32 = auto()
+    INT64 = auto()
+    UINT64 = auto()
+    FLOAT32 = auto()
+    FLOAT64 = auto()
+    IN_CELLS = auto()
+
+
+class Sign(IntFlag):
+    """`enum sign`: which operands of an operation are unsigned, and whether its result is."""
+
+    FIRST = 1
+    SECOND = 2
+    THIRD = 4
+    RESULT = 8
 
 
 @dataclass(eq=False, slots=True)
 class Slot:
-    """A place for a value. `default` is what it holds where nothing was read: for a list, None."""
+    """A place for a value, numbered by a layout. `default` is what it holds where nothing was read: for a list, None.
+
+    `name` says what it holds in the words of the table; that of a temporary is empty.
+    """
 
     default: int | float | bytes | None = None
+    name: str = ""
     index: int = -1
 
 
 class Operation(NamedTuple):
-    """`struct operation`; `slot` may be an object that has an index, `data` are the bytes of a literal."""
+    """`struct operation`; `slot` may be what has an index, `data` are bytes of the literals."""
 
     kind: Op
     slot: Union[int, Slot, Node] = 0
@@ -159,206 +203,119 @@ class Operation(NamedTuple):
 Code = tuple[Operation, ...]
 
 
-def deepest(code: Iterable[Operation]) -> int:
-    """How many values are stacked at most, or somewhat more: branches count as if they came one after another."""
-    depth = most = 0
-    for operation in code:
-        kind = operation.kind
-        depth += (kind in _PUSHES) - (kind in _TAKES_ONE) - 2 * (kind in _TAKES_TWO)
-        most = max(most, depth)
-    return most
+def code(*parts: Operation | Code) -> Code:
+    """One code of operations and codes, in order."""
+    made: list[Operation] = []
+    for part in parts:
+        if isinstance(part, Operation):
+            made.append(part)
+        else:
+            made += part
+    return tuple(made)
 
 
-# ---- fields that are read
+def integer(number: int) -> Operation:
+    return Operation(Op.INTEGER, number=number if number < 1 << 63 else number - (1 << 64))
 
 
-class FieldType(IntEnum):
-    """`enum field_type`."""
-
-    BOOL = 0
-    INT32 = 1
-    INT64 = 2
-    UINT32 = 3
-    SINT32 = 4
-    SINT64 = 5
-    FIXED32 = 6
-    SFIXED32 = 7
-    FIXED64 = 8
-    FLOAT = 9
-    DOUBLE = 10
-    BYTES = 11
-    MESSAGE = 12
-    GROUP = 13
+def real(number: float) -> Operation:
+    return Operation(Op.REAL, number=float(number))
 
 
-FIELD_TYPES = {
-    FieldDescriptor.TYPE_BOOL: FieldType.BOOL,
-    FieldDescriptor.TYPE_ENUM: FieldType.INT32,
-    FieldDescriptor.TYPE_INT32: FieldType.INT32,
-    FieldDescriptor.TYPE_INT64: FieldType.INT64,
-    FieldDescriptor.TYPE_UINT32: FieldType.UINT32,
-    FieldDescriptor.TYPE_UINT64: FieldType.INT64,
-    FieldDescriptor.TYPE_SINT32: FieldType.SINT32,
-    FieldDescriptor.TYPE_SINT64: FieldType.SINT64,
-    FieldDescriptor.TYPE_FIXED32: FieldType.FIXED32,
-    FieldDescriptor.TYPE_SFIXED32: FieldType.SFIXED32,
-    FieldDescriptor.TYPE_FIXED64: FieldType.FIXED64,
-    FieldDescriptor.TYPE_SFIXED64: FieldType.FIXED64,
-    FieldDescriptor.TYPE_FLOAT: FieldType.FLOAT,
-    FieldDescriptor.TYPE_DOUBLE: FieldType.DOUBLE,
-    FieldDescriptor.TYPE_STRING: FieldType.BYTES,
-    FieldDescriptor.TYPE_BYTES: FieldType.BYTES,
-    FieldDescriptor.TYPE_MESSAGE: FieldType.MESSAGE,
-    FieldDescriptor.TYPE_GROUP: FieldType.GROUP,
-}
+def text(data: bytes) -> Operation:
+    return Operation(Op.TEXT, size=len(data), data=data)
 
 
-@dataclass(slots=True)
-class Wanted:
-    """A field of which something is wanted: its value or list, whether it is there, or fields of the message in it."""
-
-    field: FieldDescriptor
-    value: Slot | None = None
-    presence: Slot | None = None
-    node: Node | None = None
+def known(data: bytes, alignment: int = 1) -> Operation:
+    return Operation(Op.KNOWN, alignment, size=len(data), data=data)
 
 
-@dataclass(eq=False, slots=True)
-class Node:
-    """A message at one place: the payload, a message in it, or the elements of a list, which are read one by one."""
-
-    descriptor: Descriptor
-    wanted: dict[str, Wanted] = field(default_factory=dict)
-    index: int = -1
-
-    def field(self, name: str) -> Wanted:
-        return self.wanted.setdefault(name, Wanted(self.descriptor.fields_by_name[name]))
-
-    def message(self, name: str) -> Node:
-        """The message in a field that is not repeated."""
-        wanted = self.field(name)
-        if wanted.node is None:
-            wanted.node = Node(message_of(wanted.field))
-        return wanted.node
-
-    def value(self, name: str) -> Slot:
-        """A scalar, text or bytes, or the list of a repeated field."""
-        wanted = self.field(name)
-        if wanted.value is None:
-            wanted.value = Slot(None if wanted.field.is_repeated else _default(wanted.field))
-        return wanted.value
-
-    def presence(self, name: str) -> Slot:
-        wanted = self.field(name)
-        if wanted.presence is None:
-            wanted.presence = Slot(0)
-        return wanted.presence
-
-    def depth(self) -> int:
-        return 1 + max((each.node.depth() for each in self.wanted.values() if each.node), default=0)
+def load(slot: Slot) -> Operation:
+    return Operation(Op.LOAD, slot)
 
 
-def _default(declared: FieldDescriptor) -> int | float | bytes:
-    value = declared.default_value
-    return value.encode() if isinstance(value, str) else value
+def keep(slot: Slot) -> Operation:
+    return Operation(Op.KEEP, slot)
 
 
-class NodeField(NamedTuple):
-    """`struct node_field`; NONE where there is no such slot or node."""
-
-    number: int
-    type: FieldType
-    is_repeated: bool
-    slot: int
-    presence: int
-    node: int
-    choice: int
-    cleared: int
-    cleared_count: int
+DROP, SIZE, WANT = Operation(Op.DROP), Operation(Op.SIZE), Operation(Op.WANT)
+EQUAL = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=Relation.EQUAL)
 
 
-NONE = 0xFFFF
+def repeat(body: Code, *, keeps: bool = False) -> Code:
+    """`body`, as often as the integer on the stack says. `keeps`: lists and text that it makes are used behind it."""
+    return (Operation(Op.REPEAT, flag=keeps, size=len(body) + 1), *body, Operation(Op.AGAIN))
 
 
-class NodeFields(NamedTuple):
-    """`struct node`."""
+# ---- what is known of a program
 
-    fields: tuple[NodeField, ...]
-    first_slot: int
-    slot_count: int
-
-
-@dataclass(slots=True)
-class Layout:
-    """The numbers of slots and nodes. The first node is the payload, the second one the envelope that it is in."""
-
-    defaults: list[int | float | bytes | None]
-    nodes: list[NodeFields]
-
-
-def layout(slots: Sequence[Slot], payload: Node, envelope: Descriptor, case: str, elements: Sequence[Node]) -> Layout:
-    """Number `slots`, from 0, then those of the nodes."""
-    maker = _Layout()
-    for slot in slots:
-        maker.number(slot)
-    around = Node(envelope, {case: Wanted(envelope.fields_by_name[case], node=payload)})
-    roots = [around, *elements]
-    inside = chain(_inner(payload), *map(_all, elements))
-    for index, node in enumerate([payload, around, *inside]):
-        node.index = index
-        maker.made.nodes.append(NodeFields((), 0, 0))
-    for root in roots:
-        maker.place(root)
-    return maker.made
+_GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
+_TAKE_ONE = frozenset({
+    Op.DROP, Op.UNLESS, Op.AND, Op.OR, Op.WANT, Op.ENTER, Op.REPEAT, Op.APPEND, Op.PUT, Op.PUT_FLOAT, Op.PUT_DOUBLE,
+    Op.PUT_TEXT, Op.PUT_BYTES, Op.WRITE_VARINT, Op.WRITE_ZIGZAG, Op.WRITE_FIXED32, Op.WRITE_FIXED64, Op.WRITE_FLOAT,
+    Op.WRITE_DOUBLE, Op.WRITE_BYTES,
+})  # fmt: skip
+_TAKE_TWO_GIVE_ONE = frozenset({
+    Op.ADD, Op.SUBTRACT, Op.MULTIPLY, Op.CHECKED_ADD, Op.CHECKED_SUBTRACT, Op.CHECKED_MULTIPLY, Op.DIVIDE, Op.MODULO,
+    Op.LEAST, Op.GREATEST, Op.REAL_ADD, Op.REAL_SUBTRACT, Op.REAL_MULTIPLY, Op.REAL_DIVIDE, Op.REAL_FLOOR_DIVIDE,
+    Op.REAL_MODULO, Op.REAL_POWER, Op.REAL_LEAST, Op.REAL_GREATEST, Op.ATAN2, Op.HYPOT, Op.COMPARE, Op.EITHER, Op.JOIN,
+})  # fmt: skip
+_TAKE_THREE_GIVE_ONE = frozenset({Op.CLAMP, Op.FIT, Op.WRAP, Op.REAL_CLAMP})
 
 
-def _all(node: Node) -> Iterator[Node]:
-    yield node
-    yield from _inner(node)
+def _effect(operation: Operation) -> int:
+    """By how many values the stack grows."""
+    kind = operation.kind
+    if kind is Op.LIST:
+        return 1 - operation.size
+    return (kind in _GIVE) - (kind in _TAKE_ONE or kind in _TAKE_TWO_GIVE_ONE) - 2 * (kind in _TAKE_THREE_GIVE_ONE)
 
 
-def _inner(node: Node) -> Iterator[Node]:
-    for wanted in node.wanted.values():
-        if wanted.node is not None:
-            yield from _all(wanted.node)
+def depths(operations: Sequence[Operation]) -> Iterator[int]:
+    """How many values are stacked behind each operation."""
+    depth = 0
+    joins: dict[int, int] = {}  # the depth where a jump leads
+    for index, operation in enumerate(operations):
+        depth = joins.pop(index, depth)
+        kind, target = operation.kind, index + 1 + operation.size
+        before = depth
+        depth += _effect(operation)
+        if kind is Op.JUMP or kind is Op.UNLESS:
+            joins[target] = depth
+        elif kind is Op.AND or kind is Op.OR:
+            joins[target] = before
+        yield depth
 
 
-class _Layout:
-    """Slots of a node stand together, those of a oneof's members behind the number of the member that is there."""
+def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> int:
+    """How deep loops, or messages that are written, nest."""
+    depth = deepest = 0
+    for operation in operations:
+        depth += (operation.kind is opens) - (operation.kind is closes)
+        deepest = max(deepest, depth)
+    return deepest
 
-    def __init__(self) -> None:
-        self.made = Layout([], [])
 
-    def number(self, slot: Slot) -> int:
-        slot.index = len(self.made.defaults)
-        self.made.defaults.append(slot.default)
-        return slot.index
+_BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.DIGITS})
+"""Operations that take as long as their text or list, at the most that of a datagram."""
 
-    def place(self, node: Node) -> None:
-        first = len(self.made.defaults)
-        alone = [wanted for wanted in node.wanted.values() if wanted.field.containing_oneof is None]
-        fields = [self._field(wanted) for wanted in alone]
-        oneofs = {wanted.field.containing_oneof for wanted in node.wanted.values() if wanted.field.containing_oneof}
-        for oneof in sorted(oneofs, key=lambda each: each.index):
-            choice, begin = self.number(Slot(0)), len(self.made.defaults)
-            members = [self._field(node.wanted.get(member.name) or Wanted(member)) for member in oneof.fields]
-            count = len(self.made.defaults) - begin
-            fields += [each._replace(choice=choice, cleared=begin, cleared_count=count) for each in members]
-        fields.sort(key=lambda each: each.number)
-        self.made.nodes[node.index] = NodeFields(tuple(fields), first, len(self.made.defaults) - first)
+_BYTES_AT_A_TIME = 16
 
-    def _field(self, wanted: Wanted) -> NodeField:
-        slot, presence = (self.number(each) if each else NONE for each in (wanted.value, wanted.presence))
-        if wanted.node is not None:
-            self.place(wanted.node)
-        return NodeField(
-            wanted.field.number,
-            FIELD_TYPES[wanted.field.type],
-            wanted.field.is_repeated,
-            slot,
-            presence,
-            wanted.node.index if wanted.node is not None else NONE,
-            NONE,
-            0,
-            0,
-        )
+
+def most_executed(operations: Sequence[Operation]) -> int:
+    """How many operations a datagram can have executed, at the most: a loop has as many elements as that has bytes."""
+    total, times = 0, [1]
+    previous: Op | None = None
+    for operation in operations:
+        cost = 1
+        if operation.kind in _BYTEWISE or (operation.kind is Op.ENTER and previous is not Op.NEXT):
+            cost += MAX_DATAGRAM // _BYTES_AT_A_TIME
+        elif operation.kind is Op.ELEMENT:
+            cost += int(operation.number)  # cells are gone through
+        total += cost * times[-1]
+        if operation.kind is Op.REPEAT:
+            times.append(times[-1] * MAX_DATAGRAM)
+        elif operation.kind is Op.AGAIN:
+            times.pop()
+        previous = operation.kind
+    return total

@@ -2,7 +2,7 @@
  * that takes its time now and then, refuses, and is stuck at last. Generations are held and resumed, counters are read,
  * and all ends at some moment. Fails unless each topic gets its messages in order and from a program that is alive, and
  * the counters balance; sanitizers see the rest. A program is freed as soon as nobody can use it. */
-#include "publishing.h"
+#include "publish.h"
 
 #include <pthread.h>
 #include <stdio.h>
@@ -16,7 +16,7 @@
 enum { ROUNDS = 12, PROGRAMS = 24, TOPICS = 2, QUEUE = 1 << 12, ALIVE = 0x600d, NUMBER = 2, SLOTS = 3 };
 /* Counters of each topic behind those of the listener and of the route. */
 enum { RECEIVED, BYTES, PADDED, REJECTED, UNKNOWN = REJECTED + REASONS, ACCEPTED, LAST, DURATION, TOPIC = DURATION + 14 };
-enum { WAITING, QUEUE_FULL, FILTERED, PUBLISHED, STALE, LIMITED, MAPPING, NON_FINITE, REFUSED, OF_TOPIC };
+enum { WAITING, QUEUE_FULL, FILTERED, PUBLICATIONS, STALE, LIMITED, MAPPING, NON_FINITE, REFUSED, OF_TOPIC };
 enum { COUNTERS = TOPIC + TOPICS * OF_TOPIC };
 
 /* All that a program refers to. */
@@ -29,23 +29,24 @@ struct made {
     struct part part;
     struct waiting waiting[TOPICS];
     const uint8_t *wanted[TOPICS];
-    struct publish_route publish;
-    struct publish_target targets[TOPICS];
-    struct publish_topic topics[TOPICS];
+    struct targets publish;
+    struct target targets[TOPICS];
+    struct topic topics[TOPICS];
     struct node_field of_payload, of_envelope;
     struct node nodes[2];
     struct value defaults[SLOTS], source;
-    struct operation operations[2];
+    struct operation operations[3];
+    struct layout layout;
     uint32_t publishers[TOPICS]; /* ALIVE and their index */
 };
 
 /* All of a round. */
-struct stage {
+struct round {
     counter *received, *published;
     struct ring *events, *rejections, *messages;
     struct deadmen *deadmen;
     struct carrier *carrier;
-    struct publishing *publishing;
+    struct publish_thread *publishing;
     int socket;
 };
 
@@ -54,12 +55,13 @@ static const struct wire_field of_payload[] = {{1, WIRE_VARINT, 0, 0}};
 static const struct wire_type types[] = {{of_envelope, 1, 0}, {of_payload, 1, 1}};
 static const struct wire_schema schema = {types, 2};
 
+static const uint8_t header[] = {0, 1, 0, 0};
 static struct limit limit = {1000, 500, -1000};
 static uint8_t wanted[TOPICS] = {1, 1};
 static uint32_t latest[TOPICS]; /* numbers that were published; of the thread */
 static _Atomic bool is_stuck, has_ended;
 static _Atomic uint32_t inside;
-static struct publishing *left[ROUNDS]; /* by the caller, with what they hold */
+static struct publish_thread *left[ROUNDS]; /* by the caller, with what they hold */
 
 static void check(bool holds, const char *what) {
     if (holds) return;
@@ -97,34 +99,39 @@ static uint32_t topic_counter(int topic, int which) { return (uint32_t)(TOPIC + 
 
 static void make_target(struct made *made, int index) {
     made->publishers[index] = (uint32_t)(ALIVE * TOPICS + index);
-    made->topics[index] = (struct publish_topic){&made->publishers[index], &wanted[index], (uint32_t)index + 1, 0};
+    made->topics[index] = (struct topic){&made->publishers[index], &wanted[index]};
     made->wanted[index] = &wanted[index];
     made->waiting[index] = (struct waiting){(uint32_t)index + 1, topic_counter(index, WAITING),
                                             topic_counter(index, QUEUE_FULL), topic_counter(index, FILTERED)};
-    made->targets[index] = (struct publish_target){
-        .topic = &made->topics[index], .operations = made->operations, .operation_count = 2,
-        .condition = index ? made->operations : NULL, .condition_count = (uint32_t)index, .limit = index ? &limit : NULL,
-        .published = topic_counter(index, PUBLISHED), .waiting = topic_counter(index, WAITING),
-        .filtered = topic_counter(index, FILTERED), .stale = topic_counter(index, STALE),
-        .rate_limited = topic_counter(index, LIMITED), .mapping_error = topic_counter(index, MAPPING),
-        .non_finite = topic_counter(index, NON_FINITE), .publish_error = topic_counter(index, REFUSED)};
+    made->targets[index] = (struct target){
+        .topic = &made->topics[index], .message = {made->operations, 3, 0}, .id = (uint32_t)index + 1,
+        .condition = {made->operations + 1, (uint32_t)index, 0}, .limit = index ? &limit : NULL,
+        .delivered = topic_counter(index, PUBLICATIONS), .waiting = topic_counter(index, WAITING),
+        .filtered = topic_counter(index, FILTERED)};
+    for (int reason = 0; reason < LOSSES; reason++) made->targets[index].dropped[reason] = topic_counter(index, MAPPING);
+    made->targets[index].dropped[LOSS_STALE] = topic_counter(index, STALE);
+    made->targets[index].dropped[LOSS_RATE_LIMITED] = topic_counter(index, LIMITED);
+    made->targets[index].dropped[LOSS_NON_FINITE] = topic_counter(index, NON_FINITE);
+    made->targets[index].dropped[LOSS_PUBLISH_ERROR] = topic_counter(index, REFUSED);
 }
 
-static struct made *make(const struct stage *stage, uint32_t generation) {
+static struct made *make(const struct round *stage, uint32_t generation) {
     struct made *made = calloc(1, sizeof *made);
     check(made, "memory");
     made->of_payload = (struct node_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .node = NONE,
-                                           .choice = NONE};
+                                           .choice = NONE, .closed = NONE};
     made->of_envelope = (struct node_field){.number = 1, .type = TYPE_MESSAGE, .slot = NONE, .presence = NONE,
-                                            .node = NODE_PAYLOAD, .choice = NONE};
+                                            .node = NODE_PAYLOAD, .choice = NONE, .closed = NONE};
     made->nodes[NODE_PAYLOAD] = (struct node){&made->of_payload, 1, 0, 0};
     made->nodes[NODE_ENVELOPE] = (struct node){&made->of_envelope, 1, 0, 0};
-    made->operations[0] = (struct operation){.kind = OP_LOAD, .slot = NUMBER};
-    made->operations[1] = (struct operation){.kind = OP_PUT, .slot = 4};
+    made->operations[0] = (struct operation){.kind = OP_KNOWN, .size = sizeof header, .slot = 1};
+    made->operations[1] = (struct operation){.kind = OP_LOAD, .slot = NUMBER};
+    made->operations[2] = (struct operation){.kind = OP_PUT, .slot = 4};
+    made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .literals = header,
+                                   .slot_count = SLOTS};
     for (int index = 0; index < TOPICS; index++) make_target(made, index);
-    made->publish = (struct publish_route){.ttl = generation % 2 ? 0 : 5000000, .nodes = made->nodes,
-                                           .defaults = made->defaults, .sources = &made->source, .targets = made->targets,
-                                           .slot_count = SLOTS, .target_count = TOPICS};
+    made->publish = (struct targets){.ttl = generation % 2 ? 0 : 5000000, .layout = &made->layout,
+                                     .sources = &made->source, .targets = made->targets, .count = TOPICS};
     made->part = (struct part){.ring = stage->messages, .publishes = &made->publish, .wanted = made->wanted,
                                .targets = made->waiting, .wanted_count = TOPICS, .target_count = TOPICS};
     made->route = (struct route){.parts = &made->part, .part_count = 1, .last_message = LAST, .duration = DURATION};
@@ -141,26 +148,26 @@ static struct made *make(const struct stage *stage, uint32_t generation) {
 
 /* Free a program that nothing in the ring refers to. The receive thread may just be dropping such a message: it is done
  * with that a turn later. */
-static void free_made(const struct stage *stage, struct made *made) {
+static void free_made(const struct round *stage, struct made *made) {
     uint64_t turns = carrier_turns(stage->carrier);
     while (carrier_turns(stage->carrier) == turns) usleep(50);
     memset(made, 0, sizeof *made);
     free(made);
 }
 
-static struct made *replace_all(const struct stage *stage, struct made *running) {
+static struct made *replace_all(const struct round *stage, struct made *running) {
     for (uint32_t generation = 2; generation <= PROGRAMS; generation++) {
         struct made *next = make(stage, generation);
         struct change change = {.program = &next->program};
-        if (generation % 3 == 0) publishing_hold(stage->publishing, generation);
+        if (generation % 3 == 0) publish_hold(stage->publishing, generation);
         carrier_change(stage->carrier, &change);
-        publishing_advance(stage->publishing, generation);
+        publish_advance(stage->publishing, generation);
         __atomic_store_n(&wanted[0], generation % 5 != 0, __ATOMIC_RELAXED);
         usleep(generation % 7 * 300);
-        while (!publishing_has_reached(stage->publishing, generation)) usleep(100);
+        while (!publish_has_reached(stage->publishing, generation)) usleep(100);
         free_made(stage, running);
         running = next;
-        if (generation < PROGRAMS) publishing_hold(stage->publishing, 0); /* the last one is held to the end */
+        if (generation < PROGRAMS) publish_hold(stage->publishing, 0); /* the last one is held to the end */
     }
     return running;
 }
@@ -176,7 +183,7 @@ static size_t make_datagram(uint32_t number, uint8_t *data) {
 }
 
 static void *send_datagrams(void *of) {
-    const struct stage *stage = of;
+    const struct round *stage = of;
     int from = socket(AF_INET, SOCK_DGRAM, 0);
     struct sockaddr_in to;
     socklen_t length = sizeof to;
@@ -199,13 +206,13 @@ static void check_balance(const int64_t *counts) {
 }
 
 static void *watch(void *of) {
-    const struct stage *stage = of;
+    const struct round *stage = of;
     static uint64_t records[4096];
     int64_t counts[COUNTERS];
     uint32_t topic;
     while (!atomic_load(&has_ended)) {
-        if (publishing_counters(stage->publishing, counts, COUNTERS)) check_balance(counts);
-        if (publishing_since(stage->publishing, &topic)) check(topic <= TOPICS, "it is a topic");
+        if (publish_counters(stage->publishing, counts, COUNTERS)) check_balance(counts);
+        if (publish_since(stage->publishing, &topic)) check(topic <= TOPICS, "it is a topic");
         carrier_pulse(stage->carrier);
         ring_take(stage->events, records, sizeof records, 1);
     }
@@ -214,7 +221,7 @@ static void *watch(void *of) {
 
 /* ---- rounds ---- */
 
-static void open_stage(struct stage *stage) {
+static void open_stage(struct round *stage) {
     struct sockaddr_in any = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
     stage->received = calloc(COUNTERS, sizeof *stage->received);
     stage->published = calloc(COUNTERS, sizeof *stage->published);
@@ -225,11 +232,11 @@ static void open_stage(struct stage *stage) {
     stage->carrier = carrier_open(stage->deadmen, stage->received, stage->rejections);
     stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
     check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
-    stage->publishing = publishing_open(stage->messages, stage->published, stage->events, publish, why, forget);
+    stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget);
     check(stage->publishing, "the thread starts");
 }
 
-static void close_stage(struct stage *stage) {
+static void close_stage(struct round *stage) {
     carrier_close(stage->carrier);
     deadmen_close(stage->deadmen);
     ring_close(stage->messages);
@@ -241,7 +248,7 @@ static void close_stage(struct stage *stage) {
 }
 
 /* All that was received came to something. */
-static void check_accounts(const struct stage *stage) {
+static void check_accounts(const struct round *stage) {
     check_balance((const int64_t *)stage->published);
     for (int topic = 0; topic < TOPICS; topic++) {
         int64_t sum = 0;
@@ -255,7 +262,7 @@ static void check_accounts(const struct stage *stage) {
 
 /* Play a round. In some, the thread is stuck at the end, and left. */
 static void play(int round) {
-    struct stage stage;
+    struct round stage;
     bool gets_stuck = round % 4 == 3;
     memset(latest, 0, sizeof latest);
     open_stage(&stage);
@@ -268,7 +275,7 @@ static void play(int round) {
     pthread_create(&watching, NULL, watch, &stage);
     struct made *last = replace_all(&stage, first);
     if (gets_stuck) {
-        publishing_hold(stage.publishing, 0);
+        publish_hold(stage.publishing, 0);
         __atomic_store_n(&wanted[0], 1, __ATOMIC_RELAXED);
         atomic_store(&is_stuck, true);
         while (!atomic_load(&inside)) usleep(100);
@@ -278,12 +285,12 @@ static void play(int round) {
     pthread_join(sending, NULL);
     pthread_join(watching, NULL);
     carrier_stop_receiving(stage.carrier);
-    bool has_stopped = publishing_stop(stage.publishing);
+    bool has_stopped = publish_stop(stage.publishing);
     check(has_stopped == !gets_stuck, "it stops unless it is stuck");
     if (has_stopped) check_accounts(&stage);
     else left[round] = stage.publishing;
     printf("%lld received, %lld and %lld published\n", (long long)stage.received[ACCEPTED],
-           (long long)stage.published[topic_counter(0, PUBLISHED)], (long long)stage.published[topic_counter(1, PUBLISHED)]);
+           (long long)stage.published[topic_counter(0, PUBLICATIONS)], (long long)stage.published[topic_counter(1, PUBLICATIONS)]);
     close_stage(&stage);
     free(last);
     atomic_store(&is_stuck, false);

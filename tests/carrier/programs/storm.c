@@ -36,7 +36,11 @@ struct made {
     struct peer peer;
     struct payload_case cases[ROUTES + 1];
     struct route routes[ROUTES];
-    struct destination destinations[ROUTES][DESTINATIONS];
+    struct target destinations[ROUTES][DESTINATIONS];
+    struct node nodes[2]; /* of which no field is wanted */
+    struct value defaults[SLOT_SOURCE + 1], sources[2];
+    struct layout layout;
+    struct operation condition;
     struct part parts[ROUTES];
     struct waiting waiting[ROUTES];
     const uint8_t *wanted[1];
@@ -122,22 +126,29 @@ static struct listener make_listener(const struct made *made, int index) {
     return listener;
 }
 
+static struct target make_destination(const struct made *made, int route, int to) {
+    struct target target = {
+        .sender = senders[to], .limit = to == 1 ? &limit : NULL, .feeds = &made->feed, .feed_count = to == 0,
+        .condition = {&made->condition, to == 1, 0}, .trims = to == 1, .id = (uint32_t)to,
+        .delivered = destination_counter(route, to, SENT), .delivered_bytes = destination_counter(route, to, SENT_BYTES)};
+    target.dropped[LOSS_STALE] = destination_counter(route, to, STALE);
+    target.dropped[LOSS_RATE_LIMITED] = destination_counter(route, to, LIMITED);
+    target.dropped[LOSS_SEND_BUFFER_FULL] = destination_counter(route, to, FULL);
+    target.dropped[LOSS_SEND_ERROR] = destination_counter(route, to, ERROR);
+    return target;
+}
+
 static void make_route(struct made *made, int index) {
-    for (int to = 0; to < DESTINATIONS; to++)
-        made->destinations[index][to] = (struct destination){
-            .sender = senders[to], .limit = to == 1 ? &limit : NULL, .feeds = &made->feed, .feed_count = to == 0,
-            .trims = to == 1, .id = (uint32_t)to, .sent = destination_counter(index, to, SENT),
-            .sent_bytes = destination_counter(index, to, SENT_BYTES), .stale = destination_counter(index, to, STALE),
-            .rate_limited = destination_counter(index, to, LIMITED),
-            .send_buffer_full = destination_counter(index, to, FULL), .send_error = destination_counter(index, to, ERROR)};
+    for (int to = 0; to < DESTINATIONS; to++) made->destinations[index][to] = make_destination(made, index, to);
     made->waiting[index] = (struct waiting){7, route_counter(index, WAITING), route_counter(index, QUEUE_FULL),
                                             route_counter(index, FILTERED)};
     made->parts[index] = (struct part){.ring = messages, .wanted = made->wanted, .targets = &made->waiting[index],
                                        .wanted_count = 1, .target_count = 1, .is_always_wanted = index == 0,
                                        .handler = (uint32_t)index, .route = (uint32_t)index};
-    made->routes[index] = (struct route){.ttl = index ? 20000000 : 0, .destinations = made->destinations[index],
-                                         .parts = &made->parts[index], .destination_count = DESTINATIONS,
-                                         .part_count = 1, .id = (uint32_t)index,
+    struct targets sends = {.ttl = index ? 20000000 : 0, .layout = &made->layout, .sources = made->sources,
+                            .targets = made->destinations[index], .count = DESTINATIONS, .route = (uint32_t)index,
+                            .topic = NO_NAME};
+    made->routes[index] = (struct route){.sends = sends, .parts = &made->parts[index], .part_count = 1,
                                          .last_message = route_counter(index, LAST),
                                          .duration = route_counter(index, LAST + 1)};
     made->cases[index] = (struct payload_case){.number = (uint32_t)index + 1, .row = index, .unhandled = UNHANDLED_CASE};
@@ -156,6 +167,8 @@ static struct made *make(uint32_t generation) {
     check(made, "memory");
     made->wanted[0] = &wanted;
     made->feed.deadman = open_deadman();
+    made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
+    made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
     made->peer = (struct peer){0x7f000002, 0, 0, SEEN, 0};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};
     for (int index = 0; index < ROUTES; index++) make_route(made, index);

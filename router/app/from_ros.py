@@ -1,0 +1,126 @@
+"""Messages from ROS that a native thread serves, from one program to the next.
+
+Topics that another thread is to serve, or from another subscription, are left before the swap. All others are served by
+the earlier program until the swap is done, unless deadmen change: those of two programs do not get feeds in turns.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription, forget_what_is_served
+from router.carrier.ring import Ring
+from router.errors import StartError
+from router.log import logger
+from router.threads import StuckError
+
+
+@dataclass(frozen=True, slots=True)
+class RosTopics:
+    """What a program has a native thread make of messages from ROS, and all of its subscriptions by topic."""
+
+    messages: NativeFromRos
+    subscriptions: Mapping[str, Subscription]
+
+    def only(self, *, urgent: bool) -> RosTopics:
+        """With those for the thread of urgent messages, or those for the other one."""
+        return RosTopics(self.messages.only(urgent=urgent), self.subscriptions)
+
+
+class FromRos:
+    """The thread, which starts with the first program that has messages for it.
+
+    `deadmen` is the address of the carrier's, `counts` the array that the thread counts in. Urgent messages have a
+    thread of their own.
+    """
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        deadmen: int,
+        counts: ctypes.Array[ctypes.c_int64],
+        events: Ring,
+        *,
+        is_urgent: bool,
+    ) -> None:
+        self._library = library
+        self.is_urgent = is_urgent
+        self._deadmen = deadmen
+        self._counts = counts
+        self._events = events
+        self._thread: FromRosThread | None = None
+        self._served = RosTopics(NativeFromRos(), {})
+        self._refused = 0
+        self.has_passed = True
+        """Whether the thread serves what it was last told to serve."""
+
+    def counters(self, count: int) -> list[int]:
+        """Return the first counters, as they are between two messages."""
+        return self._thread.counters(count) if self._thread else list(self._counts[:count])
+
+    def open(self, messages: NativeFromRos) -> None:
+        """Start the thread if these need it. Raises StartError."""
+        if self._thread is not None or not messages.only(urgent=self.is_urgent).topics:
+            return
+        from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
+
+        try:
+            self._thread = FromRosThread(
+                self._library, self._deadmen, self._counts, self._events, TAKE, RESET, is_urgent=self.is_urgent
+            )
+        except MemoryError as error:
+            raise StartError(str(error)) from error
+
+    def leave(self, next_one: RosTopics, *, keeps: bool) -> None:
+        """Cease to serve what the next program does not have, or everything, once what has arrived is served.
+
+        Raises StuckError, with nothing changed.
+        """
+        if self._thread is None:
+            return
+        now, then = self._served, next_one.subscriptions
+        own = next_one.only(urgent=self.is_urgent).messages.topics
+        kept = [topic for topic in now.messages.topics if keeps and topic in own]
+        kept = [topic for topic in kept if then[topic] is now.subscriptions[topic]]
+        forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.messages.topics if topic in then})
+        topics = {topic: now.messages.topics[topic] for topic in kept}
+        messages = NativeFromRos(topics, now.messages.urgent, now.messages.arrays)
+        self._thread.serve(messages, {topic: then[topic] for topic in kept})
+
+    def stay(self) -> None:
+        """Undo `leave`."""
+        self.serve(self._served)
+
+    def serve(self, next_one: RosTopics) -> None:
+        """Serve other topics, or by another program. What fails is logged; what was served before is served then."""
+        if self._thread is None:
+            return
+        next_one = next_one.only(urgent=self.is_urgent)
+        try:
+            messages, subscriptions = next_one.messages, next_one.subscriptions
+            self._thread.serve(messages, {topic: subscriptions[topic] for topic in messages.topics})
+        except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
+            logger.error("messages from ROS are not served as the table says until it is reloaded", why=str(error))
+            self.has_passed = False
+        else:
+            self._served = next_one
+            self.has_passed = True
+
+    def report_failures(self) -> None:
+        """Log how often the middleware has refused to hand out a message since the last call."""
+        refused = self._thread.failures if self._thread else 0
+        if refused > self._refused:
+            logger.error("the middleware has not handed out messages that it has", times=refused - self._refused)
+        self._refused = refused
+
+    def stop(self) -> bool:
+        """Serve what has arrived, and end. Return False if the thread is stuck: subscriptions must stay open then.
+
+        Idempotent.
+        """
+        has_ended = self._thread is None or self._thread.stop()
+        if not has_ended:
+            logger.error("a thread for messages from ROS is stuck, and the router ends without it")
+        return has_ended

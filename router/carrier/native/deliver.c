@@ -1,0 +1,207 @@
+#include "deliver.h"
+
+#include <errno.h>
+#include <string.h>
+
+#include "clock.h"
+#include "envelope.h"
+#include "evaluate.h"
+
+/* One message on its way to one target. */
+struct delivery {
+    struct stage *stage;
+    const struct targets *to;
+    const struct target *target;
+    struct message *message;
+    int64_t expires; /* boot clock, ns; NEVER without `ttl` */
+    const uint8_t *data; /* what is sent */
+    size_t size;
+};
+
+/* ---- losses ---- */
+
+static void count(const struct delivery *of, uint32_t which) { counter_add(of->stage->counters, which, 1); }
+
+/* Count and report a loss, with an errno or a text that says more. Returns false. */
+static bool lose_because(const struct delivery *of, enum loss reason, int error, const char *text) {
+    struct lost_event lost = {.route = of->to->route, .topic = of->to->topic, .target = of->target->id, .reason = reason,
+                              .error = error, .counter = of->target->dropped[reason]};
+    count(of, lost.counter);
+    report_loss(&of->stage->reporter, of->message->now, &lost, text);
+    return false;
+}
+
+/* Count a message that is older than `ttl`. Of commands, a stall brings many at once: they are not reported. */
+static bool lose_stale(const struct delivery *of) {
+    if (of->target->topic) return lose_because(of, LOSS_STALE, 0, "");
+    count(of, of->target->dropped[LOSS_STALE]);
+    return false;
+}
+
+/* As `lose_because`, for a message that a place in the table refuses. */
+static bool refuse(const struct delivery *of, enum loss reason, uint32_t place) {
+    struct lost_event lost = {.route = of->to->route, .topic = of->to->topic, .target = of->target->id, .reason = reason,
+                              .counter = of->target->dropped[reason], .generation = of->to->generation, .place = place};
+    count(of, lost.counter);
+    report_loss(&of->stage->reporter, of->message->now, &lost, "");
+    return false;
+}
+
+/* ---- fields ---- */
+
+/* Read the fields of a datagram that programs of the route use. */
+static bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
+    machine_begin(machine, to->layout);
+    machine->slots[SLOT_RECEIVED_AT].integer = from->received_at;
+    machine->slots[SLOT_SOURCE] = to->sources[from->column];
+    if (!from->is_single) return machine_read(machine, NODE_ENVELOPE, from->data, from->size);
+    return machine_read(machine, NODE_PAYLOAD, from->data + from->start, from->length);
+}
+
+/* Read the message unless that was done for another target. */
+static bool is_readable(const struct delivery *of) {
+    struct message *message = of->message;
+    if (!message->is_read) {
+        bool is_well_formed = read_datagram(&of->stage->machine, of->to, message->datagram);
+        message->outcome = is_well_formed ? EVALUATED : LOSS_MAPPING_ERROR;
+        message->is_read = true;
+    }
+    return message->outcome == EVALUATED || refuse(of, (enum loss)message->outcome, message->place);
+}
+
+/* ---- the steps: each returns whether the message goes on; else it is counted ---- */
+
+static bool is_wanted(const struct delivery *of) {
+    const struct topic *topic = of->target->topic;
+    if (!topic || __atomic_load_n(topic->wanted, __ATOMIC_RELAXED)) return true;
+    count(of, of->target->filtered);
+    return false;
+}
+
+static bool meets_condition(const struct delivery *of) {
+    bool is_true;
+    uint32_t at;
+    int outcome = evaluate_condition(&of->stage->machine, &of->target->condition, &is_true, &at);
+    if (outcome != EVALUATED) return refuse(of, (enum loss)outcome, PLACE_CONDITION);
+    if (!is_true) count(of, of->target->filtered);
+    return is_true;
+}
+
+/* Commands to boards are as old as they can be, anything else is as young. */
+static int64_t expiry(const struct delivery *of) {
+    struct born born = of->message->born;
+    return of->to->ttl ? (of->target->board ? born.oldest : born.youngest) + of->to->ttl : NEVER;
+}
+
+static bool is_fresh(const struct delivery *of) {
+    return of->expires == NEVER || of->stage->now(of->stage) <= of->expires || lose_stale(of);
+}
+
+static bool keeps_rate(const struct delivery *of) {
+    if (!of->target->limit || limit_passes(of->target->limit, of->message->now)) return true;
+    count(of, of->target->dropped[LOSS_RATE_LIMITED]);
+    return false;
+}
+
+static bool is_written(struct delivery *of) {
+    uint32_t at;
+    int outcome = evaluate_message(&of->stage->machine, &of->target->message, &at);
+    if (outcome != EVALUATED) return refuse(of, (enum loss)outcome, PLACE_OPERATIONS + at);
+    of->data = of->stage->machine.output.data;
+    of->size = of->stage->machine.output.size;
+    return true;
+}
+
+static bool fits_board(const struct delivery *of) {
+    struct board_refusal refusal;
+    if (!of->target->board || board_takes(of->target->board, of->data, of->size, &refusal)) return true;
+    return lose_because(of, refusal.reason, 0, refusal.text);
+}
+
+/* ---- the last step ---- */
+
+/* The size of an envelope without its trailing zeros, if it can be told from the rest how many there were. */
+static size_t trimmed_size(const uint8_t *data, size_t size) {
+    size_t trimmed = size;
+    while (trimmed && !data[trimmed - 1]) trimmed--;
+    return envelope_restored_size(data, trimmed) == size ? trimmed : size;
+}
+
+static enum loss loss_of(int error) {
+    bool is_full = error == EAGAIN || error == EWOULDBLOCK || error == ENOBUFS;
+    return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
+}
+
+static void send_it(const struct delivery *of) {
+    const struct target *target = of->target;
+    size_t size = target->trims ? trimmed_size(of->data, of->size) : of->size;
+    int error = of->stage->send(of->stage, target, of->data, size, of->expires);
+    if (error == COMMAND_STALE) {
+        lose_stale(of);
+    } else if (error) {
+        lose_because(of, loss_of(error), error, "");
+    } else {
+        count(of, target->delivered);
+        counter_add(of->stage->counters, target->delivered_bytes, (int64_t)size);
+    }
+}
+
+/* Return false if the thread was left. */
+static bool publish_it(const struct delivery *of) {
+    const char *why;
+    switch (of->stage->publish(of->stage, of->target, &why)) {
+    case PUBLISHED: count(of, of->target->delivered); return true;
+    case PUBLISH_FAILED: lose_because(of, LOSS_PUBLISH_ERROR, 0, why); return true;
+    default: return false;
+    }
+}
+
+bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
+    struct delivery of = {.stage = stage, .to = to, .target = target, .message = message};
+    bool is_forwarded = !target->message.count, has_condition = target->condition.count;
+    of.expires = expiry(&of);
+    if (!is_wanted(&of)) return true;
+    if ((has_condition || !is_forwarded) && !is_readable(&of)) return true;
+    if (has_condition && !meets_condition(&of)) return true;
+    if (!is_fresh(&of) || !keeps_rate(&of)) return true;
+    if (is_forwarded) {
+        of.data = message->datagram->data;
+        of.size = message->datagram->size;
+    } else if (!is_written(&of)) {
+        return true;
+    }
+    if (!fits_board(&of)) return true;
+    if (target->topic) return publish_it(&of);
+    send_it(&of);
+    return true;
+}
+
+bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message) {
+    for (uint32_t index = 0; index < to->count; index++)
+        if (!deliver(stage, to, &to->targets[index], message)) return false;
+    return true;
+}
+
+/* ---- the stage of this computer ---- */
+
+static int64_t clock_now(struct stage *stage) {
+    (void)stage;
+    return boottime_ns();
+}
+
+static int send_by_socket(struct stage *stage, const struct target *target, const uint8_t *data, size_t size,
+                          int64_t expires) {
+    return command_send(stage->deadmen, target->sender, data, size, expires, target->feeds, target->feed_count);
+}
+
+bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct deadmen *deadmen) {
+    memset(stage, 0, sizeof *stage);
+    stage->counters = counters;
+    stage->reporter.events = events;
+    stage->deadmen = deadmen;
+    stage->now = clock_now;
+    stage->send = send_by_socket;
+    return machine_open(&stage->machine);
+}
+
+void stage_close(struct stage *stage) { machine_close(&stage->machine); }

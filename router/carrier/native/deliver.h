@@ -1,0 +1,122 @@
+/* The one way from a message to a target, whatever feeds it: datagrams in the receive thread and in the one that publishes,
+ * and messages from ROS. In this order:
+ *
+ *     wanted      a topic needs a subscriber                          else filtered
+ *     condition   `when`                                              else filtered
+ *     age         `ttl`                                               else stale
+ *     rate        `max_rate`                                          else rate_limited
+ *     message     what the program writes, or the envelope as it was received
+ *     board       what the firmware can take                          else too_large or non_finite
+ *     send or publish, and feed deadmen
+ *
+ * Every message is counted once at each target. Losses are reported, except those of `max_rate`, which the table asks for,
+ * and of stale commands.
+ *
+ * Clock, sockets and middleware are functions of a stage, so that the same steps run without any of them. */
+#ifndef DELIVER_H
+#define DELIVER_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "board.h"
+#include "counters.h"
+#include "deadman.h"
+#include "freshness.h"
+#include "limit.h"
+#include "machine.h"
+#include "report.h"
+#include "sender.h"
+
+/* ---- what a table says ---- */
+
+/* A topic that is published on, by however many routes. */
+struct topic {
+    const void *publisher; /* rcl_publisher_t */
+    const uint8_t *wanted; /* not 0 while somebody subscribes */
+};
+
+struct target {
+    struct code condition; /* empty: it gets every message */
+    struct code message;   /* empty: it gets the envelope as it was received */
+    struct limit *limit;   /* `max_rate`, or NULL */
+    const struct topic *topic; /* NULL for a destination, which has these: */
+    struct sender *sender;
+    const struct board *board; /* NULL if it is no board */
+    const struct feed *feeds;  /* the deadmen that a command feeds or disarms */
+    uint32_t feed_count;
+    uint32_t trims; /* it gets datagrams without their trailing zeros */
+    uint32_t id;    /* in events */
+    /* Counters. `waiting`: of a target whose messages come by a ring; `delivered_bytes`: of a destination. */
+    uint32_t waiting, filtered, delivered, delivered_bytes, dropped[LOSSES];
+};
+
+/* The first slots of every layout of datagrams, and its first nodes. */
+enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
+enum { NODE_PAYLOAD, NODE_ENVELOPE };
+
+/* The targets of a route that one thread serves. */
+struct targets {
+    int64_t ttl;                 /* ns, 0 for none */
+    const struct layout *layout; /* what their programs read; NULL if there are none */
+    const struct value *sources; /* names of senders, by column; of datagrams */
+    const struct target *targets;
+    uint32_t count;
+    /* In events: the route, the topic whose messages these are, or NO_NAME, and the generation of the program. */
+    uint32_t route, topic, generation;
+};
+
+/* ---- what is delivered ---- */
+
+/* A datagram as it was received, with what the carrier knows about it. */
+struct datagram {
+    const uint8_t *data;
+    uint32_t size;
+    uint32_t start, length; /* of the payload, if it is the only field */
+    bool is_single;         /* it is */
+    uint32_t column;        /* of the sender */
+    int64_t received_at;    /* wall clock */
+};
+
+/* A message on its way to the targets of a route. Its fields are read when a program first needs them. */
+struct message {
+    const struct datagram *datagram; /* NULL if it is from ROS: then it has been read */
+    int64_t now;                     /* boot clock: when it was received */
+    struct born born;
+    bool is_read;
+    int outcome;    /* of reading: EVALUATED, or an enum loss */
+    uint32_t place; /* that refused it, an enum place */
+};
+
+/* ---- how it is delivered ---- */
+
+enum publication { PUBLISHED, PUBLISH_FAILED, LEFT };
+
+/* What a thread delivers with. */
+struct stage {
+    counter *counters;
+    struct reporter reporter;
+    struct deadmen *deadmen;
+    struct machine machine;
+    /* The boot clock, ns. */
+    int64_t (*now)(struct stage *stage);
+    /* Send as `command_send` does. */
+    int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
+    /* Publish the machine's output. `why` is set if that fails, and valid until the next call. LEFT: others went on
+     * without this thread meanwhile, and it may use nothing of theirs. */
+    enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
+};
+
+/* Prepare a stage with the clock of this computer, and sockets; `publish` is left to the caller. Return false for lack of
+ * memory. To be closed in either case. */
+bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct deadmen *deadmen);
+void stage_close(struct stage *stage);
+
+/* Deliver a message to one of the targets. Return false if the thread was left in the middleware. */
+bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);
+
+/* Deliver it to all of them, likewise. */
+bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message);
+
+#endif

@@ -1,0 +1,74 @@
+/* A thread that takes messages from ROS, most of them commands, and sends what routes make of them.
+ *
+ * It takes serialized messages, and delivers them (deliver.h) as the receive thread delivers datagrams. Neither the
+ * interpreter nor a publisher can hold it up. It holds its lock while it serves a message, never while it is in the
+ * middleware: so whoever waits for that lock waits for one message at most. */
+#ifndef FROM_ROS_H
+#define FROM_ROS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "carrier.h"
+#include "rcl_types.h"
+
+/* `for_each`: each element of a list is served as a message. */
+struct for_each {
+    struct code list;   /* leaves the list on the stack; empty without `for_each` */
+    uint16_t stored;    /* how, an enum scalar */
+    uint16_t node;      /* into which an element is read that is a message, or NONE */
+    uint16_t item;      /* slot of any other element */
+    uint16_t index, count; /* slots, NONE if nothing uses them */
+    uint16_t reserved[3];
+};
+
+/* A route, as one of its topics feeds it. */
+struct ros_route {
+    struct targets targets;
+    struct for_each for_each;
+    uint16_t seconds, nanoseconds; /* slots of the message's stamp, or NONE */
+    uint32_t received, last_message, duration; /* counters; the last one is a histogram */
+};
+
+struct ros_topic {
+    const void *subscription; /* rcl_subscription_t */
+    const struct ros_route *routes;
+    uint32_t route_count;
+    uint32_t capacity; /* messages that the subscription holds */
+    int32_t eventfd;   /* the middleware adds to it when messages come; nobody reads it */
+    uint32_t reserved;
+};
+
+/* What the thread serves. Belongs to the caller, with all that it refers to. */
+struct ros_set {
+    const struct ros_topic *topics;
+    uint32_t count, reserved;
+};
+
+struct from_ros;
+
+/* Open a thread that serves nothing yet. It counts in `counters`, and losses go to `events`. Messages that are urgent have
+ * a thread of their own, which runs first. NULL for lack of memory, descriptors or threads. */
+struct from_ros *from_ros_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
+                               reset_function *reset, bool is_urgent);
+
+/* Have the thread wait for an eventfd as well, before it is in a set. Return 0, or an errno. */
+int from_ros_watch(struct from_ros *thread, int eventfd);
+void from_ros_unwatch(struct from_ros *thread, int eventfd);
+
+/* Serve this set from the next message on, also what has arrived on its subscriptions, after what has arrived on those
+ * that are left. Returns when the earlier set is not used any more. Returns false, with nothing changed, after 1 s: the
+ * thread is stuck in the middleware. */
+bool from_ros_serve(struct from_ros *thread, const struct ros_set *set);
+
+/* Serve what has arrived, and end the thread. Returns false after 1 s: the thread is stuck in the middleware, and left
+ * there with a subscription. Should it return, it ends; it uses nothing else of the caller's. */
+bool from_ros_stop(struct from_ros *thread);
+
+/* How often the middleware refused to hand out a message. */
+uint64_t from_ros_failures(struct from_ros *thread);
+
+/* Copy the first counters as in `counters_copy`. */
+bool from_ros_counters(struct from_ros *thread, int64_t *to, uint32_t count);
+
+#endif

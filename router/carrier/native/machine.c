@@ -1,0 +1,47 @@
+#include "machine.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "read_cdr.h"
+#include "read_protobuf.h"
+
+enum { FIRST_CAPACITY = 4096 };
+
+bool machine_open(struct machine *machine) {
+    memset(machine, 0, sizeof *machine);
+    machine->slots = calloc(UINT16_MAX + 1, sizeof *machine->slots);
+    machine->cells = malloc(FIRST_CELLS * sizeof *machine->cells);
+    machine->cell_capacity = FIRST_CELLS;
+    machine->text = malloc(MOST_TEXT);
+    machine->output.data = malloc(FIRST_CAPACITY);
+    machine->output.capacity = FIRST_CAPACITY;
+    return machine->slots && machine->cells && machine->text && machine->output.data;
+}
+
+void machine_close(struct machine *machine) {
+    free(machine->slots);
+    free(machine->cells);
+    free(machine->text);
+    free(machine->output.data);
+}
+
+void machine_begin(struct machine *machine, const struct layout *layout) {
+    machine->layout = layout;
+    machine->cell_count = 0;
+    machine->text_size = 0;
+    memcpy(machine->slots, layout->defaults, layout->slot_count * sizeof *machine->slots);
+}
+
+bool machine_read(struct machine *machine, uint16_t node, const uint8_t *data, size_t size) {
+    if (!machine->layout->is_cdr) return read_protobuf(machine, node, data, size);
+    return read_cdr(machine, node, data, size);
+}
+
+bool machine_enter(struct machine *machine, uint16_t node, const struct value *element) {
+    const struct layout *layout = machine->layout;
+    const struct node *of = &layout->nodes[node];
+    memcpy(machine->slots + of->first_slot, layout->defaults + of->first_slot, of->slot_count * sizeof *machine->slots);
+    if (!layout->is_cdr) return read_protobuf(machine, node, element->bytes, element->size);
+    return read_cdr_element(machine, node, element->bytes);
+}

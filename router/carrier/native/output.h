@@ -1,0 +1,34 @@
+/* A message that is being written: it grows as its bytes come. */
+#ifndef OUTPUT_H
+#define OUTPUT_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+struct output {
+    uint8_t *data;
+    size_t size, capacity;
+};
+
+/* Make room for `size` more bytes. Return false for lack of memory. */
+static inline bool has_room(struct output *output, size_t size) {
+    if (size <= output->capacity - output->size) return true;
+    size_t capacity = output->capacity * 2 + size;
+    uint8_t *data = realloc(output->data, capacity);
+    if (!data) return false;
+    output->data = data;
+    output->capacity = capacity;
+    return true;
+}
+
+static inline bool append(struct output *output, const void *bytes, size_t size) {
+    if (!has_room(output, size)) return false;
+    if (size) memcpy(output->data + output->size, bytes, size);
+    output->size += size;
+    return true;
+}
+
+#endif

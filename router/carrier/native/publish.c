@@ -1,0 +1,203 @@
+#include "publish.h"
+
+#include <pthread.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "carrier_internal.h"
+#include "clock.h"
+
+struct publish_thread {
+    struct stage stage; /* first: what it calls is given this */
+    pthread_t thread;
+    pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
+    pthread_cond_t changed;
+    bool has_ended, is_left; /* under the lock */
+    uint32_t held;           /* likewise: a generation, or 0 */
+    _Atomic bool is_stopping;
+    _Atomic uint32_t latest; /* generation */
+    /* Written by the thread: */
+    edition edition;             /* of the counters */
+    _Atomic uint32_t generation; /* nothing of an earlier one is in use */
+    _Atomic int64_t since;       /* when it entered the middleware, or 0 */
+    _Atomic uint32_t topic;      /* where it did */
+    /* Of the thread: */
+    struct ring *ring;
+    publish_function *publish;
+    error_function *error;
+    reset_function *reset;
+    struct error_text why; /* the last publication failed */
+    _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
+};
+
+/* ---- the middleware ---- */
+
+/* Publish what was written, without the lock. The counters balance meanwhile: the message waits. */
+static enum publication publish_unlocked(struct stage *stage, const struct target *target, const char **why) {
+    struct publish_thread *thread = (struct publish_thread *)stage;
+    struct output *written = &stage->machine.output;
+    struct serialized_message message = {written->data, written->size, written->capacity, ALLOCATOR};
+    const void *publisher = target->topic->publisher;
+    atomic_store_explicit(&thread->topic, target->id, memory_order_relaxed);
+    atomic_store_explicit(&thread->since, monotonic_ns(), memory_order_release);
+    edition_end(&thread->edition);
+    pthread_mutex_unlock(&thread->lock);
+    int error = thread->publish(publisher, &message, NULL);
+    if (error) {
+        thread->why = thread->error();
+        thread->reset();
+    }
+    pthread_mutex_lock(&thread->lock);
+    edition_begin(&thread->edition);
+    atomic_store_explicit(&thread->since, 0, memory_order_relaxed);
+    *why = thread->why.text;
+    return thread->is_left ? LEFT : error ? PUBLISH_FAILED : PUBLISHED;
+}
+
+/* ---- messages ---- */
+
+/* Serve a message. Return false if the thread was left meanwhile. */
+static bool serve(struct publish_thread *thread, const struct message_record *record) {
+    const struct targets *to = record->part->publishes;
+    struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
+                                .length = record->payload_length, .is_single = record->is_single,
+                                .column = record->column, .received_at = record->received_at};
+    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
+    for (uint32_t index = 0; index < to->count; index++) {
+        if (!deliver(&thread->stage, to, &to->targets[index], &message)) return false;
+        counter_add(thread->stage.counters, to->targets[index].waiting, -1);
+    }
+    return true;
+}
+
+/* ---- the thread ---- */
+
+/* Take messages, without the lock. Return how many bytes they have. */
+static size_t take(struct publish_thread *thread, bool waits) {
+    pthread_mutex_unlock(&thread->lock);
+    size_t size = ring_take(thread->ring, thread->records, sizeof thread->records, waits ? -1 : 0);
+    pthread_mutex_lock(&thread->lock);
+    return size;
+}
+
+/* Go on to a generation, unless it was reached, and wait there while it is held. */
+static void reach(struct publish_thread *thread, uint32_t generation) {
+    if (generation <= atomic_load(&thread->generation)) return;
+    atomic_store(&thread->generation, generation);
+    while (thread->held && thread->held <= generation && !atomic_load(&thread->is_stopping))
+        pthread_cond_wait(&thread->changed, &thread->lock);
+}
+
+/* Serve what was taken. Return false if the thread was left meanwhile. */
+static bool serve_all(struct publish_thread *thread, size_t size) {
+    for (size_t at = 0; at < size;) {
+        const struct message_record *record = (const struct message_record *)(thread->records + at);
+        reach(thread, record->generation);
+        edition_begin(&thread->edition);
+        bool goes_on = serve(thread, record);
+        edition_end(&thread->edition);
+        if (!goes_on) return false;
+        at += record->size;
+    }
+    return true;
+}
+
+static void *run(void *of) {
+    struct publish_thread *thread = of;
+    run_soon();
+    pthread_mutex_lock(&thread->lock);
+    for (;;) {
+        /* Read before the ring: what is there by now is served, and what comes later is of this generation at least. */
+        uint32_t latest = atomic_load(&thread->latest);
+        bool is_stopping = atomic_load(&thread->is_stopping);
+        size_t size = take(thread, !is_stopping && latest <= atomic_load(&thread->generation));
+        if (thread->is_left || !serve_all(thread, size) || (is_stopping && !size)) break;
+        if (!size) reach(thread, latest);
+    }
+    thread->has_ended = true;
+    pthread_cond_broadcast(&thread->changed);
+    pthread_mutex_unlock(&thread->lock);
+    return NULL;
+}
+
+/* ---- for others ---- */
+
+/* Free a thread that does not run. */
+static void publish_close(struct publish_thread *thread) {
+    pthread_cond_destroy(&thread->changed);
+    pthread_mutex_destroy(&thread->lock);
+    stage_close(&thread->stage);
+    free(thread);
+}
+
+/* All but the thread itself. NULL for lack of memory. */
+static struct publish_thread *publish_prepare(struct ring *ring, counter *counters, struct ring *events,
+                                              publish_function *publish, error_function *error, reset_function *reset) {
+    struct publish_thread *thread = calloc(1, sizeof *thread);
+    if (!thread) return NULL;
+    thread->ring = ring;
+    thread->publish = publish;
+    thread->error = error;
+    thread->reset = reset;
+    pthread_mutex_init(&thread->lock, NULL);
+    condition_open(&thread->changed);
+    bool is_open = stage_open(&thread->stage, counters, events, NULL);
+    thread->stage.publish = publish_unlocked;
+    if (is_open) return thread;
+    publish_close(thread);
+    return NULL;
+}
+
+struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
+                                    error_function *error, reset_function *reset) {
+    struct publish_thread *thread = publish_prepare(ring, counters, events, publish, error, reset);
+    if (!thread || !start_thread(&thread->thread, "publish", run, thread)) return thread;
+    publish_close(thread);
+    return NULL;
+}
+
+void publish_advance(struct publish_thread *thread, uint32_t generation) {
+    atomic_store(&thread->latest, generation);
+    ring_wake(thread->ring);
+}
+
+bool publish_has_reached(struct publish_thread *thread, uint32_t generation) {
+    return atomic_load(&thread->generation) >= generation;
+}
+
+void publish_hold(struct publish_thread *thread, uint32_t generation) {
+    pthread_mutex_lock(&thread->lock);
+    thread->held = generation;
+    pthread_cond_broadcast(&thread->changed);
+    pthread_mutex_unlock(&thread->lock);
+}
+
+int64_t publish_since(struct publish_thread *thread, uint32_t *topic) {
+    int64_t since = atomic_load_explicit(&thread->since, memory_order_acquire);
+    *topic = atomic_load_explicit(&thread->topic, memory_order_relaxed);
+    return since;
+}
+
+bool publish_stop(struct publish_thread *thread) {
+    struct timespec until = patience();
+    atomic_store(&thread->is_stopping, true);
+    ring_wake(thread->ring);
+    pthread_mutex_lock(&thread->lock);
+    pthread_cond_broadcast(&thread->changed); /* if it is held */
+    while (!thread->has_ended && !pthread_cond_timedwait(&thread->changed, &thread->lock, &until)) {}
+    bool has_ended = thread->has_ended;
+    thread->is_left = !has_ended;
+    pthread_mutex_unlock(&thread->lock);
+    if (!has_ended) {
+        pthread_detach(thread->thread);
+        return false;
+    }
+    pthread_join(thread->thread, NULL);
+    publish_close(thread);
+    return true;
+}
+
+bool publish_counters(struct publish_thread *thread, int64_t *to, uint32_t count) {
+    return counters_copy(&thread->edition, thread->stage.counters, to, count);
+}

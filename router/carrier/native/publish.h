@@ -1,0 +1,41 @@
+/* The thread that publishes what topics get of datagrams: it takes messages from a ring, and delivers them (deliver.h).
+ *
+ * A publisher may block in the middleware: then all topics of the thread wait, and the ring drops its oldest messages.
+ * Nothing else waits. The thread holds its lock while it serves a message, never while it publishes or waits. */
+#ifndef PUBLISH_H
+#define PUBLISH_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "carrier.h"
+#include "rcl_types.h"
+
+struct publish_thread;
+
+/* Start a thread that serves what comes into `ring`, where each message's part has targets to publish to. It counts in
+ * `counters`, and losses go to `events`. NULL for lack of memory, descriptors or threads. */
+struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
+                                    error_function *error, reset_function *reset);
+
+/* Have the thread go on to a generation once all that is in the ring is served: nothing of an earlier one comes any more. */
+void publish_advance(struct publish_thread *thread, uint32_t generation);
+
+/* Whether the thread uses nothing of earlier generations any more. */
+bool publish_has_reached(struct publish_thread *thread, uint32_t generation);
+
+/* Have the thread serve nothing of that generation or a later one until this is called with 0: others serve first what
+ * belongs in front. */
+void publish_hold(struct publish_thread *thread, uint32_t generation);
+
+/* The topic in whose publisher the thread is now, by its id, and since when (monotonic); 0 if in none. */
+int64_t publish_since(struct publish_thread *thread, uint32_t *topic);
+
+/* Serve what waits, and end the thread. Returns false after 1 s: it is stuck in the middleware, and left there with a
+ * publisher. Should it return, it ends; it uses nothing else of the caller's. */
+bool publish_stop(struct publish_thread *thread);
+
+/* Copy the first counters as in `counters_copy`. */
+bool publish_counters(struct publish_thread *thread, int64_t *to, uint32_t count);
+
+#endif

@@ -1,0 +1,21 @@
+/* Reads the wanted fields of a serialized ROS message into slots.
+ *
+ * Plain CDR, little-endian: four bytes of header, then each scalar aligned to its own size, counted from behind the
+ * header. Strings are their length with the final NUL (32 bits), then the bytes; sequences the number of elements, then
+ * the elements. Publishers are not trusted: lengths beyond the end of the message are refused. */
+#ifndef READ_CDR_H
+#define READ_CDR_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "machine.h"
+
+/* Read a message with its header into the slots of a node, which have their defaults. */
+bool read_cdr(struct machine *machine, uint16_t node, const uint8_t *message, size_t size);
+
+/* Likewise an element of a list, which begins there in the message that was read last. */
+bool read_cdr_element(struct machine *machine, uint16_t node, const uint8_t *beginning);
+
+#endif

@@ -1,0 +1,162 @@
+#include "read_protobuf.h"
+
+#include <string.h>
+
+#include "lists.h"
+#include "wire.h"
+
+/* Find a field. Most messages have theirs in order: `guess` is where the next one is then. */
+static const struct node_field *find(const struct node *node, uint32_t number, uint32_t *guess) {
+    if (*guess < node->count && node->fields[*guess].number == number) return &node->fields[(*guess)++];
+    uint32_t low = 0, high = node->count;
+    while (low < high) {
+        uint32_t middle = low + (high - low) / 2;
+        if (node->fields[middle].number < number) low = middle + 1;
+        else high = middle;
+    }
+    if (low == node->count || node->fields[low].number != number) return NULL;
+    *guess = low + 1;
+    return &node->fields[low];
+}
+
+static uint32_t wire_type_of(enum field_type type) {
+    switch (type) {
+    case TYPE_FIXED32:
+    case TYPE_SFIXED32:
+    case TYPE_FLOAT: return I32;
+    case TYPE_FIXED64:
+    case TYPE_DOUBLE: return I64;
+    case TYPE_BYTES:
+    case TYPE_MESSAGE: return LEN;
+    case TYPE_GROUP: return GROUP;
+    default: return VARINT;
+    }
+}
+
+static int64_t of_zigzag(uint64_t bits) { return (int64_t)(bits >> 1 ^ (bits & 1 ? UINT64_MAX : 0)); }
+
+/* What protobuf makes of the bits of a scalar. */
+static struct value scalar(enum field_type type, uint64_t bits) {
+    switch (type) {
+    case TYPE_BOOL: return (struct value){.integer = bits != 0};
+    case TYPE_INT32:
+    case TYPE_SFIXED32:
+    case TYPE_CLOSED_ENUM: return (struct value){.integer = (int32_t)(uint32_t)bits};
+    case TYPE_UINT32: return (struct value){.integer = (uint32_t)bits};
+    case TYPE_SINT32: return (struct value){.integer = (int32_t)of_zigzag((uint32_t)bits)};
+    case TYPE_SINT64: return (struct value){.integer = of_zigzag(bits)};
+    case TYPE_FLOAT: return (struct value){.real = of_float32(bits)};
+    case TYPE_DOUBLE: return (struct value){.real = of_float64(bits)};
+    default: return (struct value){.integer = (int64_t)bits};
+    }
+}
+
+static bool read_scalar(struct bytes *from, enum field_type type, struct value *value) {
+    uint32_t wire_type = wire_type_of(type);
+    uint64_t bits;
+    if (wire_type == VARINT) {
+        if (!read_varint(from, LONGEST_VARINT, &bits)) return false;
+    } else {
+        const uint8_t *at = from->at;
+        unsigned size = wire_type == I32 ? 4 : 8;
+        if (!skip(from, size)) return false;
+        bits = load_little_endian(at, size);
+    }
+    *value = scalar(type, bits);
+    return true;
+}
+
+/* Whether a field can hold a value: of a closed enum, only its own numbers. */
+static bool is_known(const struct machine *machine, const struct node_field *field, const struct value *value) {
+    if (field->type != TYPE_CLOSED_ENUM) return true;
+    const struct closed_enum *closed = &machine->layout->closed[field->closed];
+    uint32_t low = 0, high = closed->count;
+    while (low < high) {
+        uint32_t middle = low + (high - low) / 2;
+        if (closed->numbers[middle] == value->integer) return true;
+        if (closed->numbers[middle] < value->integer) low = middle + 1;
+        else high = middle;
+    }
+    return false;
+}
+
+static struct value range(const struct bytes *bytes) {
+    return (struct value){.bytes = bytes->at, .size = (uint32_t)left(bytes)};
+}
+
+static bool read_element(struct machine *machine, const struct node_field *field, struct bytes *from) {
+    struct value element;
+    if (!read_scalar(from, field->type, &element)) return false;
+    return !is_known(machine, field, &element) || list_add(machine, &machine->slots[field->slot], element);
+}
+
+/* Read a value of a repeated field, or several that are packed. */
+static bool read_elements(struct machine *machine, const struct node_field *field, uint32_t wire_type, struct bytes *from) {
+    struct bytes many;
+    if (wire_type != LEN) return read_element(machine, field, from);
+    if (!read_len(from, &many)) return false;
+    if (field->type == TYPE_BYTES || field->type == TYPE_MESSAGE)
+        return list_add(machine, &machine->slots[field->slot], range(&many));
+    while (many.at < many.end)
+        if (!read_element(machine, field, &many)) return false;
+    return true;
+}
+
+static bool has_type(const struct node_field *field, uint32_t wire_type) {
+    uint32_t declared = wire_type_of(field->type);
+    return wire_type == declared || (wire_type == LEN && field->is_repeated);
+}
+
+/* Note that a field is there: it clears the other members of its oneof. */
+static void mark(struct machine *machine, const struct node_field *field) {
+    struct value *slots = machine->slots;
+    if (field->choice != NONE && slots[field->choice].integer != field->number) {
+        memcpy(slots + field->cleared, machine->layout->defaults + field->cleared, field->cleared_count * sizeof *slots);
+        slots[field->choice].integer = field->number;
+    }
+    if (field->presence != NONE) slots[field->presence].integer = 1;
+}
+
+/* A number that a closed enum does not have is an unknown field: it neither clears nor marks anything. */
+static bool read_single(struct machine *machine, const struct node_field *field, struct bytes *from) {
+    struct value value;
+    if (!read_scalar(from, field->type, &value)) return false;
+    if (!is_known(machine, field, &value)) return true;
+    mark(machine, field);
+    if (field->slot != NONE) machine->slots[field->slot] = value;
+    return true;
+}
+
+static bool read_node(struct machine *machine, uint16_t of, struct bytes rest, int depth);
+
+static bool read_field(struct machine *machine, const struct node_field *field, uint32_t wire_type, struct bytes *from,
+                       int depth) {
+    struct bytes value;
+    if (field->is_repeated && field->slot != NONE) return read_elements(machine, field, wire_type, from);
+    if (wire_type != LEN && wire_type != GROUP) return read_single(machine, field, from);
+    mark(machine, field);
+    if (!read_value(from, wire_type, &value)) return false;
+    if (field->node != NONE) return read_node(machine, field->node, value, depth - 1);
+    if (field->slot != NONE) machine->slots[field->slot] = range(&value);
+    return true;
+}
+
+static bool read_node(struct machine *machine, uint16_t of, struct bytes rest, int depth) {
+    if (!depth) return false;
+    const struct node *node = &machine->layout->nodes[of];
+    uint32_t guess = 0;
+    while (rest.at < rest.end) {
+        uint32_t tag;
+        struct bytes unknown;
+        if (!read_tag(&rest, &tag)) return false;
+        const struct node_field *field = find(node, tag >> 3, &guess);
+        bool is_read = field != NULL && has_type(field, tag & 7) ? read_field(machine, field, tag & 7, &rest, depth)
+                                                                 : read_value(&rest, tag & 7, &unknown);
+        if (!is_read) return false;
+    }
+    return true;
+}
+
+bool read_protobuf(struct machine *machine, uint16_t node, const uint8_t *message, size_t size) {
+    return read_node(machine, node, (struct bytes){message, message + size}, MOST_NODES_DEEP);
+}

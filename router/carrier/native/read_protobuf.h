@@ -1,0 +1,19 @@
+/* Reads the wanted fields of a protobuf message into slots, as the protobuf library would parse them: the last of several
+ * values counts, messages that come in parts are merged, and a member of a oneof clears the others.
+ *
+ * The carrier has checked the payload before (envelope.h); what is not well formed all the same is refused. */
+#ifndef READ_PROTOBUF_H
+#define READ_PROTOBUF_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "machine.h"
+
+enum { MOST_NODES_DEEP = 32 }; /* messages in messages */
+
+/* Read a message into the slots of a node, which have their defaults. */
+bool read_protobuf(struct machine *machine, uint16_t node, const uint8_t *message, size_t size);
+
+#endif

@@ -1,0 +1,86 @@
+/* Writes a protobuf message, from its first byte to its last. The length of a message within it is known only at its end:
+ * one byte is left for it, and what follows is moved on where the length takes more. Each function returns false for lack
+ * of memory. Small, and inline in what runs programs. */
+#ifndef WRITE_PROTOBUF_H
+#define WRITE_PROTOBUF_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "numbers.h"
+#include "operations.h"
+#include "output.h"
+#include "wire.h"
+
+/* Write a varint where there is room for LONGEST_VARINT bytes. Returns its end. */
+static inline uint8_t *store_varint(uint8_t *to, uint64_t value) {
+    for (; value > 0x7F; value >>= 7) *to++ = (uint8_t)(value | 0x80);
+    *to++ = (uint8_t)value;
+    return to;
+}
+
+static inline uint64_t to_zigzag(uint64_t bits) { return bits << 1 ^ (bits >> 63 ? UINT64_MAX : 0); }
+
+/* A field begins with its tag. Those without one are elements of packed ones. */
+static inline uint8_t *store_tag(uint8_t *to, uint32_t tag) { return tag ? store_varint(to, tag) : to; }
+
+/* A field that has no presence is left out if it is zero or empty: `is_kept` is false for these. */
+static inline bool write_varint(struct output *output, uint32_t tag, uint64_t value, bool is_kept) {
+    if (!value && !is_kept) return true;
+    if (!has_room(output, LONGEST_TAG + LONGEST_VARINT)) return false;
+    uint8_t *to = store_tag(output->data + output->size, tag);
+    output->size = (size_t)(store_varint(to, value) - output->data);
+    return true;
+}
+
+static inline bool write_fixed(struct output *output, uint32_t tag, uint64_t bits, unsigned size, bool is_kept) {
+    if (!bits && !is_kept) return true;
+    if (!has_room(output, LONGEST_TAG + size)) return false;
+    uint8_t *to = store_tag(output->data + output->size, tag);
+    store_little_endian(to, bits, size);
+    output->size = (size_t)(to + size - output->data);
+    return true;
+}
+
+static inline bool write_bytes(struct output *output, uint32_t tag, const struct value *value, bool is_kept) {
+    if (!value->size && !is_kept) return true;
+    if (!has_room(output, LONGEST_TAG + LONGEST_SIZE + (size_t)value->size)) return false;
+    uint8_t *to = store_varint(store_tag(output->data + output->size, tag), value->size);
+    if (value->size) memcpy(to, value->bytes, value->size);
+    output->size = (size_t)(to + value->size - output->data);
+    return true;
+}
+
+/* A message within, or packed elements, from its tag on. */
+struct opened {
+    size_t tag, content; /* where these begin */
+    bool is_kept;        /* also if it is empty */
+};
+
+static inline bool write_open(struct output *output, uint32_t tag, bool is_kept, struct opened *opened) {
+    if (!has_room(output, LONGEST_TAG + 1)) return false;
+    uint8_t *to = store_tag(output->data + output->size, tag);
+    *opened = (struct opened){output->size, (size_t)(to + 1 - output->data), is_kept};
+    output->size = opened->content;
+    return true;
+}
+
+static inline bool write_close(struct output *output, const struct opened *opened) {
+    size_t size = output->size - opened->content;
+    if (!size && !opened->is_kept) {
+        output->size = opened->tag;
+        return true;
+    }
+    uint8_t length[LONGEST_VARINT];
+    size_t more = (size_t)(store_varint(length, size) - length) - 1; /* bytes of the length than were left for it */
+    if (!has_room(output, more)) return false;
+    uint8_t *content = output->data + opened->content;
+    if (more) memmove(content + more, content, size);
+    memcpy(content - 1, length, 1 + more);
+    output->size += more;
+    return true;
+}
+
+#endif

@@ -1,0 +1,74 @@
+"""What is open for a program, as the carrier's arrays refer to it."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
+from router.compiler.program import Handler, TargetPlan
+from router.net.udp import Listener
+
+
+class Names:
+    """Numbers for names, in both directions. A name keeps its number as long as the process lives."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+        self._names: list[str] = []
+
+    def number(self, name: str) -> int:
+        if name not in self._numbers:
+            self._numbers[name] = len(self._names)
+            self._names.append(name)
+        return self._numbers[name]
+
+    def name(self, number: int) -> str:
+        return self._names[number]
+
+
+class Publication(Protocol):
+    """What `ros.endpoints.Publication` is. Several threads may publish at a time, until it is closed."""
+
+    @property
+    def address(self) -> int: ...
+
+    @property
+    def wanted(self) -> ctypes.Array[Any]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class PartTargets:
+    """The targets of a route that one thread serves, and the ring by which it gets the messages.
+
+    `is_native`: they are topics, and the native thread publishes on them.
+    """
+
+    ring: int
+    targets: Sequence[TargetPlan]
+    is_always_wanted: bool
+    is_native: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Outlets:
+    """What is open for a program. Pointers are addresses of C structures.
+
+    `senders` are by endpoint, `publications` by topic. `feeds(route, names)` returns the deadmen that a command feeds
+    (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`. `carried(handler)` are
+    the targets that the receive thread serves, `parts(handler)` all others. Without `boards`, endpoints that are
+    boards get everything.
+    """
+
+    listeners: Mapping[str, Listener]
+    senders: Mapping[str, int]
+    publications: Mapping[str, Publication]
+    feeds: Callable[[str, Sequence[str]], Sequence[tuple[int, bool]]]
+    limit: Callable[[Handler, TargetPlan], c.Limit]
+    carried: Callable[[Handler], Sequence[TargetPlan]]
+    parts: Callable[[Handler], Sequence[PartTargets]]
+    names: Names
+    boards: NativeBoards | None = None

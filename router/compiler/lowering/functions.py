@@ -1,0 +1,234 @@
+"""The functions of the language, and the checks of `conversion`, as operations."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from router.compiler.expressions.functions import NS_PER_MILLISECOND, NS_PER_SECOND
+from router.compiler.expressions.kinds import (
+    BoolKind,
+    EnumKind,
+    FloatKind,
+    IntKind,
+    StringKind,
+)
+from router.compiler.expressions.tree import Binary, Call, Choice, Constant, Listed
+from router.compiler.expressions.tree import Node as Tree
+from router.compiler.lowering import lists
+from router.compiler.lowering.numbers import INT64, bounds, fitted, is_unsigned, signs, to_real
+from router.compiler.lowering.operations import (
+    DROP,
+    MAX_DATAGRAM,
+    WANT,
+    Code,
+    Compared,
+    Op,
+    Operation,
+    Relation,
+    code,
+    integer,
+    keep,
+    load,
+    real,
+    text,
+)
+
+if TYPE_CHECKING:
+    from router.compiler.lowering.expressions import Lowering
+
+_OF_REALS = {
+    "sqrt": Op.SQRT, "sin": Op.SIN, "cos": Op.COS, "tan": Op.TAN, "atan2": Op.ATAN2, "hypot": Op.HYPOT,
+    "float32": Op.FLOAT32,
+}  # fmt: skip
+_ROUNDINGS = {"round": Op.ROUND, "trunc": Op.TRUNCATE, "floor": Op.FLOOR, "ceil": Op.CEIL}
+_FACTORS = {"radians": math.pi / 180, "degrees": 180 / math.pi}
+_TIMES = {"time_from_seconds": NS_PER_SECOND, "time_from_milliseconds": NS_PER_MILLISECOND}
+_OF_THREE = {"clamp": (Op.CLAMP, Op.REAL_CLAMP), "wrap": (Op.WRAP, None)}
+EXTREMES = {"min": (Op.LEAST, Op.REAL_LEAST), "max": (Op.GREATEST, Op.REAL_GREATEST)}
+"""Of integers and of real numbers."""
+
+_LONGEST_DECIMAL, _LONGEST_DIGITS = 20, 1 + 309 + 1 + 17
+"""Characters of an integer, and of a double with 17 decimals."""
+
+
+def called(lowering: Lowering, node: Call) -> Code:
+    """What puts the result of a call on the stack."""
+    name, first = node.function, node.arguments[0]
+    if name in EXTREMES:
+        return _extreme(lowering, node)
+    if name in _OF_REALS:
+        return code(*map(lowering.real, node.arguments), Operation(_OF_REALS[name]))
+    if name in _ROUNDINGS:
+        made = lowering.value(first)
+        return code(made, Operation(_ROUNDINGS[name])) if isinstance(first.kind, FloatKind) else made
+    if name in _FACTORS:
+        return code(lowering.real(first), real(_FACTORS[name]), Operation(Op.REAL_MULTIPLY))
+    if name in _TIMES:
+        return _time(lowering, first, _TIMES[name])
+    if name in _OF_THREE:
+        return _between(lowering, node)
+    return _OTHERS[name](lowering, node)
+
+
+# ---- numbers
+
+
+def _extreme(lowering: Lowering, node: Call) -> Code:
+    of_integers, of_reals = EXTREMES[node.function]
+    if len(node.arguments) == 1:
+        return lists.extreme(lowering, node, of_integers, of_reals)
+    first, *others = node.arguments
+    if isinstance(node.kind, FloatKind):
+        return code(lowering.real(first), *(code(lowering.real(each), Operation(of_reals)) for each in others))
+    made, kind = lowering.value(first), first.kind
+    pick = min if of_integers is Op.LEAST else max
+    for each in others:
+        (low, high), (low_too, high_too) = bounds(kind), bounds(each.kind)
+        result = IntKind(pick(low, low_too), pick(high, high_too))
+        made = code(made, lowering.value(each), Operation(of_integers, flag=signs(result, kind, each.kind)))
+        kind = result
+    return made
+
+
+def _between(lowering: Lowering, node: Call) -> Code:
+    """clamp() and wrap()."""
+    of_integers, of_reals = _OF_THREE[node.function]
+    if isinstance(node.kind, FloatKind):
+        assert of_reals is not None  # noqa: S101 - wrap() takes integers
+        return code(*map(lowering.real, node.arguments), Operation(of_reals))
+    flag = signs(node.kind, *(each.kind for each in node.arguments))
+    return code(*map(lowering.value, node.arguments), Operation(of_integers, flag=flag))
+
+
+def _fit(lowering: Lowering, node: Call) -> Code:
+    first, low, high = node.arguments
+    assert isinstance(low, Constant)  # noqa: S101 - as `tree.CHECKS` says
+    assert isinstance(high, Constant)  # noqa: S101
+    return fitted(lowering.value(first), first.kind, IntKind(int(low.value), int(high.value)))
+
+
+def _time(lowering: Lowering, node: Tree, factor: int) -> Code:
+    """Nanoseconds; what has more than 64 bits is no time."""
+    if isinstance(node.kind, FloatKind):
+        return code(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
+    flag = signs(IntKind(*INT64), node.kind)
+    return code(lowering.value(node), integer(factor), Operation(Op.CHECKED_MULTIPLY, flag=flag))
+
+
+def _absolute(lowering: Lowering, node: Call) -> Code:
+    (first,) = node.arguments
+    made = lowering.value(first)
+    if isinstance(node.kind, FloatKind):
+        return code(to_real(made, first.kind), Operation(Op.REAL_ABSOLUTE))
+    return code(made, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else made
+
+
+def _seconds(lowering: Lowering, node: Call) -> Code:
+    return code(lowering.real(node.arguments[0]), real(NS_PER_SECOND), Operation(Op.REAL_DIVIDE))
+
+
+# ---- enums
+
+
+def _named(lowering: Lowering, node: Call) -> Code:
+    """The number of a name. Another text is refused."""
+    assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
+    slot = lowering.names.temporary()
+    found: Code = (integer(0), WANT, integer(0))
+    for name, number in reversed(node.kind.enum.values):
+        is_it = load(slot), text(name.encode()), Operation(Op.COMPARE, int(Compared.TEXTS), flag=Relation.EQUAL)
+        found = code(is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found)
+    return code(lowering.value(node.arguments[0]), keep(slot), DROP, found)
+
+
+def _member(lowering: Lowering, node: Call) -> Code:
+    """A number of a closed enum. Another one is refused."""
+    assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
+    numbers = sorted({number for _, number in node.kind.enum.values})
+    data = struct.pack(f"<{len(numbers)}i", *numbers)
+    return code(lowering.value(node.arguments[0]), Operation(Op.MEMBER, size=len(numbers), data=data))
+
+
+# ---- text and bytes
+
+
+def longest(node: Tree) -> int:
+    """Bytes of a text, at the most. That of a ROS message may have more: then it is refused where it does not fit."""
+    match node:
+        case Constant(value=str(value)):
+            return len(value.encode())
+        case Binary():
+            return longest(node.left) + longest(node.right)
+        case Choice():
+            return max(longest(node.body), longest(node.orelse))
+        case Call(function="str"):
+            is_text = isinstance(node.arguments[0].kind, StringKind)
+            return longest(node.arguments[0]) if is_text else _LONGEST_DECIMAL
+        case Call(function="text"):
+            return _LONGEST_DIGITS
+        case _:
+            return MAX_DATAGRAM
+
+
+def _str(lowering: Lowering, node: Call) -> Code:
+    (first,) = node.arguments
+    made = lowering.value(first)
+    if isinstance(first.kind, StringKind):
+        return made
+    if isinstance(first.kind, BoolKind):
+        yes, no = text(b"True"), text(b"False")
+        return code(made, Operation(Op.UNLESS, size=2), yes, Operation(Op.JUMP, size=1), no)
+    lowering.names.count_text(_LONGEST_DECIMAL, node.span)
+    return code(made, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
+
+
+def _text(lowering: Lowering, node: Call) -> Code:
+    number, digits = node.arguments
+    assert isinstance(digits, Constant)  # noqa: S101 - it is a literal
+    lowering.names.count_text(_LONGEST_DIGITS, node.span)
+    return code(lowering.real(number), Operation(Op.DIGITS, int(digits.value)))
+
+
+def _length(lowering: Lowering, node: Call) -> Code:
+    (first,) = node.arguments
+    if isinstance(first.kind, StringKind):
+        return code(lowering.value(first), Operation(Op.CHARACTERS))
+    return lists.length(lowering, first)
+
+
+def _fit_text(lowering: Lowering, node: Call) -> Code:
+    first, most = node.arguments
+    assert isinstance(most, Constant)  # noqa: S101 - as `tree.CHECKS` says
+    return code(lowering.value(first), Operation(Op.FIT_SIZE, number=int(most.value)))
+
+
+def _octets(lowering: Lowering, node: Call) -> Code:
+    (first,) = node.arguments
+    if isinstance(first, Listed) and all(isinstance(item, Constant) for item in first.items):
+        return (text(bytes(int(item.value) for item in first.items if isinstance(item, Constant))),)
+    made = lists.stored(lowering, first)
+    return made.code if made.is_octets else code(made.code, Operation(Op.OCTETS, flag=made.scalar))
+
+
+def _same(lowering: Lowering, node: Call) -> Code:
+    return lowering.value(node.arguments[0])
+
+
+_OTHERS: Mapping[str, Callable[[Lowering, Call], Code]] = {
+    "abs": _absolute,
+    "fit": _fit,
+    "float64": lambda lowering, node: lowering.real(node.arguments[0]),
+    "fit_text": _fit_text,
+    "int": _same,
+    "len": _length,
+    "member": _member,
+    "named": _named,
+    "octets": _octets,
+    "seconds": _seconds,
+    "str": _str,
+    "sum": lists.total,
+    "text": _text,
+}

@@ -1,0 +1,344 @@
+"""Lists: how they are gone through, computed element by element, and looked into.
+
+A list on the stack is either as it stands in the message, scalars in a row, or in cells. A loop takes the elements off
+copies of its lists, which it has in slots of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from router.compiler.expressions.kinds import (
+    OCTET,
+    BytesKind,
+    FloatKind,
+    Kind,
+    ListKind,
+    MessageKind,
+    StringKind,
+    TimeKind,
+    kind_of,
+)
+from router.compiler.expressions.tree import Call, Choice, Contains, Each, Element, Listed, Read, Relation, Variable
+from router.compiler.expressions.tree import Node as Tree
+from router.compiler.lowering.layout import Node
+from router.compiler.lowering.numbers import coerced, compare, signs
+from router.compiler.lowering.operations import (
+    DROP,
+    EQUAL,
+    SIZE,
+    WANT,
+    Code,
+    Op,
+    Operation,
+    Scalar,
+    Slot,
+    code,
+    integer,
+    keep,
+    load,
+    real,
+    repeat,
+)
+
+if TYPE_CHECKING:
+    from router.compiler.lowering.expressions import Lowering
+
+
+_MOST_STACKED = 32
+"""Elements of a literal that are on the stack at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A list, which `code` puts on the stack, and how it is stored.
+
+    `element` is the kind of its elements. If they are messages, as times of ROS are, they are read into nodes like
+    `message`. `is_unchecked` text may be something else than UTF-8.
+    """
+
+    code: Code
+    scalar: Scalar
+    element: Kind | None
+    message: Node | None = None
+    is_unchecked: bool = False
+
+    @property
+    def is_octets(self) -> bool:
+        return self.scalar is Scalar.UINT8
+
+
+def stored(lowering: Lowering, node: Tree) -> Stored:
+    """A list or bytes as a value."""
+    match node:
+        case Read() if isinstance(node.kind, ListKind):
+            return _read(lowering, node)
+        case Listed():
+            return _listed(lowering, node)
+        case Each():
+            return _computed(lowering, node)
+        case Choice():
+            return _chosen(lowering, node)
+        case _:
+            assert isinstance(node.kind, BytesKind)  # noqa: S101 - nothing else gives a list
+            return Stored(lowering.value(node), Scalar.UINT8, kind_of(OCTET))
+
+
+def are_messages(node: Tree) -> bool:
+    """Whether the elements of a list are read from messages, as those of a field with times are."""
+    match node:
+        case Read():
+            return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
+        case Listed() | Choice():
+            return isinstance(node.kind, ListKind) and isinstance(node.kind.element, MessageKind)
+        case _:
+            return False
+
+
+def _read(lowering: Lowering, node: Read) -> Stored:
+    before, holder = lowering.message(node.holder)
+    assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
+    element = node.kind.element
+    message = holder.inner(node.field) if isinstance(element, (MessageKind, TimeKind)) else None
+    is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
+    made = code(before, load(holder.value(node.field)))
+    return Stored(made, holder.stored(node.field), element, message, is_unchecked)
+
+
+def _listed(lowering: Lowering, node: Listed) -> Stored:
+    element = node.kind.element
+    items = [code(lowering.value(item), *_as(item.kind, element)) for item in node.items]
+    message: Node | None = None
+    if isinstance(element, MessageKind):
+        message = Node(element.type, None, "[].")  # only those of ROS are values
+    if len(items) <= _MOST_STACKED:
+        return Stored(code(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
+    made = lowering.names.temporary()
+    appended = (code(item, Operation(Op.APPEND, made)) for item in items)
+    return Stored(code(_begun(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
+
+
+def _begun(made: Slot) -> Code:
+    """An empty list in a slot."""
+    return Operation(Op.LIST, size=0), keep(made), DROP
+
+
+def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
+    return coerced((), kind, element) if element is not None else ()
+
+
+def _computed(lowering: Lowering, node: Each) -> Stored:
+    made = lowering.names.temporary()
+
+    def append() -> Code:
+        element = node.kind.element
+        assert element is not None  # noqa: S101 - it is computed
+        return code(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
+
+    filled = code(_begun(made), looped(lowering, node.lists, append, keeps=True), load(made))
+    return Stored(filled, Scalar.IN_CELLS, node.kind.element)
+
+
+def _chosen(lowering: Lowering, node: Choice) -> Stored:
+    """One of two lists: stored in the same way, with elements of the same kind."""
+    from router.compiler.lowering.expressions import choice
+
+    body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
+    if isinstance(node.kind, ListKind) and node.kind.element is not None:
+        body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
+    if body.scalar is not orelse.scalar:
+        body, orelse = map(_in_cells, (body, orelse))
+    made = choice(lowering.value(node.test), body.code, orelse.code)
+    return replace(body if body.element is not None else orelse, code=made)
+
+
+def _in_cells(values: Stored) -> Stored:
+    if values.scalar is Scalar.IN_CELLS:
+        return values
+    unpacked = code(values.code, Operation(Op.UNPACK, flag=values.scalar))
+    return replace(values, code=unpacked, scalar=Scalar.IN_CELLS)
+
+
+def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
+    """A list with its elements as values of `element`."""
+    kind = values.element
+    is_moment = isinstance(element, TimeKind) and values.message is not None
+    if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
+        return values
+    made, each = lowering.names.temporary(), lowering.names.temporary()
+    start = code(_begun(made), values.code, keep(each), SIZE)
+    taken, meaning = _taken(lowering, values, each)
+    one = lowering.time((), meaning) if isinstance(meaning, Node) else ()
+    body = code(taken, one, *_as(kind, element), Operation(Op.APPEND, made))
+    return Stored(code(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
+
+
+# ---- loops
+
+
+def looped(
+    lowering: Lowering, lists: Sequence[tuple[str, Tree]], body: Callable[[], Code], *, keeps: bool = False
+) -> Code:
+    """`body`, for the elements of `lists` side by side, each of which is a variable. It leaves the stack as it was."""
+    counted, each = gone_through(lowering, lists)
+    return code(counted, repeat(code_of_each(lowering, each, body), keeps=keeps))
+
+
+Taken = tuple[str, Stored, Slot]
+"""A variable, its list, and the slot with what is left of it."""
+
+
+def gone_through(lowering: Lowering, lists: Sequence[tuple[str, Tree]]) -> tuple[Code, list[Taken]]:
+    """What leaves the number of elements on the stack, once for all lists; those of different length are refused."""
+    made: Code = ()
+    taken: list[Taken] = []
+    for variable, values in lists:
+        of = stored(lowering, values)
+        slot = lowering.names.temporary()
+        made = code(made, of.code, keep(slot), SIZE)
+        if taken:
+            made = code(made, EQUAL, WANT, load(slot), SIZE)
+        taken.append((variable, of, slot))
+    return made, taken
+
+
+def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Code]) -> Code:
+    """What is done for the elements at one place of all lists."""
+    before: Code = ()
+    for variable, of, slot in taken:
+        one, node = _taken(lowering, of, slot)
+        meaning = node or lowering.names.temporary()
+        lowering.names.variables[variable] = meaning
+        before = code(before, one) if isinstance(meaning, Node) else code(before, one, keep(meaning), DROP)
+    return _without_a_detour(code(before, body()))
+
+
+def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Code, Node | None]:
+    """What takes an element off a list: it is on the stack, or if it is a message, in a node."""
+    taken = Operation(Op.NEXT, slot, flag=of.scalar)
+    if of.message is not None:
+        node = lowering.names.element(of.message)
+        return (taken, Operation(Op.ENTER, node)), node
+    return ((taken, Operation(Op.UTF8)) if of.is_unchecked else (taken,)), None
+
+
+def _without_a_detour(made: Code) -> Code:
+    """An element that is loaded once, at once, need not be kept."""
+    for index, operation in enumerate(made[:-2]):
+        if operation.kind is Op.KEEP:
+            slot = operation.slot
+            is_direct = made[index + 1].kind is Op.DROP and made[index + 2] == Operation(Op.LOAD, slot)
+            uses = sum(each.slot is slot for each in made)
+            return (*made[:index], *made[index + 3 :]) if is_direct and uses == 2 else made
+        if operation.kind not in (Op.NEXT, Op.UTF8):
+            break
+    return made
+
+
+# ---- elements
+
+
+def element(lowering: Lowering, node: Element) -> Code:
+    """A scalar, a text or bytes in a list; a message as an element of another list."""
+    of = _checked(lowering, stored(lowering, node.values))
+    return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
+
+
+def entered(lowering: Lowering, node: Element) -> tuple[Code, Node]:
+    """A message in a list, with its fields read."""
+    if isinstance(node.values, Listed):
+        return _entered_item(lowering, node.values, node.index)
+    of = stored(lowering, node.values)
+    assert of.message is not None  # noqa: S101 - said by the caller
+    made = lowering.names.element(of.message)
+    return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)), made
+
+
+def _entered_item(lowering: Lowering, values: Listed, index: int) -> tuple[Code, Node]:
+    """A message of a literal: others have to be there as well."""
+    reached = [lowering.message(item) for item in values.items]
+    others = [before for place, (before, _) in enumerate(reached) if place != index]
+    before, node = reached[index]
+    return code(*others, before), node
+
+
+def _checked(lowering: Lowering, of: Stored) -> Stored:
+    """A list whose texts are UTF-8, all of them."""
+    if not of.is_unchecked:
+        return of
+    slot = lowering.names.temporary()
+    body = Operation(Op.NEXT, slot, flag=of.scalar), Operation(Op.UTF8), DROP
+    return replace(of, code=code(of.code, keep(slot), SIZE, repeat(body), of.code), is_unchecked=False)
+
+
+# ---- whole lists
+
+
+def length(lowering: Lowering, node: Tree) -> Code:
+    if isinstance(node, Listed) and are_messages(node):
+        return code(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
+    return code(_checked(lowering, stored(lowering, node)).code, SIZE)
+
+
+def checked_list(lowering: Lowering, node: Tree) -> Stored:
+    """The list of `for_each`."""
+    return _checked(lowering, stored(lowering, node))
+
+
+def contains(lowering: Lowering, node: Contains) -> Code:
+    """Whether an element equals a value. All of them are evaluated."""
+    sought = lowering.names.temporary()
+    found = code(lowering.value(node.sought), keep(sought), DROP, integer(0))
+    again = (load(sought),)
+
+    def look(one: Code, kind: Kind) -> Code:
+        is_it = compare(Relation.EQUAL, one, again, kind, node.sought.kind)
+        return code(is_it, Operation(Op.EITHER))
+
+    if isinstance(node.values, Listed):
+        found = code(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
+    else:
+        found = code(found, _folded(lowering, node.values, look))
+    return code(found, Operation(Op.NOT)) if node.is_negated else found
+
+
+def total(lowering: Lowering, node: Call) -> Code:
+    """The sum, in order. Each partial sum of integers is checked."""
+    (values,) = node.arguments
+    is_real = isinstance(node.kind, FloatKind)
+
+    def add(one: Code, kind: Kind) -> Code:
+        if is_real:
+            return code(coerced(one, kind, node.kind), Operation(Op.REAL_ADD))
+        return code(one, Operation(Op.CHECKED_ADD, flag=signs(node.kind, node.kind, kind)))
+
+    return code(real(0.0) if is_real else integer(0), _folded(lowering, values, add))
+
+
+def extreme(lowering: Lowering, node: Call, of_integers: Op, of_reals: Op) -> Code:
+    """min() or max() of a list: it begins with the first element, and is refused if there is none."""
+    of = stored(lowering, node.arguments[0])
+    kind = of.element
+    assert kind is not None  # noqa: S101 - a number
+    whole, left = lowering.names.temporary(), lowering.names.temporary()
+    operator = of_reals if isinstance(kind, FloatKind) else of_integers
+    step = Operation(operator, flag=0 if isinstance(kind, FloatKind) else signs(kind, kind, kind))
+    first = code(of.code, keep(whole), Operation(Op.ELEMENT, flag=of.scalar))
+    rest = code(load(whole), keep(left), SIZE, repeat((Operation(Op.NEXT, left, flag=of.scalar), step)))
+    return coerced(code(first, rest), kind, node.kind)
+
+
+def _folded(lowering: Lowering, values: Tree, step: Callable[[Code, Kind], Code]) -> Code:
+    """Add each element to what is on the stack. A computed list is not made for that."""
+    if isinstance(values, Each):
+        each = values
+    else:
+        assert isinstance(values.kind, (ListKind, BytesKind))  # noqa: S101 - the checker has seen to it
+        kind = values.kind.element if isinstance(values.kind, ListKind) else kind_of(OCTET)
+        assert kind is not None  # noqa: S101 - it is compared or added
+        name = f"element {len(lowering.names.temporaries)}"
+        listed = values.kind if isinstance(values.kind, ListKind) else ListKind(kind)
+        each = Each(listed, values.span, ((name, values),), Variable(kind, values.span, name))
+    return looped(lowering, each.lists, lambda: step(lowering.value(each.element), each.element.kind))

@@ -1,0 +1,50 @@
+"""What names mean in the expressions of a target: messages, and values in slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Union
+
+from router.compiler.lowering.layout import Node
+from router.compiler.lowering.operations import MOST_TEXT, Slot
+from router.errors import Code, Diagnostic, SourceSpan
+
+Meaning = Union[Slot, Node]
+
+
+class TooLargeError(Exception):
+    """What the table asks for is more than a program can do; the finding says what, and where."""
+
+    def __init__(self, span: SourceSpan, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.diagnostic = Diagnostic(span, Code.TOO_LARGE, message, hint)
+
+
+@dataclass(slots=True)
+class Names:
+    """`variables` by name. Temporaries and elements are numbered with them in one layout.
+
+    `elements` are the nodes that elements of lists are read into, `joined` the bytes of text that are put together
+    outside of loops.
+    """
+
+    variables: dict[str, Meaning]
+    temporaries: list[Slot] = field(default_factory=list)
+    elements: list[Node] = field(default_factory=list)
+    joined: int = 0
+
+    def temporary(self) -> Slot:
+        self.temporaries.append(Slot(0))
+        return self.temporaries[-1]
+
+    def element(self, like: Node) -> Node:
+        """A new node for an element of a list, of which another one is given."""
+        self.elements.append(replace(like, wanted={}))
+        return self.elements[-1]
+
+    def count_text(self, most: int, span: SourceSpan) -> None:
+        """Raise TooLargeError if there is no room for so many bytes of text more."""
+        self.joined += most
+        if self.joined > MOST_TEXT:
+            message = f"the text that is put together here may have {self.joined} bytes, and at most {MOST_TEXT} fit"
+            raise TooLargeError(span, message, "join fewer fields")

@@ -1,0 +1,109 @@
+"""Numbers on the stack: signs, conversions, comparisons. The ranges of their kinds decide."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from router.compiler.expressions.kinds import (
+    INT32,
+    BoolKind,
+    BytesKind,
+    EnumKind,
+    FloatKind,
+    IntKind,
+    Kind,
+    StringKind,
+)
+from router.compiler.expressions.tree import Relation as TreeRelation
+from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer
+
+INT64 = -(1 << 63), (1 << 63) - 1
+
+
+def bounds(kind: Kind) -> tuple[int, int]:
+    """The range of an integer, which may stand for a bool, an enum's value or a time."""
+    match kind:
+        case IntKind(low=int(low), high=int(high)):
+            return low, high
+        case EnumKind():
+            return INT32.low, INT32.high
+        case BoolKind():
+            return 0, 1
+        case _:
+            return INT64
+
+
+def is_unsigned(kind: Kind) -> bool:
+    """Whether 64 bits are an unsigned integer: those beyond int64."""
+    return bounds(kind)[1] > INT64[1]
+
+
+def signs(result: Kind, *operands: Kind) -> int:
+    """The flag of an operation with integers."""
+    flags = (Sign.FIRST, Sign.SECOND, Sign.THIRD)
+    unsigned = sum(int(flag) for flag, kind in zip(flags, operands, strict=False) if is_unsigned(kind))
+    return unsigned + int(Sign.RESULT) * is_unsigned(result)
+
+
+def to_real(made: Code, kind: Kind) -> Code:
+    """A number as a real one."""
+    if isinstance(kind, FloatKind):
+        return made
+    return code(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
+
+
+def coerced(made: Code, kind: Kind, to: Kind) -> Code:
+    """A value of one kind as one of another kind, which holds both it and others."""
+    if isinstance(to, FloatKind):
+        return to_real(made, kind)
+    if isinstance(to, IntKind) and not isinstance(kind, BoolKind):
+        return fitted(made, kind, to) if is_unsigned(kind) and not is_unsigned(to) else made
+    return made
+
+
+def fitted(made: Code, kind: Kind, to: Kind) -> Code:
+    """An integer that is refused outside of the range of another kind."""
+    (low, high), (least, most) = bounds(kind), bounds(to)
+    if least <= low and high <= most:
+        return made
+    ends = IntKind(least, least), IntKind(most, most)
+    return code(made, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
+
+
+_RELATIONS: Mapping[TreeRelation, tuple[Relation, Relation]] = {
+    TreeRelation.EQUAL: (Relation.EQUAL, Relation.EQUAL),
+    TreeRelation.UNEQUAL: (Relation.UNEQUAL, Relation.UNEQUAL),
+    TreeRelation.LESS: (Relation.LESS, Relation.MORE),
+    TreeRelation.LESS_OR_EQUAL: (Relation.LESS_OR_EQUAL, Relation.MORE_OR_EQUAL),
+    TreeRelation.MORE: (Relation.MORE, Relation.LESS),
+    TreeRelation.MORE_OR_EQUAL: (Relation.MORE_OR_EQUAL, Relation.LESS_OR_EQUAL),
+}
+"""Of two values, and of the same two in the other order."""
+
+
+def compare(relation: TreeRelation, left: Code, right: Code, left_kind: Kind, right_kind: Kind) -> Code:
+    """Whether a relation holds, exactly. The operation wants an integer in front of a real number, and a signed one
+    in front of an unsigned one: so the right operand may be evaluated first.
+    """
+    straight, swapped = _RELATIONS[relation]
+    how = _compared(left_kind, right_kind)
+    if how is not None:
+        return code(left, right, Operation(Op.COMPARE, int(how), flag=straight))
+    how = _compared(right_kind, left_kind)
+    assert how is not None  # noqa: S101 - one of two orders is right
+    return code(right, left, Operation(Op.COMPARE, int(how), flag=swapped))
+
+
+def _compared(left: Kind, right: Kind) -> Compared | None:
+    """How two values are compared in this order; None if they are compared in the other one."""
+    if isinstance(left, (StringKind, BytesKind)):
+        return Compared.TEXTS
+    if isinstance(left, FloatKind):
+        return Compared.REALS if isinstance(right, FloatKind) else None
+    if isinstance(right, FloatKind):
+        return Compared.UNSIGNED_WITH_REAL if is_unsigned(left) else Compared.SIGNED_WITH_REAL
+    if not is_unsigned(left) and not is_unsigned(right):
+        return Compared.SIGNED_INTEGERS
+    if bounds(left)[0] >= 0 and bounds(right)[0] >= 0:
+        return Compared.UNSIGNED_INTEGERS
+    return None if is_unsigned(left) else Compared.SIGNED_WITH_UNSIGNED

@@ -1,0 +1,181 @@
+"""From the plan of a payload to the operations that write the envelope around it.
+
+The bytes are those of the protobuf library: fields by ascending number, what has no presence only if it is not zero.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+from router.compiler.lowering.expressions import Lowering
+from router.compiler.lowering.messages import Place, Placed, at, counted, each
+from router.compiler.lowering.numbers import to_real
+from router.compiler.lowering.operations import Code, Op, Operation, known
+from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.types.descriptors import container, message_of
+from router.types.protobuf import PayloadCase
+from router.types.wire import GROUP, GROUP_END, LEN, varint, wire_type_of
+
+_WRITES: Mapping[int, Op] = {
+    FieldDescriptor.TYPE_SINT32: Op.WRITE_ZIGZAG,
+    FieldDescriptor.TYPE_SINT64: Op.WRITE_ZIGZAG,
+    FieldDescriptor.TYPE_FIXED32: Op.WRITE_FIXED32,
+    FieldDescriptor.TYPE_SFIXED32: Op.WRITE_FIXED32,
+    FieldDescriptor.TYPE_FIXED64: Op.WRITE_FIXED64,
+    FieldDescriptor.TYPE_SFIXED64: Op.WRITE_FIXED64,
+    FieldDescriptor.TYPE_FLOAT: Op.WRITE_FLOAT,
+    FieldDescriptor.TYPE_DOUBLE: Op.WRITE_DOUBLE,
+    FieldDescriptor.TYPE_STRING: Op.WRITE_BYTES,
+    FieldDescriptor.TYPE_BYTES: Op.WRITE_BYTES,
+}
+"""By type of a field; all others are varints."""
+
+_CLOSE = Operation(Op.CLOSE)
+
+
+def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase) -> list[Placed]:
+    """The operations that write the envelope of a payload, each with its place."""
+    descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
+    place = Place(plan.span, "")
+    inside = _Writer(lowering).record(plan, descriptor, "")
+    return list(_merged(_delimited(case.number << 3 | LEN, inside, place)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Writer:
+    lowering: Lowering
+
+    def record(self, plan: Record, descriptor: Descriptor, path: str) -> Iterator[Placed]:
+        for member, made in sorted(plan.members, key=lambda each: each[0].number):
+            yield from self._field(made, descriptor.fields_by_name[member.name], f"{path}.{member.name}".lstrip("."))
+
+    def _field(self, made: Plan, to: FieldDescriptor, path: str) -> Iterator[Placed]:
+        place = Place(made.span, path)
+        match made:
+            case Leaf():
+                is_entry = container(to).GetOptions().map_entry
+                yield from self._leaf(made, to, place, is_always=to.has_presence or is_entry)
+            case Record():
+                yield from self._message(made, to, place)
+            case Items():
+                yield from self._items(made, to, place)
+            case Each():
+                yield from self._each(made, to, place)
+            case Unset():
+                pass
+
+    def _message(self, made: Record, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        inside = self.record(made, message_of(to), place.field)
+        if to.type != FieldDescriptor.TYPE_GROUP:
+            yield from _delimited(_tag(to), inside, place)
+            return
+        yield from at(place, known(varint(to.number << 3 | GROUP)))
+        yield from inside
+        yield from at(place, known(varint(to.number << 3 | GROUP_END)))
+
+    def _items(self, made: Items, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        elements = (placed for item in made.items for placed in self._element(item, to, place.field))
+        if to.is_packed:
+            yield from _packed(to, elements, place)
+        else:
+            yield from elements
+
+    def _each(self, made: Each, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        count, taken = counted(self.lowering, made)
+        loop = each(self.lowering, taken, place, lambda: list(_merged(self._element(made.element, to, place.field))))
+        elements = [*at(place, count), *loop]
+        yield from _packed(to, elements, place) if to.is_packed else elements
+
+    def _element(self, made: Plan, to: FieldDescriptor, path: str) -> Iterable[Placed]:
+        """An element of a repeated field: zero is written as well."""
+        place = Place(made.span, path)
+        if isinstance(made, Leaf):
+            return self._leaf(made, to, place, is_always=True)
+        assert isinstance(made, Record)  # noqa: S101 - there are no lists in lists
+        return self._message(made, to, place)
+
+    def _leaf(self, made: Leaf, to: FieldDescriptor, place: Place, *, is_always: bool) -> list[Placed]:
+        tag = 0 if to.is_packed else _tag(to)
+        if made.constant is not None:
+            data = _encoded(made.constant, to)
+            is_written = is_always or _is_set(made.constant, to)
+            return at(place, known(varint(tag) * bool(tag) + data)) if is_written else []
+        write = _WRITES.get(to.type, Op.WRITE_VARINT)
+        return at(place, self._value(made, write), Operation(write, flag=is_always, size=tag))
+
+    def _value(self, made: Leaf, write: Op) -> Code:
+        value = self.lowering.value(made.node)
+        return to_real(value, made.node.kind) if write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE) else value
+
+
+def _tag(to: FieldDescriptor) -> int:
+    return to.number << 3 | wire_type_of(to)
+
+
+# ---- known bytes
+
+
+def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
+    """A constant without its tag."""
+    write = _WRITES.get(to.type, Op.WRITE_VARINT)
+    if write is Op.WRITE_FLOAT:
+        return struct.pack("<f", value)
+    if write is Op.WRITE_DOUBLE:
+        return struct.pack("<d", value)
+    if isinstance(value, str):
+        return varint(len(value.encode())) + value.encode()
+    number = int(value)
+    if write is Op.WRITE_FIXED32:
+        return (number & 0xFFFF_FFFF).to_bytes(4, "little")
+    if write is Op.WRITE_FIXED64:
+        return (number & _ALL_BITS).to_bytes(8, "little")
+    return varint((number << 1 ^ number >> 63 if write is Op.WRITE_ZIGZAG else number) & _ALL_BITS)
+
+
+_ALL_BITS = (1 << 64) - 1
+
+
+def _is_set(value: bool | float | str, to: FieldDescriptor) -> bool:
+    """Whether a constant is not zero, which has no presence. Minus zero is not."""
+    is_real = _WRITES.get(to.type) in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
+    return any(_encoded(value, to)) if is_real else bool(value)
+
+
+def _delimited(tag: int, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
+    """A message, with its tag and its length in front."""
+    yield from _lengthened(tag, list(_merged(inside)), place, is_always=True)
+
+
+def _packed(to: FieldDescriptor, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
+    """Packed elements, if there are any."""
+    yield from _lengthened(to.number << 3 | LEN, list(_merged(inside)), place, is_always=False)
+
+
+def _lengthened(tag: int, inside: list[Placed], place: Place, *, is_always: bool) -> Iterator[Placed]:
+    """What has a length in front, which is known if all of it is."""
+    data = b"".join(operation.data for operation, _ in inside)
+    if any(operation.kind is not Op.KNOWN for operation, _ in inside):
+        yield Operation(Op.OPEN, flag=is_always, size=tag), place
+        yield from inside
+        yield _CLOSE, place
+    elif data or is_always:
+        yield known(varint(tag) + varint(len(data)) + data), place
+
+
+def _merged(placed: Iterable[Placed]) -> Iterator[Placed]:
+    """Join known bytes that stand beside each other."""
+    last: Placed | None = None
+    for operation, place in placed:
+        if operation.kind is Op.KNOWN:
+            last = (operation, place) if last is None else (known(last[0].data + operation.data), last[1])
+            continue
+        if last is not None:
+            yield last
+            last = None
+        yield operation, place
+    if last is not None:
+        yield last

@@ -1,0 +1,207 @@
+"""What the programs of one layout have in common: the message that they read, its slots and nodes, and their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from google.protobuf.descriptor import Descriptor
+
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, MESSAGE, RECEIVED_AT, SOURCE, Read
+from router.compiler.expressions.tree import Node as Tree
+from router.compiler.lowering import lists
+from router.compiler.lowering.cdr import cdr_message
+from router.compiler.lowering.expressions import Lowering, chained
+from router.compiler.lowering.layout import (
+    MOST_NODES_DEEP,
+    Layout,
+    Node,
+    TooManyListsError,
+    cdr_layout,
+    protobuf_layout,
+)
+from router.compiler.lowering.messages import Placed
+from router.compiler.lowering.names import Meaning, Names, TooLargeError
+from router.compiler.lowering.operations import (
+    MAX_DATAGRAM,
+    MOST_LOOPS,
+    MOST_OPEN,
+    MOST_STACKED,
+    NONE,
+    Code,
+    Op,
+    Operation,
+    Scalar,
+    Slot,
+    depths,
+    most_executed,
+    nesting,
+)
+from router.compiler.lowering.protobuf import protobuf_message
+from router.compiler.plan import Record
+from router.errors import SourceSpan
+from router.types.model import MessageType
+from router.types.protobuf import Envelope, PayloadCase
+
+MOST_CONDITION_OPERATIONS = 1 << 17
+"""Of all that a destination's `when` may execute for a datagram: less than a millisecond of the receive thread."""
+
+_MOST_SLOTS = NONE
+
+
+class Condition(NamedTuple):
+    """`when` as operations, and where the table says so; both empty where there is none."""
+
+    code: Code
+    place: str
+
+
+class Message(NamedTuple):
+    """The operations that write a message, and the place of each."""
+
+    code: Code
+    places: tuple[str, ...]
+
+
+@dataclass
+class _Source:
+    """A message that programs read. `root` is its node."""
+
+    root: Node
+    topic: str = ""
+    temporaries: list[Slot] = field(default_factory=list)
+    elements: list[Node] = field(default_factory=list)
+    variables: dict[str, Meaning] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        given = Slot(0, RECEIVED_AT), Slot(self.topic.encode(), SOURCE)
+        self.temporaries += given
+        self.variables |= {MESSAGE: self.root, RECEIVED_AT: given[0], SOURCE: given[1]}
+
+    def lowering(self) -> Lowering:
+        """That of one target: what it names itself is its own."""
+        return Lowering(Names(dict(self.variables), self.temporaries, self.elements))
+
+    def condition(
+        self, lowering: Lowering, conditions: Sequence[Tree | None], *, is_bounded: bool = False
+    ) -> Condition:
+        """All of several conditions. `is_bounded`: it is evaluated in the receive thread."""
+        given = [each for each in conditions if each is not None]
+        if not given:
+            return Condition((), "")
+        code = chained(Op.AND, [lowering.value(each) for each in given])
+        _want_small([(operation, given[-1].span) for operation in code])
+        if is_bounded and (most := most_executed(code)) > MOST_CONDITION_OPERATIONS:
+            message = (
+                f"this condition may take {most} operations for a message, and a destination's `when` at most "
+                f"{MOST_CONDITION_OPERATIONS}: a list counts with {MAX_DATAGRAM} elements"
+            )
+            raise TooLargeError(given[-1].span, message, "look into fewer lists, or into one only")
+        return Condition(code, ", or ".join(f"{each.span}: when" for each in given))
+
+
+class Datagram(_Source):
+    """A payload in its envelope, from UDP."""
+
+    def __init__(self, case: PayloadCase, envelope: Envelope) -> None:
+        descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
+        around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]
+        super().__init__(Node(case.type, descriptor))
+        self._case, self._envelope = case.name, around
+
+    def published(self, lowering: Lowering, plan: Record) -> Message:
+        """The ROS message of a topic."""
+        return _message(cdr_message(lowering, plan))
+
+    def layout(self, span: SourceSpan) -> Layout:
+        """Of all programs that have been made. Raises TooLargeError for one that is too large."""
+        for node in (self.root, *self.elements):
+            if (depth := node.depth()) > MOST_NODES_DEEP - 2:
+                message = f"what is read here is {depth} messages deep, and at most {MOST_NODES_DEEP - 2} are gone into"
+                raise TooLargeError(span, message, "read what is less deep")
+        made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
+        _want_room(made, span)
+        return made
+
+
+class RosMessage(_Source):
+    """A message from a topic of ROS."""
+
+    def __init__(self, declared: MessageType, topic: str) -> None:
+        super().__init__(Node(declared, None), topic)
+
+    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> Message:
+        """The envelope for a destination."""
+        return _message(protobuf_message(lowering, plan, case))
+
+    def stamp(self, node: Tree) -> tuple[Slot, Slot]:
+        """The slots of the seconds and nanoseconds of a field with a time."""
+        assert isinstance(node, Read)  # noqa: S101 - it is a field of the message
+        _, moment = self.lowering().message(node)
+        seconds, nanoseconds = moment.type.fields
+        return moment.value(seconds), moment.value(nanoseconds)
+
+    def for_each(self, node: Tree) -> Elements:
+        """The list of `for_each`. From now on, expressions can name `item`, `index` and `count`."""
+        lowering = self.lowering()
+        of = lists.checked_list(lowering, node)
+        _want_small([(operation, node.span) for operation in of.code])
+        item: Meaning = Slot(0, ITEM) if of.message is None else lowering.names.element(of.message)
+        index, count = Slot(0, INDEX), Slot(0, COUNT)
+        if isinstance(item, Node):
+            item.path = f"{ITEM}."
+        self.temporaries += [each for each in (item, index, count) if isinstance(each, Slot)]
+        self.variables |= {ITEM: item, INDEX: index, COUNT: count}
+        return Elements(of.code, of.scalar, item, index, count)
+
+    def layout(self, span: SourceSpan) -> Layout:
+        """Of all programs that have been made. Raises TooLargeError for one that is too large."""
+        try:
+            made = cdr_layout(self.temporaries, self.root, self.elements)
+        except TooManyListsError as error:
+            raise TooLargeError(span, str(error), "take another type of message") from None
+        _want_room(made, span)
+        return made
+
+
+@dataclass(frozen=True)
+class Elements:
+    """A list on the stack, how it is stored, and what becomes of each element."""
+
+    code: Code
+    scalar: Scalar
+    item: Meaning
+    index: Slot
+    count: Slot
+
+
+def _message(placed: Sequence[Placed]) -> Message:
+    _want_small([(operation, place.span) for operation, place in placed])
+    return Message(tuple(operation for operation, _ in placed), tuple(str(place) for _, place in placed))
+
+
+# ---- limits
+
+
+def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
+    """Raise TooLargeError for what is deeper than a program can be."""
+    operations = [operation for operation, _ in placed]
+    for (_, span), depth in zip(placed, depths(operations), strict=True):
+        if depth > MOST_STACKED:
+            message = f"this holds more than {MOST_STACKED} values at a time"
+            raise TooLargeError(span, message, "write it with fewer brackets in brackets")
+    loops = nesting(operations, Op.REPEAT, Op.AGAIN)
+    if loops > MOST_LOOPS:
+        message = f"this goes through {loops} lists within each other, and at most {MOST_LOOPS} are"
+        raise TooLargeError(placed[0][1], message, "fill a message with fewer lists in lists")
+    if (opened := nesting(operations, Op.OPEN, Op.CLOSE)) > MOST_OPEN:
+        message = f"this writes {opened} messages within each other, and at most {MOST_OPEN} are"
+        raise TooLargeError(placed[0][1], message, "fill a message with fewer messages in messages")
+
+
+def _want_room(layout: Layout, span: SourceSpan) -> None:
+    most = max(len(layout.defaults), len(layout.nodes))
+    if most > _MOST_SLOTS:
+        message = f"these mappings use {most} values, and at most {_MOST_SLOTS} have room"
+        raise TooLargeError(span, message, "make several routes of it, or map less")

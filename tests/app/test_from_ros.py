@@ -1,0 +1,191 @@
+"""Commands from ROS through a whole router: by the carrier where it can, through reloads, and whatever Python does."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+if os.environ.get("ROUTER_CARRIER") == "python":
+    pytest.skip("is about the carrier", allow_module_level=True)
+
+from router.app import Router
+from router.app.native_datapath import NativeWiring
+from router.carrier.from_ros import FromRosThread
+from router.threads import StuckError
+from tests.app.conftest import BRAKE, Site
+from tests.ros.peers import Publisher, wait_until
+
+TYPE = "comms/msg/DrivingBoardMotorMessage"
+TIMEVAL = struct.Struct("@ll")
+COUNT = 400
+
+
+def drive(
+    *, timeout: str = "30s", fields: str = "auto", more: str = "", depth: int = 1000, send: str = "brake: true"
+) -> str:
+    return f"""\
+  drive_motor:
+    source: {{topic: drive_motor, type: {TYPE}, queue_depth: {depth}}}
+    fields: {fields}
+    destinations: [{{endpoint: basestation{more}}}]
+    ttl: 30s
+    deadman: {{timeout: {timeout}, send: {{manual_brake: {{{send}}}}}, to: [basestation], repeat: 100ms}}
+"""
+
+
+IN_PYTHON = drive(more=", max_rate: 1000000 Hz, on_limit: latest")
+NOBODY = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
+
+
+def command(number: int) -> bytes:
+    return b"\0\1\0\0" + struct.pack("<ff", number, 1)
+
+
+def numbers(site: Site, until: int) -> list[int]:
+    """The numbers of the commands that the board gets, up to this one."""
+    got: list[int] = []
+    while not got or got[-1] != until:
+        datagram = site.basestation.recv(1000)
+        if not datagram.startswith(BRAKE[:2]):
+            got.append(int(struct.unpack_from("<f", datagram, 3)[0]))
+    return got
+
+
+def is_carried(router: Router) -> bool:
+    wiring = router._runtime.wiring
+    assert isinstance(wiring, NativeWiring)
+    return "drive_motor" not in wiring.take
+
+
+def thread_names() -> list[str]:
+    return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    with closing(Publisher("drive_motor", TYPE)) as made:
+        yield made
+
+
+def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher) -> None:
+    python, process = ctypes.PyDLL(None), publisher.process  # calls through PyDLL keep the interpreter lock
+    buffer, at_start = ctypes.create_string_buffer(1000), len(BRAKE)
+    with site.router(drive()) as router:
+        assert is_carried(router)
+        assert "ros commands" in thread_names()
+        assert publisher.line() == "matched"
+        assert len(site.basestation.recv(1000)) == at_start
+        site.basestation.settimeout(None)
+        patience = TIMEVAL.pack(20, 0)
+        site.basestation.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
+        process.send_signal(signal.SIGSTOP)
+        publisher.publish([command(7)])
+        python.kill(process.pid, signal.SIGCONT)
+        size = python.recv(site.basestation.fileno(), buffer, len(buffer), 0)
+        assert struct.unpack_from("<f", buffer.raw[:size], 3) == (7,)
+        wait_until(lambda: router.total("datagrams_sent") == 1)
+        assert router.total("messages_received") == 1
+        site.basestation.settimeout(10)
+    assert site.basestation.recv(1000) == BRAKE  # the last word
+
+
+def test_commands_stay_whole_and_in_order_while_tables_change(site: Site, publisher: Publisher) -> None:
+    tables = [
+        drive(),
+        IN_PYTHON,
+        drive(more=", max_rate: 1000000 Hz"),
+        drive(timeout="40s"),
+        IN_PYTHON.replace("30s", "20s"),
+        drive(),
+    ]
+    with site.router(drive()) as router:
+        assert publisher.line() == "matched"
+        sent = 0
+        for table in tables:
+            publisher.publish(map(command, range(sent + 1, sent + COUNT + 1)))
+            sent += COUNT
+            site.write(table)
+            result = router.reload()
+            assert result.ok, result
+            assert is_carried(router) == ("latest" not in table)
+        assert numbers(site, sent) == list(range(1, sent + 1))
+        wait_until(lambda: router.total("datagrams_sent") == sent)
+        assert router.total("messages_received") == sent
+        assert router.total("messages_dropped") == 0
+        assert router.total("deadman_trips") == 0
+
+
+def test_none_is_lost_where_another_subscription_takes_over(site: Site, publisher: Publisher) -> None:
+    with site.router(drive()) as router:
+        assert publisher.line() == "matched"
+        sent = 0
+        for table in (drive(depth=900), IN_PYTHON, drive(depth=900), drive(depth=800)):
+            publisher.publish(map(command, range(sent + 1, sent + COUNT + 1)))
+            sent += COUNT
+            site.write(table)
+            assert router.reload().ok
+        assert sorted(set(numbers(site, sent))) == list(range(1, sent + 1))
+
+
+def test_a_topic_comes_and_goes(site: Site) -> None:
+    with site.router(NOBODY) as router:
+        for _ in range(2):
+            site.write(drive())
+            assert router.reload().ok
+            with closing(Publisher("drive_motor", TYPE)) as publisher:
+                assert publisher.line() == "matched"
+                publisher.publish([command(1), command(2)])
+                assert numbers(site, 2) == [1, 2]
+                site.write(NOBODY)
+                assert router.reload().ok
+                while site.basestation.recv(1000) != BRAKE:  # the deadman that goes has the last word
+                    pass
+
+
+def test_a_reload_is_refused_while_the_middleware_holds_the_thread(
+    site: Site, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve, is_stuck = FromRosThread.serve, True
+
+    def stuck_once(self: FromRosThread, *arguments: object) -> None:
+        nonlocal is_stuck
+        if is_stuck:
+            is_stuck = False
+            raise StuckError("the thread for commands from ROS is stuck in the middleware: try again")
+        serve(self, *arguments)  # type: ignore[arg-type]  # those of the router
+
+    with site.router(drive()) as router:
+        assert publisher.line() == "matched"
+        monkeypatch.setattr(FromRosThread, "serve", stuck_once)
+        site.write(IN_PYTHON)
+        result = router.reload()
+        assert not result.ok
+        assert result.text.endswith("try again")
+        assert is_carried(router)
+        publisher.publish([command(1)])
+        assert numbers(site, 1) == [1]
+        assert router.reload().ok
+        assert not is_carried(router)
+
+
+def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
+    site: Site, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with site.router(drive()) as router, capture_logs() as logs:
+        ros = router._runtime._ros
+        assert ros is not None
+        stop = FromRosThread.stop
+        monkeypatch.setattr(FromRosThread, "stop", lambda thread: stop(thread) and False)
+        router.__exit__(None, None, None)
+        assert len([line for line in logs if "stuck, and the router ends without it" in line["event"]]) == 1
+        assert [each.raw.take() for each in ros._subscriptions.values()] == [None]  # it is open

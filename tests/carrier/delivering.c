@@ -1,0 +1,133 @@
+/* Delivers messages without threads, sockets, clocks and middleware: what would leave is written down. A library of its
+ * own, which uses that of the carrier. */
+#define deliver_to_all note_all
+#include "from_ros.c"
+#undef deliver_to_all
+
+enum { DELIVERED = -1, FILTERED_OUT = -2 };
+
+/* What became of a message at a target, in the order in which it did. The bytes that would leave follow. */
+struct noted {
+    uint32_t size, target;
+    int32_t outcome; /* DELIVERED, FILTERED_OUT, or an enum loss */
+    uint32_t place, length, reserved;
+};
+
+/* A thread that does not run, and what it has delivered since the last call. */
+struct delivering {
+    struct from_ros thread;
+    struct output notes, bytes;
+    int64_t now;
+};
+
+struct delivering *seam_open(counter *counters);
+void seam_close(struct delivering *of);
+size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, bool is_single,
+                     uint32_t column, int64_t received_at, const void **notes);
+size_t seam_from_ros(struct delivering *of, const struct ros_route *route, const void *data, size_t size,
+                     int64_t received_at, const void **notes);
+
+static int64_t now_of(struct stage *stage) { return ((struct delivering *)stage)->now; }
+
+static int note_sent(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    struct delivering *of = (struct delivering *)stage;
+    (void)target, (void)expires;
+    of->bytes.size = 0;
+    return !append(&of->bytes, data, size);
+}
+
+static enum publication note_published(struct stage *stage, const struct target *target, const char **why) {
+    struct output *written = &stage->machine.output;
+    *why = "";
+    return note_sent(stage, target, written->data, written->size, NEVER) ? PUBLISH_FAILED : PUBLISHED;
+}
+
+/* Counters of targets: which of them has counted says what became of a message. */
+static int32_t outcome_of(const struct delivering *of, const struct target *target, const int64_t *before) {
+    const counter *counters = of->thread.stage.counters;
+    if (counters[target->delivered] != before[0]) return DELIVERED;
+    if (counters[target->filtered] != before[1]) return FILTERED_OUT;
+    for (int32_t reason = 0; reason < LOSSES; reason++)
+        if (counters[target->dropped[reason]] != before[2 + reason]) return reason;
+    abort();
+}
+
+static bool note(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
+    struct delivering *of = (struct delivering *)stage;
+    counter *counters = stage->counters;
+    int64_t before[2 + LOSSES] = {counters[target->delivered], counters[target->filtered]};
+    for (int reason = 0; reason < LOSSES; reason++) before[2 + reason] = counters[target->dropped[reason]];
+    struct { struct lost_event event; char text[256]; } lost = {0};
+    stage->reporter.left = 1;
+    of->bytes.size = 0;
+    bool goes_on = deliver(stage, to, target, message);
+    ring_take(stage->reporter.events, &lost, sizeof lost, 0);
+    struct noted noted = {.target = (uint32_t)(target - to->targets), .outcome = outcome_of(of, target, before),
+                          .place = lost.event.place, .length = (uint32_t)of->bytes.size};
+    noted.size = (uint32_t)(sizeof noted + (of->bytes.size + 7) / 8 * 8);
+    static const uint8_t zeros[8];
+    if (!append(&of->notes, &noted, sizeof noted) || !append(&of->notes, of->bytes.data, of->bytes.size) ||
+        !append(&of->notes, zeros, noted.size - sizeof noted - of->bytes.size))
+        abort();
+    return goes_on;
+}
+
+bool note_all(struct stage *stage, const struct targets *to, struct message *message) {
+    for (uint32_t index = 0; index < to->count; index++)
+        if (!note(stage, to, &to->targets[index], message)) return false;
+    return true;
+}
+
+struct delivering *seam_open(counter *counters) {
+    struct delivering *made = calloc(1, sizeof *made);
+    if (!made) return NULL;
+    struct stage *stage = &made->thread.stage;
+    if (!stage_open(stage, counters, ring_open(1 << 12), NULL)) abort();
+    stage->now = now_of;
+    stage->send = note_sent;
+    stage->publish = note_published;
+    return made;
+}
+
+void seam_close(struct delivering *of) {
+    ring_close(of->thread.stage.reporter.events);
+    stage_close(&of->thread.stage);
+    free(of->notes.data);
+    free(of->bytes.data);
+    free(of);
+}
+
+/* Return `size` bytes of which a sanitizer sees what is read behind them. */
+static void *exactly(const void *data, size_t size) {
+    void *copy = malloc(size ? size : 1);
+    if (!copy) abort();
+    if (size) memcpy(copy, data, size);
+    return copy;
+}
+
+/* Deliver a datagram, or a payload if `is_single`. Return how many bytes of notes there are. */
+size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, bool is_single,
+                     uint32_t column, int64_t received_at, const void **notes) {
+    void *copy = exactly(data, size);
+    struct datagram datagram = {.data = copy, .size = size, .length = size, .is_single = is_single, .column = column,
+                                .received_at = received_at};
+    struct message message = {.datagram = &datagram};
+    of->notes.size = 0;
+    note_all(&of->thread.stage, to, &message);
+    free(copy);
+    *notes = of->notes.data;
+    return of->notes.size;
+}
+
+/* Serve a message from ROS, likewise. */
+size_t seam_from_ros(struct delivering *of, const struct ros_route *route, const void *data, size_t size,
+                     int64_t received_at, const void **notes) {
+    static struct publisher publisher;
+    void *copy = exactly(data, size);
+    struct served served = {.data = copy, .size = size, .received_at = received_at, .publisher = &publisher};
+    of->notes.size = 0;
+    serve_route(&of->thread, route, &served);
+    free(copy);
+    *notes = of->notes.data;
+    return of->notes.size;
+}

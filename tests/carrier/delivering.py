@@ -1,0 +1,131 @@
+"""What the carrier makes of messages, without threads, sockets, clocks and middleware: see delivering.c."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from ctypes import POINTER, byref, c_bool, c_char_p, c_int64, c_size_t, c_uint32, c_void_p
+from pathlib import Path
+from struct import Struct
+from typing import NamedTuple, Union
+
+from router.carrier import structures as c
+from router.carrier.build import NATIVE, compile_c
+from router.carrier.from_ros import native_for_each
+from router.carrier.lowered import Programs, native_values
+from router.compiler.lowering import LoweredFeed, LoweredRoute
+from router.compiler.lowering.operations import NONE
+from tests.carrier.building import MEMORY, sanitizing
+
+FILTERED = "filtered"
+_NOTED = Struct("@IIiIII")
+_OF_ROUTE, _DELIVERED, _FILTERED, _BYTES, _FIRST_LOSS = range(5)
+_OF_TARGET = _FIRST_LOSS + len(c.LOSSES)
+
+
+def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL:
+    """The functions of delivering.c, in a library that is made as `output` and uses that of the carrier."""
+    flags = [*(sanitizing(MEMORY) if is_sanitized else ["-O1"]), "-fPIC", "-shared", f"-I{NATIVE}"]
+    files = [str(Path(__file__).parent / "delivering.c"), str(library)]
+    compile_c([*flags, *files, "-o", str(output)], "gcc" if is_sanitized else None)
+    loaded = ctypes.CDLL(str(output))
+    loaded.seam_open.restype, loaded.seam_open.argtypes = c_void_p, (c_void_p,)
+    loaded.seam_close.restype, loaded.seam_close.argtypes = None, (c_void_p,)
+    loaded.seam_datagram.restype, loaded.seam_datagram.argtypes = (
+        c_size_t,
+        (c_void_p, c_void_p, c_char_p, c_uint32, c_bool, c_uint32, c_int64, POINTER(c_void_p)),
+    )
+    loaded.seam_from_ros.restype, loaded.seam_from_ros.argtypes = (
+        c_size_t,
+        (c_void_p, c_void_p, c_char_p, c_size_t, c_int64, POINTER(c_void_p)),
+    )
+    return loaded
+
+
+class Outcome(NamedTuple):
+    """What a target gets: bytes, FILTERED, or why it gets nothing and which place of the table refused."""
+
+    label: str
+    got: Union[bytes, str]
+    place: str = ""
+
+
+class Delivering:
+    """Delivers to all targets of a route that were lowered. Those of messages from ROS are destinations.
+
+    Without a message of its own, a target gets the datagram. `source` is the name of any sender.
+    """
+
+    def __init__(
+        self, functions: ctypes.CDLL, lowered: LoweredRoute | LoweredFeed, received_at: int = 0, source: str = ""
+    ) -> None:
+        self._functions, self._received_at = functions, received_at
+        self._lowered = [*lowered.targets.values()]
+        self._arrays: list[object] = []
+        self._counters = (c_int64 * (1 + (1 + len(self._lowered)) * _OF_TARGET))()
+        programs = Programs(lowered.layout, self._arrays)
+        wanted, is_from_ros = (ctypes.c_uint8 * 1)(1), isinstance(lowered, LoweredFeed)
+        topic = c.Topic(wanted=ctypes.addressof(wanted))
+        self._arrays += [wanted, topic]
+        targets = []
+        for number, target in enumerate(self._lowered):
+            first = 1 + number * _OF_TARGET
+            made = c.Target(condition=programs.code(target.condition), message=programs.code(target.message))
+            made.id, made.delivered, made.filtered = number, first + _DELIVERED, first + _FILTERED
+            made.delivered_bytes = first + _BYTES
+            made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(len(c.LOSSES))]
+            if target.message and not is_from_ros:
+                made.topic = ctypes.pointer(topic)
+            targets.append(made)
+        self._targets = c.Targets(
+            targets=(c.Target * len(targets))(*targets),
+            count=len(targets),
+            sources=native_values([source.encode()], self._arrays),
+            topic=c.NO_NAME,
+        )
+        self._route: c.RosRoute | None = None
+        if isinstance(lowered, LoweredFeed):
+            self._route = c.RosRoute(
+                for_each=native_for_each(lowered.for_each, programs), seconds=NONE, nanoseconds=NONE
+            )
+        self._targets.layout = programs.layout()
+        if self._route is not None:
+            self._route.targets = self._targets
+        self._address = functions.seam_open(self._counters)
+
+    def __del__(self) -> None:
+        self._functions.seam_close(self._address)
+
+    @property
+    def received(self) -> int:
+        """How many messages were counted, of those from ROS."""
+        return self._counters[0]
+
+    def datagram(self, data: bytes, *, is_single: bool = False) -> list[Outcome]:
+        """Deliver an envelope, or a payload if `is_single`. Returns one outcome for each target."""
+        notes = c_void_p()
+        size = self._functions.seam_datagram(
+            self._address, byref(self._targets), data, len(data), is_single, 0, self._received_at, byref(notes)
+        )
+        return [*self._outcomes(ctypes.string_at(notes.value or 0, size))]
+
+    def from_ros(self, data: bytes) -> list[Outcome]:
+        """Serve a message from ROS. Returns one outcome for each target, for each element with `for_each`."""
+        notes = c_void_p()
+        assert self._route is not None
+        size = self._functions.seam_from_ros(
+            self._address, byref(self._route), data, len(data), self._received_at, byref(notes)
+        )
+        return [*self._outcomes(ctypes.string_at(notes.value or 0, size))]
+
+    def _outcomes(self, notes: bytes) -> Iterator[Outcome]:
+        at = 0
+        while at < len(notes):
+            size, target, outcome, place, length, _ = _NOTED.unpack_from(notes, at)
+            lowered = self._lowered[target]
+            if outcome == -1:
+                start = at + _NOTED.size
+                yield Outcome(lowered.label, notes[start : start + length])
+            else:
+                yield Outcome(lowered.label, FILTERED if outcome == -2 else c.LOSSES[outcome], lowered.places[place])
+            at += size
