@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
-from router.compiler.lowering.layout import Layout, NodeField, PlacedNode
+from router.compiler.lowering.layout import Layout, NodeField, PlacedNode, ReadOperation
 from router.compiler.lowering.operations import Code
 
 _OPERATION, _REAL_OPERATION = struct.Struct("@BBHIQ"), struct.Struct("@BBHId")
@@ -60,20 +60,21 @@ class Programs:
         return ctypes.pointer(made)
 
     def _node(self, node: PlacedNode) -> c.Node:
-        entries = [
-            c.NodeField(*entry)
-            if isinstance(entry, NodeField)
-            else c.ReadOperation(entry.kind, entry.size, entry.type, slot=entry.slot, count=entry.elements)
-            for entry in node.entries
-        ]
-        made = ((c.ReadOperation if self._layout.is_cdr else c.NodeField) * len(entries))(*entries)
+        kind: Any = c.ReadOperation if self._layout.is_cdr else c.NodeField
+        made = (kind * len(node.entries))(*map(_native_entry, node.entries))
         self.arrays.append(made)
-        return c.Node(ctypes.addressof(made), len(entries), node.first_slot, node.slot_count)
+        return c.Node(ctypes.addressof(made), len(node.entries), node.first_slot, node.slot_count)
 
     def _closed(self, numbers: Sequence[int]) -> c.ClosedEnum:
         made = (ctypes.c_int32 * len(numbers))(*numbers)
         self.arrays.append(made)
         return c.ClosedEnum(made, len(numbers))
+
+
+def _native_entry(entry: NodeField | ReadOperation) -> c.NodeField | c.ReadOperation:
+    if isinstance(entry, NodeField):
+        return c.NodeField(*entry)
+    return c.ReadOperation(entry.kind, entry.size, entry.type, slot=entry.slot, count=entry.elements)
 
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: list[object]) -> ctypes.Array[c.Value]:

@@ -9,17 +9,19 @@ from pathlib import Path
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import add_table, seconds, table_path
-from router.compiler import check_table
+from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
+from router.tools.listing import listed_route, python_of
 
-_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides, and
-largest sizes; with --code, also the code that the router runs. Of a gateway, show what it sends how often, and what
-it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or with --live of
-all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
+_DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
+mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
+with their places in the table. Of a gateway, show what it sends how often, and what it lets in: with a ~ in front each
+topic that its patterns match, of those that the table names, or with --live of all that there are. With --diff, say
+what one table does otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -38,7 +40,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
     )
-    parser.add_argument("--code", action="store_true", help="show the generated code as well")
+    parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
     parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
     about = f"look for them for so long, as 5s (default: {_LIVE:g}s)"
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
@@ -71,10 +73,7 @@ def _explain(args: argparse.Namespace) -> int:
     topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            print(*explained_route(route, checked, program.executors), sep="\n")
-            if args.code:
-                _print_code(route, program)
-            print()
+            _print_route(route, checked, program, with_code=args.code)
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
@@ -94,14 +93,17 @@ def _diff(old: Path, new: Path) -> int:
     return OK
 
 
-def _print_code(route: CheckedRoute, program: Program) -> None:
-    for handler in program.handlers:
-        if handler.route == route.route.name:
-            print()
-            _print_python(handler.source.text())
+def _print_route(route: CheckedRoute, checked: Checked, program: Program, *, with_code: bool) -> None:
+    code = listed_route(route, program) if with_code else ()
+    print(*explained_route(route, checked, program.executors), *code, sep="\n")
+    if with_code:
+        for source in python_of(route, program):
+            _print_python(source)
+    print()
 
 
 def _print_python(source: str) -> None:
+    print()
     if is_coloured(sys.stdout):
         from rich.console import Console
         from rich.syntax import Syntax

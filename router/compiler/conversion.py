@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 
 from router.compiler.expressions import ExpressionError, Scope
-from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, INT64_END, clamp
+from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
 from router.compiler.expressions.kinds import (
     INT32,
+    INT64,
     OCTET,
     BoolKind,
     BytesKind,
@@ -27,7 +28,8 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     kind_of,
 )
-from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.lists import fitted
+from router.compiler.expressions.scope import field_of, want_readable
 from router.compiler.expressions.tree import Binary, Call, Constant, Listed, Node, Operator, Variable, constant_of
 from router.compiler.expressions.tree import Each as Computed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
@@ -43,6 +45,7 @@ _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 
 def convert(value: Node, target: Type, scope: Scope) -> Plan:
     """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
+    want_readable(value)
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
     if isinstance(target, List):
@@ -81,25 +84,17 @@ def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
 
 
 def _to_time(value: Node, target: MessageType) -> Record:
-    def part(member: Field, operator: Operator, low: int, high: int) -> tuple[Field, Plan]:
+    def part(member: Field, operator: Operator, kind: IntKind) -> tuple[Field, Plan]:
         divisor = Constant(IntKind(NS_PER_SECOND, NS_PER_SECOND), value.span, NS_PER_SECOND)
-        made = Binary(IntKind(low, high), value.span, operator, value, divisor)
-        return member, Leaf(member.type, _within(made, member.type), value.span)
+        made = Binary(kind, value.span, operator, value, divisor)
+        assert isinstance(member.type, Int)  # noqa: S101 - times are made of integers
+        range_ = _range(member.type)
+        return member, Leaf(member.type, made if range_.holds(kind) else fitted(made, range_), value.span)
 
     sec, nanosec = target.fields
-    seconds = part(sec, Operator.FLOOR_DIVIDE, -INT64_END // NS_PER_SECOND, INT64_END // NS_PER_SECOND)
-    return Record(target, (seconds, part(nanosec, Operator.MODULO, 0, NS_PER_SECOND - 1)), value.span)
-
-
-def _within(value: Binary, target: Type) -> Node:
-    """The integer, refused at run time where it is outside of the field's range."""
-    assert isinstance(target, Int)  # noqa: S101 - times are made of integers
-    assert isinstance(value.kind, IntKind)  # noqa: S101
-    return (
-        value
-        if _fits(value.kind, target)
-        else _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
-    )
+    seconds = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
+    members = part(sec, Operator.FLOOR_DIVIDE, seconds), part(nanosec, Operator.MODULO, IntKind(0, NS_PER_SECOND - 1))
+    return Record(target, members, value.span)
 
 
 def _to_same_named(value: Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
@@ -212,30 +207,31 @@ def _to_int(value: Node, target: Int) -> Node:
 
 def _saturate(value: Node, target: Int) -> Node:
     """An enum limited to an integer's range."""
-    if _fits(IntKind(INT32.low, INT32.high), target):
+    range_, every = _range(target), _range(INT32)
+    if range_.holds(every):
         return value
-    kind = IntKind(max(INT32.low, target.low), min(INT32.high, target.high))
+    kind = IntKind(max(every.low, range_.low), min(every.high, range_.high))
     literal = constant_of(value)
     if isinstance(literal, int):
-        return Constant(kind, value.span, int(clamp(literal, target.low, target.high)))
+        return Constant(kind, value.span, int(clamp(literal, kind.low, kind.high)))
     return _limited("clamp", value, kind, target.low, target.high)
 
 
-def _fits(kind: IntKind, target: Int) -> bool:
-    return kind.bounds is not None and target.low <= kind.bounds[0] and kind.bounds[1] <= target.high
+def _range(target: Int) -> IntKind:
+    return IntKind(target.low, target.high)
 
 
 def _fit(value: Node, kind: IntKind, target: Int) -> Node:
-    if kind.bounds is None:
-        return _limited("fit", value, IntKind(target.low, target.high), target.low, target.high)
-    if _fits(kind, target):
+    range_ = _range(target)
+    if range_.holds(kind):
         return value
-    low, high = kind.bounds
-    if high < target.low or low > target.high:
+    if kind.high < range_.low or kind.low > range_.high:
         limits = f"{target.low}..{target.high}"
         raise ExpressionError(
             value.span, Code.OUT_OF_RANGE, f"{value.kind} does not fit {target}", f"it holds {limits}"
         )
+    if kind.is_rounded:
+        return fitted(value, range_)
     hint = "say how: clamp() or wrap()"
     raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
 
@@ -251,8 +247,8 @@ def _to_float(value: Node, target: Float) -> Node:
                 hint = "float32() says that losing digits is meant"
                 raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)
             return value
-        case IntKind(bounds=bounds):
-            if bounds is None or (-limit <= bounds[0] and bounds[1] <= limit):
+        case IntKind() as kind:
+            if kind.is_rounded or IntKind(-limit, limit).holds(kind):
                 return value
             hint = f"float{target.bits}() says that losing digits is meant"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
@@ -268,26 +264,28 @@ def _to_string(value: Node, target: String) -> Node:
     if not isinstance(value.kind, StringKind):
         numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
         raise mismatch(value, target, "str() makes text of it" if numeric else "")
+    if target.wide:
+        hint = "leave it out, and it keeps its default; or declare it as a string"
+        raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions do not fill a wstring", hint)
     literal = constant_of(value)
     if isinstance(literal, str):
         _want_text(value, literal, target)
         return value
     if target.bound is None:
         return value
-    return _limited("fit_wide_text" if target.wide else "fit_text", value, StringKind(), target.bound)
+    return _limited("fit_text", value, StringKind(), target.bound)
 
 
 def _want_text(value: Node, text: str, target: String) -> None:
     """Raise ExpressionError if a literal cannot stand in the field."""
     try:
-        length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
+        length = len(text.encode())
     except UnicodeEncodeError as error:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is no character") from None
-    if not target.wide and "\0" in text:
+    if "\0" in text:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, "a string cannot hold a NUL")
     if target.bound is not None and length > target.bound:
-        unit = "characters" if target.wide else "bytes"
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} {unit} do not fit {target}")
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
 
 
 def _to_enum(value: Node, target: Enum) -> Node:
@@ -295,13 +293,26 @@ def _to_enum(value: Node, target: Enum) -> Node:
         case EnumKind(enum) if enum == target:
             return value
         case IntKind() as kind:
-            return _fit(value, kind, INT32)
+            return _member(_fit(value, kind, INT32), target)
         case StringKind() if isinstance(literal := constant_of(value), str):
             return Constant(EnumKind(target), value.span, _number_of(value, literal, target))
         case StringKind():
             return Call(EnumKind(target), value.span, "named", (value,))
         case _:
             raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
+
+
+def _member(value: Node, target: Enum) -> Node:
+    """A number as a value of the enum, refused at run time if a closed one does not have it."""
+    literal = constant_of(value)
+    if not target.is_closed:
+        return value
+    if literal is None:
+        return Call(EnumKind(target), value.span, "member", (value,))
+    if literal not in dict(target.values).values():
+        hint = f"it is closed: name one of its values, as {target.name}.{target.values[0][0]}"
+        raise ExpressionError(value.span, Code.UNKNOWN_ENUM_VALUE, f"'{target}' has no value {literal}", hint)
+    return value
 
 
 def _number_of(value: Node, name: str, target: Enum) -> int:
@@ -332,7 +343,7 @@ def _is_octet(kind: Kind) -> bool:
     """Whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
     if not isinstance(kind, IntKind):
         return False
-    return kind.bounds is None or OCTET.low <= kind.bounds[0] <= kind.bounds[1] <= OCTET.high
+    return kind.is_rounded or _range(OCTET).holds(kind)
 
 
 def _limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:

@@ -233,7 +233,8 @@ class _Builder:
         except ExpressionError as error:
             found = error.diagnostic
             message = f"auto cannot fill '{path}': {found.message}"
-            self.findings.append(Diagnostic(self.span, found.code, message, f"map '{path}' by hand: {found.hint}"))
+            by_hand = "the other fields" if found.code is Code.FORBIDDEN_EXPRESSION else f"'{path}'"
+            self.findings.append(Diagnostic(self.span, found.code, message, f"map {by_hand} by hand: {found.hint}"))
             return unset(member, self.span)
         self.rows.append(Row(path, str(member.type), self.origin + path, str(source.kind), automatic=True))
         return plan

@@ -6,7 +6,7 @@ A value that a field cannot hold raises MappingError.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from router.compiler.cdr.primitives import (
     CDR_LE,
@@ -30,18 +30,6 @@ from router.errors import MappingError, SourceSpan
 from router.types.framing import trimmed
 
 Values = TypeVar("Values", bound=Sized)
-
-
-class Entry(NamedTuple):
-    """One entry of a protobuf map."""
-
-    key: Any
-    value: Any
-
-
-def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
-    """The entries of a protobuf map, sorted by key: its own order differs from run to run."""
-    return tuple(Entry(key, values[key]) for key in sorted(values))
 
 
 # checks of values that are read, or fill fields; tables cannot call these
@@ -72,14 +60,6 @@ def fit_text(x: str | bytes, bound: int) -> str | bytes:
     if length <= bound:
         return x
     raise MappingError(f"{length} bytes are more than {bound}")
-
-
-def fit_wide_text(x: str, bound: int) -> str:
-    """Return text of at most `bound` UTF-16 code units."""
-    length = len(x.encode("utf-16-le")) // 2
-    if length <= bound:
-        return x
-    raise MappingError(f"{length} characters are more than {bound}")
 
 
 def fit_length(values: Values, least: int, most: int) -> Values:
@@ -141,7 +121,7 @@ def whole_total(values: Iterable[int], low: int, high: int) -> int:
 
 
 _CALLED = (
-    checked_text, checked_texts, entries, fit, fit_length, fit_text, fit_wide_text, named, member, octets,
+    checked_text, checked_texts, fit, fit_length, fit_text, named, member, octets,
     side_by_side, contains, total, whole_total,
     put_text, put_wide_text, put_numbers, put_length, want_length,
     refuse, cut_off, read_text, read_texts, read_wide_text, read_wide_texts, numbers,

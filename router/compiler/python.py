@@ -10,7 +10,7 @@ import ast
 import copy
 from collections.abc import Mapping
 
-from router.compiler.expressions.kinds import EnumKind, FloatKind, IntKind, Kind, as_int
+from router.compiler.expressions.kinds import INT64, UINT64, EnumKind, FloatKind, IntKind, Kind, as_int
 from router.compiler.expressions.tree import (
     MESSAGE,
     Binary,
@@ -34,7 +34,7 @@ from router.compiler.expressions.tree import (
     path_of,
 )
 from router.compiler.source import attribute, call, load, placed
-from router.types.model import Field, Int, List, MessageType
+from router.types.model import Field, List
 
 Values = Mapping[Path, ast.expr]
 """What stands for fields of the source message, by path."""
@@ -60,7 +60,6 @@ _RELATIONS: Mapping[Relation, type[ast.cmpop]] = {
 }
 _EXACT = 1 << 53
 """Up to here every integer is a double."""
-_SIGNED, _UNSIGNED = Int(64, signed=True), Int(64, signed=False)
 
 
 def render(node: Node, values: Values = NO_VALUES) -> ast.expr:
@@ -86,16 +85,16 @@ def _made(node: Node, values: Values) -> ast.expr:  # noqa: C901, PLR0912 - a ca
         case Unary(operator=Operator.NOT):
             return ast.UnaryOp(ast.Not(), render(node.operand, values))
         case Unary():
-            made = ast.UnaryOp(ast.USub(), render(node.operand, values))
-            return _fit(made, node.kind) if node.is_checked else made
+            negative = ast.UnaryOp(ast.USub(), render(node.operand, values))
+            return _fit(negative, node.kind) if node.is_checked else negative
         case Binary():
             return _binary(node, values)
         case Compare():
             first, *others = [render(operand, values) for operand in node.operands]
             return ast.Compare(first, [_RELATIONS[relation]() for relation in node.relations], others)
         case Contains():
-            made = call("contains", render(node.sought, values), render(node.values, values))
-            return ast.UnaryOp(ast.Not(), made) if node.is_negated else made
+            found = call("contains", render(node.sought, values), render(node.values, values))
+            return ast.UnaryOp(ast.Not(), found) if node.is_negated else found
         case Logic():
             operands = [render(operand, values) for operand in node.operands]
             return ast.BoolOp(ast.And() if node.is_all else ast.Or(), operands)
@@ -115,12 +114,11 @@ def _read(node: Variable | Read, values: Values) -> ast.expr:
 
 
 def _value_of(message: ast.expr, member: Field) -> ast.expr:
-    """A field of a message object. A protobuf map is read as the list of its entries."""
+    """A field of a message object."""
     value = attribute(message, member.name)
-    element = member.type.element if isinstance(member.type, List) else None
-    if member.is_unchecked:
-        return call("checked_texts" if element else "checked_text", value)
-    return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
+    if not member.is_unchecked:
+        return value
+    return call("checked_texts" if isinstance(member.type, List) else "checked_text", value)
 
 
 def lists_of(lists: tuple[tuple[str, Node], ...], values: Values = NO_VALUES) -> tuple[str, ast.expr]:
@@ -149,13 +147,12 @@ def _binary(node: Binary, values: Values) -> ast.expr:
 def _is_exact(kind: Kind) -> bool:
     """Whether a number is a double as it is."""
     integer = as_int(kind)
-    bounds = (0, 0) if integer is None else integer.bounds
-    return bounds is not None and bounds[0] >= -_EXACT and bounds[1] <= _EXACT
+    return integer is None or (integer.low >= -_EXACT and integer.high <= _EXACT)
 
 
 def _fit(made: ast.expr, kind: Kind) -> ast.expr:
-    assert isinstance(kind, IntKind) and kind.bounds is not None  # noqa: S101, PT018 - only integers are checked
-    return call("fit", made, *map(ast.Constant, kind.bounds))
+    assert isinstance(kind, IntKind)  # noqa: S101 - only integers are checked
+    return call("fit", made, ast.Constant(kind.low), ast.Constant(kind.high))
 
 
 def _call(node: Call, values: Values) -> ast.expr:
@@ -168,7 +165,7 @@ def _call(node: Call, values: Values) -> ast.expr:
         case "sum" if isinstance(node.kind, FloatKind):
             return call("total", *arguments)
         case "sum":
-            bounds = _UNSIGNED if _is_unsigned(node.kind) else _SIGNED
+            bounds = UINT64 if _is_unsigned(node.kind) else INT64
             return call("whole_total", *arguments, ast.Constant(bounds.low), ast.Constant(bounds.high))
         case _:
             return call(node.function, *arguments)
@@ -182,4 +179,4 @@ def _numbers(kind: Kind) -> ast.Dict:
 
 
 def _is_unsigned(kind: Kind) -> bool:
-    return isinstance(kind, IntKind) and kind.bounds is not None and kind.bounds[1] > _SIGNED.high
+    return isinstance(kind, IntKind) and kind.high > INT64.high

@@ -9,6 +9,7 @@ from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscri
 from router.compiler.deadmen import check_deadman, deadmen_of
 from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
+from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.scope import field_of
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
 from router.compiler.lookup import Lookup
@@ -258,7 +259,7 @@ def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | No
     if node is not None and isinstance(node.kind, ListKind) and node.kind.element is None:
         lookup.report(node.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
         return None
-    return node
+    return as_value(node, scope) if node else None
 
 
 def _element_names(elements: Node) -> dict[str, Node]:

@@ -10,12 +10,11 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import Any, NamedTuple, Union
 
 from google.protobuf.message import Message
 
 from router.compiler.expressions.functions import NS_PER_SECOND
-from router.compiler.namespace import entries
 from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
@@ -350,10 +349,20 @@ def _same(kind: Type, expected: Any, actual: Any) -> bool:
     return bool(expected == actual)
 
 
+class _Entry(NamedTuple):
+    """One entry of a protobuf map."""
+
+    key: Any
+    value: Any
+
+
 def _elements(kind: List, value: Any) -> Sequence[Any]:
     """Of a list; of a protobuf map its entries, by key."""
     element = kind.element
-    return entries(value) if isinstance(element, MessageType) and element.is_map_entry else value
+    if isinstance(element, MessageType) and element.is_map_entry:
+        return [_Entry(key, value[key]) for key in sorted(value)]  # its own order differs from run to run
+    elements: Sequence[Any] = value
+    return elements
 
 
 def _time_of(kind: MessageType, value: Any) -> int:

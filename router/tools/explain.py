@@ -18,7 +18,7 @@ from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.program import GatewayPlan, InboundPlan
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
-from router.errors import StartError, shown_path
+from router.errors import StartError, plural, shown_path
 from router.gateway.publishers import by_frequency
 from router.ros.environment import check_environment, ros_remedy
 from router.table.keys import flat, phrases
@@ -29,6 +29,7 @@ from router.table.model import (
     Gateway,
     GatewayFormat,
     IgnoredGateway,
+    OnLimit,
     Route,
     RouteTable,
     Topic,
@@ -37,7 +38,9 @@ from router.table.model import (
     ZenohSettings,
 )
 from router.table.units import duration
+from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.boards import framed_size
+from router.types.protobuf import PayloadCase
 
 _WIDEST_CELL = 48
 
@@ -61,10 +64,10 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
     for served in checked.targets:
         yield ""
         if served.topic:
-            yield from _topic(served, served.topic)
+            yield from _topic(served, served.topic, route)
             yield from _executor(executed_by.get((route.name, served.label, None)))
         else:
-            yield from _destination(served, route, table, "unchanged")
+            yield from _destination(served, checked, everything, "unchanged")
             yield from _executor(executed_by.get((route.name, None, served.label)))
     for feed in checked.subscriptions:
         yield ""
@@ -74,15 +77,13 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
             yield f"    when {feed.topic.when.text}"
         for served in feed.targets:
             yield ""
-            yield from _destination(served, route, table, f"from topic {feed.topic.topic.value}")
+            yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
             yield from _executor(executed_by.get((route.name, feed.topic.topic.value, served.label)))
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
     """Settings of the whole route."""
     route, deadman = checked.route, checked.deadman
-    if route.ttl is not None:
-        yield f"  dropped when older than {duration(route.ttl.value)}"
     if route.for_each is not None:
         yield f"  one datagram for each of {route.for_each.text}"
     if route.collect is not None:
@@ -114,48 +115,104 @@ def _source(name: str, table: RouteTable) -> str:
     return f"{name} ({endpoint.address.value.host}{port}{by})"
 
 
-def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
-    endpoint = table.endpoints[served.label]
+def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Checked, how: str) -> Iterator[str]:
+    """What happens to a message for an endpoint, in this order."""
+    endpoint = served.endpoint
+    assert endpoint is not None  # noqa: S101 - that of a destination
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
-    allowed = ", NaN and infinity allowed" if endpoint.allow_non_finite else ""
-    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}{allowed}  ({served.span})"
-    if endpoint.bandwidth is not None:
-        yield f"    {served.priority.value} within a bandwidth of {endpoint.bandwidth} bytes/s"
-    if others := [other for other in served.deadmen if other != route.name]:
+    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
+    yield from _conditions(served, checked.route)
+    yield from _mapping(served)
+    if board := everything.boards.get(served.label):
+        yield f"    checked for the board: {', '.join(_bounds(board, checked.case))}"
+    yield from _waiting(served)
+    if others := [other for other in served.deadmen if other != checked.route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
-    yield from _served(served)
+    if checked.route.name in served.deadmen:
+        yield "    feeds its own deadman" if others else "    feeds the deadman"
 
 
 def _executor(executor: Executor | None) -> Iterator[str]:
-    if executor is None:
-        return
-    place = f"  ({executor.span})" if executor.span else ""
-    yield "    by the carrier" if executor.is_carrier else f"    by Python: {executor.reason}{place}"
+    """What the carrier serves is not worth a word."""
+    if executor is not None and not executor.is_carrier:
+        place = f"  ({executor.span})" if executor.span else ""
+        yield f"    by Python: {executor.reason}{place}"
 
 
-def _topic(served: CheckedTarget, topic: Topic) -> Iterator[str]:
+def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
+    """What happens to a message that is published, in this order."""
     yield f"  topic {served.label}: {topic.type_name}  ({served.span})"
     yield _quality(topic)
+    if not qos_of(topic).serves_late_joiners:
+        yield "    only while a node subscribes"
+    yield from _conditions(served, route)
+    yield from _mapping(served)
     if served.plan is not None:
         size, exact = message_size(served.plan)
         yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
-    yield from _served(served)
+    yield from _waiting(served)
 
 
-def _served(served: CheckedTarget) -> Iterator[str]:
-    """The condition, rate and mapping of a target."""
+def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
+    """What decides whether a target gets a message."""
     words = phrases(served.declared)
-    if when := words.pop("when", None):
+    if when := words.get("when"):
         yield f"    {when}"
-    if words:
-        yield f"    {', '.join(words.values())}"
-    yield from _mapping(served.rows)
+    if age := phrases(route).get("ttl"):
+        yield f"    {age}"
+    if "max_rate" in words and served.declared.on_limit is OnLimit.FIRST:
+        yield f"    {words['max_rate']}, {words['on_limit']}"
+
+
+def _waiting(served: CheckedTarget) -> Iterator[str]:
+    """What decides when a message leaves that is ready."""
+    words = phrases(served.declared)
+    if "max_rate" in words and served.declared.on_limit is OnLimit.LATEST:
+        yield f"    {words['max_rate']}, {words['on_limit']}"
+    if served.endpoint is not None and served.endpoint.bandwidth is not None:
+        yield f"    {served.priority.value} within a bandwidth of {served.endpoint.bandwidth} bytes/s"
+
+
+def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
+    """What a board's firmware can take."""
+    yield f"at most {plural(board.longest, 'byte')}"
+    payload = board.fields.get(case.number)
+    fields = list(_bounded(payload.message)) if payload is not None and payload.message is not None else []
+    if any(field.is_float for field in fields):
+        yield "NaN and infinity allowed" if board.allows_non_finite else "no NaN or infinity"
+    for field in fields:
+        if sizes := list(_sizes(field)):
+            yield f"{field.path.removeprefix(f'{case.name}.')} of {', each of '.join(sizes)}"
+
+
+def _sizes(field: BoardField) -> Iterator[str]:
+    if field.most is not None:
+        yield _size(field.most, "element", is_fixed=field.has_fixed_count)
+    if field.longest is not None:
+        yield _size(field.longest, "byte", is_fixed=field.has_fixed_length)
+
+
+def _bounded(message: BoardMessage) -> Iterator[BoardField]:
+    """Its fields and those of messages in it."""
+    for field in message.values():
+        yield field
+        if field.message is not None:
+            yield from _bounded(field.message)
+
+
+def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
+    return f"{plural(bound, unit)} or none" if is_fixed else f"up to {plural(bound, unit)}"
+
+
+def _mapping(served: CheckedTarget) -> Iterator[str]:
+    """One line for each field, in columns, and what nothing fills."""
+    yield from _rows(served.rows)
     if served.plan is not None and (unset := list(_unset(served.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"
 
 
-def _mapping(rows: Sequence[Row]) -> Iterator[str]:
-    """One line a field, in columns; a long expression shifts only what follows it."""
+def _rows(rows: Sequence[Row]) -> Iterator[str]:
+    """A long expression shifts only what follows it."""
     cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
     widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
     for target, type_, expression, kind, automatic in (
@@ -197,7 +254,7 @@ def explained_gateway(checked: GatewayPlan, topics: Topics) -> Iterator[str]:
     gateway = checked.settings
     yield f"{gateway.name}: gateway, {_transport(gateway)}, {gateway.format.value}  ({gateway.span})"
     yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
-    yield f"  messages of up to {gateway.max_outbound} bytes{_sizes(gateway)}"
+    yield f"  messages of up to {gateway.max_outbound} bytes{_gateway_sizes(gateway)}"
     yield from _patterns(gateway)
     yield from _matched(TopicSelector(gateway, checked.inbound), topics)
     for entry in checked.inbound.values():
@@ -243,7 +300,7 @@ def _regularly(gateway: Gateway) -> str:
     return f"{'' if connected else again}looks for topics every {duration(gateway.discovery_period)}"
 
 
-def _sizes(gateway: Gateway) -> str:
+def _gateway_sizes(gateway: Gateway) -> str:
     compressed = f", compressed with zstd {gateway.compression}" if gateway.compression else ""
     datagrams = f", in datagrams of up to {gateway.max_datagram} bytes"
     return compressed + (datagrams if gateway.format is GatewayFormat.GATEWAY_V2 else "")

@@ -69,10 +69,11 @@ class Bytes:
 
 @dataclass(frozen=True, slots=True)
 class Enum:
-    """A protobuf enum: open, so a value may be any int32; `values` are those that have names."""
+    """A protobuf enum; `values` are those that have names. A value may be any int32, unless it `is_closed` (proto2)."""
 
     name: str
     values: tuple[tuple[str, int], ...]
+    is_closed: bool = False
 
     def __str__(self) -> str:
         return self.name
@@ -98,7 +99,8 @@ class Field:
     `number` is the protobuf field number (0 for ROS). `has_presence` says that "not set" differs from
     the default, `is_required` that there is no message without it (proto2, and both parts of a map entry).
     `oneof` is the protobuf oneof that it is a member of; an optional field may have one of its own. `is_unchecked` text
-    may be something else than UTF-8, as in proto2: protobuf then gives bytes.
+    may be something else than UTF-8, as in proto2: protobuf then gives bytes. `is_group` says that its message stands
+    between two tags, without a length.
     `default` is a ROS field's declared default, None where the type's zero is meant. `comment` is the
     documentation beside it, as one line.
     """
@@ -112,6 +114,7 @@ class Field:
     default: object = None
     comment: str = ""
     is_unchecked: bool = False
+    is_group: bool = False
 
 
 @dataclass(eq=False, slots=True)

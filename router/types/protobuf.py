@@ -324,6 +324,7 @@ def build_types(
                 oneof=field.containing_oneof.name if field.containing_oneof else None,
                 comment=sources.comment(f"{message.full_name}.{field.name}"),
                 is_unchecked=field.type == FieldDescriptor.TYPE_STRING and not validates_text(field),
+                is_group=field.type == FieldDescriptor.TYPE_GROUP,
             )
             for field in message.fields
         )
@@ -337,7 +338,8 @@ def _with_nested(message: Descriptor) -> Iterator[Descriptor]:
 
 
 def _enum(enum: EnumDescriptor) -> Enum:
-    return Enum(enum.full_name, tuple((value.name, value.number) for value in enum.values))
+    values = tuple((value.name, value.number) for value in enum.values)
+    return Enum(enum.full_name, values, is_closed=enum.is_closed)
 
 
 def _type(

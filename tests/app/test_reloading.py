@@ -47,8 +47,8 @@ TOPIC = """\
 FROM_ROS = """\
   rock_measure_result:
     source: {topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}
-    fields: {auto: true, width_cm: "width_cm + 0"}   # which needs Python
-    destinations: [basestation]
+    fields: auto
+    destinations: [{endpoint: basestation, max_rate: 1000000 Hz, on_limit: latest}]   # which needs Python
 """
 
 

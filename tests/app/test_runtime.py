@@ -351,7 +351,7 @@ def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program
         site.send(NAN_PH)
         wait_until(lambda: router.totals()["messages_dropped"] == 1)
         generation = datapath._wiring.native.generation if datapath._wiring else 0
-        told = [datapath._where_refused("ph_info", "ph", each, 1) for each in (generation, generation + 1)]
+        told = [datapath._where_refused("ph_info", None, "ph", each, 1) for each in (generation, generation + 1)]
     place = f"{router.program.table.path}:16:15: when"
     assert told == [place, ""]
     lines = [entry for entry in logged if entry["event"] == "message dropped"]

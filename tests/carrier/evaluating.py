@@ -41,13 +41,26 @@ INTEGER, REAL, TEXT, LIST = "integer", "real", "text", "list"
 
 @dataclass(frozen=True)
 class Operation:
+    """`struct operation`."""
+
     name: str
     slot: int = 0
     flag: int = 0
     size: int = 0
     number: int | float = 0
     data: bytes | None = None
-    """Stands in the literals: `number` and, of known bytes and text, `size` follow from it."""
+    """Stands in the literals: `number` and, unless it is given, `size` follow from it."""
+
+    def packed(self, literals: bytearray) -> bytes:
+        """With its data in the literals, which grow if they do not have them."""
+        size, number = self.size, self.number
+        if self.data is not None:
+            size, number = self.size or len(self.data), literals.find(self.data)
+            if number < 0:
+                number = len(literals)
+                literals += self.data
+        head = struct.pack("<BBHI", C[self.name], self.flag, self.slot, size)
+        return head + (struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64)))
 
 
 @dataclass(frozen=True)
@@ -242,27 +255,12 @@ class Machine:
         return struct.pack("<QII", value % (1 << 64), 0, 0)
 
     def _code(self, operations: Sequence[Operation]) -> _Code:
-        packed = b"".join(self._operation(each) for each in operations)
+        packed = b"".join(each.packed(self._literals) for each in operations)
+        self._room[: len(self._literals)] = bytes(self._literals)
         made = ctypes.create_string_buffer(packed, max(1, len(packed)))
         self._running = made
         return _Code(ctypes.addressof(made), len(operations), 0)
 
-    def _operation(self, operation: Operation) -> bytes:
-        size, number = operation.size, operation.number
-        if operation.data is not None:
-            size, number = operation.size or len(operation.data), self._literal(operation.data)
-        head = struct.pack("<BBHI", C[operation.name], operation.flag, operation.slot, size)
-        if isinstance(number, float):
-            return head + struct.pack("<d", number)
-        return head + struct.pack("<Q", number % (1 << 64))
-
-    def _literal(self, data: bytes) -> int:
-        start = self._literals.find(data)
-        if start < 0:
-            start = len(self._literals)
-            self._literals += data
-            self._room[start : start + len(data)] = data
-        return start
 
 
 def integer(value: int) -> Operation:

@@ -161,14 +161,14 @@ def compare(commanding: Commanding, messages: Messages) -> None:
     for topic, handlers in commanding.program.outbound.items():
         for handler in handlers:
             topics_of.setdefault(handler.route, set()).add(topic)
-    for route in topics_of:
+    for route, topics in topics_of.items():
         timed = sum(
             commanding.thread.counters(1 << 16)[
                 commanding.program.counters.index("route_duration_seconds", route) + part
             ]
             for part in range(HISTOGRAM_CELLS - 1)
         )
-        assert timed == sum(len(sent) for topic, sent in messages.items() if topic in topics_of[route])
+        assert timed == sum(len(sent) for topic, sent in messages.items() if topic in topics)
         last = commanding.count("route_last_message_timestamp_seconds", route)
         assert abs(wall_ns() - last) < 60 * SECOND if timed else last == 0
 
@@ -431,8 +431,9 @@ def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) ->
 
 def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
     """What one of its routes needs Python for, all of them do."""
-    later = "destinations: [{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}]\n    deadman: {none: for tests}"
-    made = program(tmp_path, ROUTES.replace("destinations: [driving_board]\n    deadman: {none: for tests}", later))
+    earlier = "[driving_board]\n    deadman: {none: for tests}"
+    later = earlier.replace("driving_board", "{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}")
+    made = program(tmp_path, ROUTES.replace(earlier, later))
     assert list(made.lowered.from_ros) == ["drive"]
     reasons = {key: executor.reason for key, executor in made.executors.items()}
     needs_it = "`on_limit: latest` needs it; its freshness is Python's"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from ctypes import CDLL
 from typing import Any
 
@@ -90,14 +91,14 @@ def test_arrays_and_sequences_are_lists_where_they_are(evaluating: CDLL, data: s
     name = data.draw(st.sampled_from([*SCALARS]))
     values = data.draw(st.lists(_value_of(name), max_size=5))
     is_array = bool(values) and data.draw(st.booleans())
-    written, kept = Written().scalar("B", 7), f"SCALAR_{name}"
+    written, kept = Written().scalar("Q", 7), f"SCALAR_{name}"
     if not is_array:
         written.scalar("I", len(values))
     for value in values:
         written.scalar(SCALARS[name], value)
     written.scalar("B", 9)
     step = Step("READ_ARRAY" if is_array else "READ_SEQUENCE", 1, size=_size(name), count=len(values) * is_array)
-    steps = [Step("READ_SCALAR", 0, type="SCALAR_UINT8"), step, Step("READ_SCALAR", 2, type="SCALAR_UINT8")]
+    steps = [Step("READ_SCALAR", 0, type="SCALAR_UINT64"), step, Step("READ_SCALAR", 2, type="SCALAR_UINT8")]
     machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
     assert machine.read(written.message())
     assert (machine.slot(0), machine.slot(2), machine.value(load(1), Operation("OP_SIZE"))) == (7, 9, len(values))
@@ -201,7 +202,9 @@ def test_other_representations_are_refused(evaluating: CDLL, message: bytes) -> 
 def test_a_length_beyond_the_end_is_refused(evaluating: CDLL, count: int, size: int) -> None:
     message = Written().scalar("I", count).message() + bytes(4)
     loop = [Step("READ_EACH_SEQUENCE", 0), Step("READ_SKIP", size=size, count=1), Step("READ_AGAIN")]
-    for steps in ([Step("READ_SEQUENCE", 0, size=size)], [Step("READ_SEQUENCE", size=size)], [Step("READ_TEXT", 0)], loop):
+    nothing = [Step("READ_EACH_SEQUENCE"), Step("READ_AGAIN")]
+    sequence = Step("READ_SEQUENCE", size=size)
+    for steps in ([replace(sequence, slot=0)], [sequence], [Step("READ_TEXT", 0)], loop, nothing):
         assert not Machine(evaluating, Layout((Node(steps),), is_cdr=True)).read(message)
 
 

@@ -21,7 +21,9 @@ CLOSED = (-1, 0, 1, 2)
 _HARD = wire_of(Path(__file__).parent / "protos", "PBEnvelope")[1]
 OLD = _HARD.cases["old"]
 
-NEEDED, IS_CLOSED, CLOSED_THERE, SOME, PACKED, TEXTS, EXPANDED, ONE_CLOSED, ONE_NUMBER, INNER, INNER_TEXT, ONE = range(12)
+NEEDED, IS_CLOSED, CLOSED_THERE, SOME, PACKED, TEXTS, EXPANDED, ONE_CLOSED, ONE_NUMBER, INNER, INNER_TEXT, ONE = range(
+    12
+)
 _OF_ONE = {"choice": ONE, "cleared": (ONE_CLOSED, INNER_TEXT - ONE_CLOSED + 1)}
 _OLD = Layout(
     nodes=(
@@ -109,7 +111,9 @@ def test_messages_in_parts_are_merged_and_cleared(machine: Machine) -> None:
         _assert_read(machine, payload)
 
 
-@pytest.mark.parametrize("payload", [b"\x08", b"\x42\x05ab", b"\x0b\x08", b"\x32\x02\x80\x80", b"\x06", b"\x00\x00\x00"])
+@pytest.mark.parametrize(
+    "payload", [b"\x08", b"\x42\x05ab", b"\x0b\x08", b"\x32\x02\x80\x80", b"\x06", b"\x00\x00\x00"]
+)
 def test_what_is_cut_is_refused(machine: Machine, payload: bytes) -> None:
     assert not machine.read(b"\x08\x01" + payload) or payload == b"\x00\x00\x00"
 

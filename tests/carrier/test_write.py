@@ -53,7 +53,14 @@ def test_text_in_cdr_ends_with_a_nul_and_has_no_other(machine: Machine, a: bytes
 
 
 def test_known_bytes_are_aligned(machine: Machine) -> None:
-    code = [HEADER, integer(1), Operation("OP_PUT", 1), Operation("OP_KNOWN", 8, data=b"\7" * 9), text(b"abc"), Operation("OP_PUT_BYTES")]
+    code = [
+        HEADER,
+        integer(1),
+        Operation("OP_PUT", 1),
+        Operation("OP_KNOWN", 8, data=b"\7" * 9),
+        text(b"abc"),
+        Operation("OP_PUT_BYTES"),
+    ]
     assert machine.message(*code) == CDR_HEADER + b"\1" + bytes(7) + b"\7" * 9 + b"abc"
 
 

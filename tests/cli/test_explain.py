@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from contextlib import closing
 from itertools import permutations
@@ -20,6 +19,7 @@ extends: {base}
 endpoints: {{laptop: {{address: 127.0.0.99:9999, kind: tool}}}}
 routes:
   imu_info:
+    ttl: 1s
     destinations: [basestation, {{endpoint: laptop, when: is_calibrated, max_rate: 5 Hz}}]
     topics:
       - {{topic: x, type: std_msgs/msg/Float32, when: "accel_x > 1 or accel_y > 1", fields: {{data: accel_x * 2}}}}
@@ -46,120 +46,120 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "  largest encoding: 51 bytes, 53 in its envelope\n"
         "  source: sensor_board (127.0.0.30)\n"
         "\n"
-        f"  destination basestation (127.0.0.10:9000): unchanged  ({table}:6:20)\n"
-        "    by the carrier\n"
+        f"  destination basestation (127.0.0.10:9000): unchanged  ({table}:7:20)\n"
+        "    dropped when older than 1 s\n"
         "\n"
-        f"  destination laptop (127.0.0.99:9999): unchanged  ({table}:6:34)\n"
+        f"  destination laptop (127.0.0.99:9999): unchanged  ({table}:7:34)\n"
         "    when is_calibrated\n"
+        "    dropped when older than 1 s\n"
         "    at most 5 Hz, keeping the first\n"
-        f"    by Python: `when: is_calibrated` needs it  ({table}:6:58)\n"
         "\n"
-        f"  topic x: std_msgs/msg/Float32  ({table}:8:10)\n"
+        f"  topic x: std_msgs/msg/Float32  ({table}:9:10)\n"
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
-        "    CDR: 8 bytes\n"
+        "    only while a node subscribes\n"
         "    when accel_x > 1 or accel_y > 1\n"
+        "    dropped when older than 1 s\n"
         "    data  float32  <-  accel_x * 2  : float32\n"
-        "    by the carrier\n"
+        "    CDR: 8 bytes\n"
         "\n"
     )
 
 
-def test_who_serves_commands_from_ros_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = tmp_path / "table.yaml"
-    rover = ROUTES / "rover.yaml"
-    table.write_text(f"version: 1\nextends: {rover}\nroutes: {{arm_target: {{fields: {{target_x: target_x * 2}}}}}}\n")
-    told = explained(capsys, table, "drive_motor", "arm_target", "rover_localization")
-    assert [line.strip() for line in told.splitlines() if line.startswith("    by ")] == [
-        "by the carrier",
-        f"by Python: `target_x: target_x * 2` needs it; its freshness is Python's  ({table}:3:42)",
-        "by the carrier",
-    ]
-
-
 PROTO = """\
 syntax = "proto3";
-message Reading { float value = 1; map<string, string> words = 2; string text = 3; uint32 part = 4; }
+message Reading { float value = 1; uint32 part = 2; }
+message Order { string name = 1; repeated float samples = 2; bytes key = 3; repeated string words = 4; int32 n = 5; }
 message PBEnvelope {
-  oneof payload {
-    Reading plain = 1; Reading decimal = 2; Reading newest = 3; Reading frame = 4; Reading sharing = 5;
-    Reading mapped = 6; Reading wide = 7; Reading sent = 8;
-  }
+  oneof payload { Reading frame = 1; Reading newest = 2; Reading sharing = 3; Order order = 4; Reading plain = 5; }
 }
 """
-PUBLISHING = """\
+OPTIONS = """\
+Order.name max_size:16
+Order.samples max_count:4 fixed_count:true
+Order.key max_size:6 fixed_length:true
+Order.words max_count:1 max_size:2
+"""
+OWN = """\
 version: 1
 envelope: {protos: ., message: PBEnvelope, oneof: payload}
 listen: {here: {address: "127.0.0.1:25000"}}
-endpoints: {board: {address: "127.0.0.2:8", kind: board}}
+endpoints:
+  board: {address: "127.0.0.2:8", kind: board}
+  radio: {address: "127.0.0.3:8", kind: basestation, bandwidth: 8 kB/s, trim_trailing_zeros: true}
 routes:
-  plain:
-    source: board
-    topics:
-      - {topic: a, type: std_msgs/msg/Float32, when: value > 1, max_rate: 5 Hz, fields: {data: value * 2}}
-      - {topic: b, type: std_msgs/msg/Header, fields: {frame_id: text + "!"}}
-    ttl: 1s
-  decimal:
-    source: board
-    topics: [{topic: c, type: std_msgs/msg/String, fields: {data: str(value)}}]
-  newest:
-    source: board
-    topics: [{topic: d, type: std_msgs/msg/Float32, max_rate: 5 Hz, on_limit: latest, fields: {data: value}}]
   frame:
     source: board
     collect: {by: part, count: 2, order: part, timeout: 50ms}
     topics: [{topic: e, type: std_msgs/msg/Float32, fields: {data: "items[0].value"}}]
+  newest:
+    source: board
+    destinations: [radio]
+    topics: [{topic: d, type: std_msgs/msg/Float32, max_rate: 5 Hz, on_limit: latest, fields: {data: value}}]
   sharing:
     source: board
-    topics: [{topic: c, type: std_msgs/msg/String, fields: {data: text}}]
-  mapped:
-    source: board
-    topics: [{topic: f, type: diagnostic_msgs/msg/DiagnosticStatus, fields: {values: words}}]
-  wide:
-    source: board
-    topics: [{topic: g, type: wide_msgs/msg/Wide, when: value > 1, fields: {data: text}}]
+    topics: [{topic: d, type: std_msgs/msg/Float32, fields: {data: value}}]
+  order: {source: radio, destinations: [board], deadman: {none: it moves nothing}}
+  plain: {source: any, topics: [{topic: p, type: std_msgs/msg/Float32, fields: {data: value}}]}
 """
 
 
 @pytest.fixture
-def publishing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A table in the working directory that publishes what the carrier can fill, and what only Python can."""
-    (tmp_path / "readings.proto").write_text(PROTO)
-    message = tmp_path / "share" / "wide_msgs" / "msg" / "Wide.msg"
-    message.parent.mkdir(parents=True)
-    message.write_text("wstring data\n")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ.get('AMENT_PREFIX_PATH', '')}")
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A table in the working directory with messages of its own."""
+    (tmp_path / "own.proto").write_text(PROTO)
+    (tmp_path / "own.options").write_text(OPTIONS)
     monkeypatch.chdir(tmp_path)
     path = Path("table.yaml")
-    path.write_text(PUBLISHING)
+    path.write_text(OWN)
     return path
 
 
-def test_who_publishes_on_a_topic_is_told_and_what_needs_python(
-    publishing: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = explained(capsys, publishing)
-    lines = re.findall(r"^  topic (\w)|^    by (.*)$", told, re.MULTILINE)
-    topics, executors = [topic for topic, _ in lines if topic], [by for _, by in lines if by]
-    assert list(zip(topics, executors, strict=True)) == [
-        ("a", "the carrier"),
-        ("b", "the carrier"),
-        ("c", "Python: `data: str(value)` needs it: only Python writes a float as text  (table.yaml:14:67)"),
-        ("d", "Python: `on_limit: latest` needs it  (table.yaml:17:15)"),
-        ("e", "Python: `collect` needs it  (table.yaml:20:5)"),
-        ("c", "Python: it shares 'c' with decimal, which needs Python  (table.yaml:14:15)"),
-        ("f", "Python: `values: words` needs it: it reads a map  (table.yaml:27:86)"),
-        ("g", "Python: `data: text` needs it: the carrier writes no wide strings  (table.yaml:30:83)"),
+def test_what_python_serves_is_told(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = explained(capsys, own)
+    lines = re.findall(r"^  (?:topic|destination) (\w+)|^    by (.*)$", told, re.MULTILINE)
+    assert [name or by for name, by in lines] == [
+        "e",
+        "Python: `collect` needs it  (table.yaml:10:5)",
+        "radio",
+        "Python: the bandwidth of 'radio' needs it  (table.yaml:6:3)",
+        "d",
+        "Python: `on_limit: latest` needs it  (table.yaml:15:15)",
+        "d",
+        "Python: it shares 'd' with newest, which needs Python  (table.yaml:15:15)",
+        "board",
+        "p",
     ]
 
 
-def test_the_difference_of_two_tables_leaves_out_who_publishes(
-    publishing: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("old.yaml").write_text(PUBLISHING.replace("str(value)", "text"))
-    assert main(["explain", "--diff", "old.yaml", str(publishing)]) == OK
+def test_what_a_message_waits_for_is_told_behind_its_fields(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = explained(capsys, own, "newest")
+    assert (
+        "  destination radio (127.0.0.3:8): unchanged, trailing zeros trimmed  (table.yaml:14:20)\n"
+        "    telemetry within a bandwidth of 8000 bytes/s\n"
+    ) in told
+    assert (
+        "    data  float32  <-  value  : float32\n"
+        "    CDR: 8 bytes\n"
+        "    at most 5 Hz, keeping the latest\n"
+    ) in told  # fmt: skip
+
+
+def test_what_is_checked_for_a_board_is_told(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bounds = (
+        "name of up to 15 bytes, samples of 4 elements or none, key of 6 bytes or none, "
+        "words of up to 1 element, each of up to 1 byte"
+    )
+    told = explained(capsys, own, "order")
+    assert f"\n    checked for the board: at most 62 bytes, no NaN or infinity, {bounds}\n" in told
+    own.write_text(OWN.replace("kind: board}", "kind: board, allow_non_finite: true}"))
+    assert f"bytes, NaN and infinity allowed, {bounds}\n" in explained(capsys, own, "order")
+
+
+def test_the_difference_of_two_tables_leaves_out_who_serves(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("old.yaml").write_text(OWN.replace("max_rate: 5 Hz, on_limit: latest, ", ""))
+    assert main(["explain", "--diff", "old.yaml", str(own)]) == OK
     told = capsys.readouterr().out
-    assert "str(value)" in told
-    assert "carrier" not in told
+    assert "at most 5 Hz" in told
     assert "Python" not in told
     assert "route sharing" not in told
 
@@ -184,11 +184,10 @@ def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFi
         "  deadman: arm_ctrl to laptop when no command came for 500 ms, again every 100 ms, "
         "and once when the router starts\n"
         "    disarmed by commands of imu_info\n"
-    ) in explained(capsys, table, "arm_ctrl")
-    code = explained(capsys, table, "imu_info", "--code")
-    assert f"({table}:6:34)\n    disarms the deadman of arm_ctrl\n" in code
-    assert re.search(r"send_laptop\(.*, None\)", code)
-    assert re.search(r"send_basestation\([^,]*\)", code)
+    ) in (told := explained(capsys, table, "arm_ctrl"))
+    assert f"  destination laptop (127.0.0.99:9999): unchanged  ({table}:12:20)\n    feeds the deadman\n" in told
+    code = explained(capsys, table, "imu_info")
+    assert "    at most 5 Hz, keeping the first\n    disarms the deadman of arm_ctrl\n" in code
 
 
 def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
@@ -196,8 +195,16 @@ def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
 ) -> None:
     out = explained(capsys, table, "--code")
     assert "imu_info: SensorBoardIMUInfo" in out
-    assert "\ndef route_imu_info(" in out
+    assert "\n  topic x\n    # when  (" in out
+    assert "\ndef " not in out
     assert "  ignored: not part of this test\n" in out
+
+
+def test_the_code_of_what_needs_python_is_python(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = explained(capsys, own, "--code")
+    assert "\ndef route_newest(" in out
+    assert "\n  topic p\n    # " in out
+    assert "def route_plain(" not in out
 
 
 def test_an_unknown_name_and_a_bad_table_are_told_instead(

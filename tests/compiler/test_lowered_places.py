@@ -10,7 +10,7 @@ from tests.compiler.conftest import CheckText
 def lowered(check_text: CheckText, topic: str, payload: str = "imu_info") -> LoweredTarget:
     checked = check_text(f"routes:\n  {payload}:\n    source: board\n    topics:\n      - {topic}\n")
     assert checked.program is not None, checked.diagnostics
-    [target] = checked.program.lowered[payload].targets.values()
+    [target] = checked.program.lowered.topics[payload].targets.values()
     return target
 
 
@@ -26,16 +26,16 @@ topic: a
           twist.angular: {y: float32(accel_y)}
 """,
     )
-    nothing, condition, *operations = target.places
-    assert (nothing, condition) == ("", "table.yaml:12:15: when")
-    placed = dict(zip([each.kind for each in target.operations], operations, strict=True))
+    nothing, condition, elements, *operations = target.places
+    assert (nothing, condition, elements) == ("", "table.yaml:12:15: when", "")
+    placed = dict(zip([each.kind for each in target.message], operations, strict=True))
     assert placed[Op.REAL_DIVIDE] == "table.yaml:14:27: twist.linear.x"
     assert placed[Op.FLOAT32] == "table.yaml:15:30: twist.angular.y"
 
 
 def test_without_a_condition_there_is_no_place_for_it(check_text: CheckText) -> None:
     target = lowered(check_text, "{topic: a, type: std_msgs/msg/Float32, fields: {data: accel_x}}")
-    assert target.places[:2] == ("", "")
+    assert target.places[:3] == ("", "", "")
 
 
 def test_elements_of_lists_have_places_of_their_own(check_text: CheckText) -> None:
@@ -48,6 +48,6 @@ topic: a
           orientation_covariance: [0, 0, 0, 0, 1 / accel_x, 0, 0, 0, sqrt(accel_y)]
 """,
     )
-    placed = dict(zip([each.kind for each in target.operations], target.places[2:], strict=True))
+    placed = dict(zip([each.kind for each in target.message], target.places[3:], strict=True))
     assert placed[Op.REAL_DIVIDE] == "table.yaml:13:48: orientation_covariance"
     assert placed[Op.SQRT] == "table.yaml:13:70: orientation_covariance"

@@ -39,7 +39,6 @@ from tests.compiler.compiling import (
 from tests.compiler.generated_types import EACH_TYPE, mirror, payload_sources, values
 from tests.compiler.payloads import (
     Wire,
-    assert_same_bytes,
     compiled_envelope,
     made,
     made_wire,
@@ -177,14 +176,17 @@ def test_an_unknown_name_is_refused_when_it_comes(case: str, name: str, value: o
         made(case, AUTO, **{name: (type_, value)})
 
 
-@pytest.mark.parametrize(("number", "refused"), [("2", False), ("'HIGH'", False), ("3", True), ("0", True)])
-def test_a_closed_enum_takes_only_what_it_names(number: str, refused: bool) -> None:
-    fields = field_map(gear=number, number="1")
-    if not refused:
-        assert made("closed", fields).gear == 2
-        return
-    with pytest.raises(ValueError, match="invalid enumerator"):
-        made("closed", fields)
+@pytest.mark.parametrize("gear", ["2", "'HIGH'", "HIGH", "number", "name", "gear"])
+def test_a_closed_enum_takes_what_it_names(gear: str) -> None:
+    given: dict[str, tuple[Type, Any]] = {"number": (U8, 2), "name": (String(), "HIGH"), "gear": (List(U8), [2, 3])}
+    assert made("closed", field_map(gear="gear[0]" if gear == "gear" else gear, number="1"), **given).gear == 2
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_closed_enum_takes_no_other_number(number: int) -> None:
+    assert codes_of("closed", field_map(gear=str(number), number="1")) == [Code.UNKNOWN_ENUM_VALUE]
+    with pytest.raises(MappingError):
+        made("closed", field_map(gear="gear", number="1"), gear=(U8, number))
 
 
 # bytes and texts
@@ -210,11 +212,6 @@ def test_what_is_larger_than_the_boards_expect_is_refused(
         made("bounded", AUTO, **{name: too_much})
 
 
-def test_half_a_character_is_refused() -> None:
-    with pytest.raises(ValueError, match="surrogates"):
-        made("scalars", AUTO, text=(String(wide=True), "\ud800"))
-
-
 # messages
 
 
@@ -229,18 +226,6 @@ def test_a_map_takes_a_list_of_entries_and_keeps_the_last_of_each_key() -> None:
     ]
     optionals = made("maps", AUTO, optionals=(List(narrow), twice)).optionals
     assert (optionals[1].number, optionals[1].text) == (0, "")
-
-
-def test_map_is_read_as_the_list_of_its_entries_in_the_order_of_its_keys() -> None:
-    wire = made_wire()
-    maps, many = wire[1].cases["maps"], wire[1].cases["many"]
-    given = maps.message_class(counts={"b": 2, "a": 1}, singles={True: 0.5})
-    copied = compiled_envelope(wire, maps, AUTO, maps.type)(given)
-    assert wire[1].message_class.FromString(copied) == wire[1].message_class(maps=given)
-    assert_same_bytes(wire, copied, reference_envelope(wire, maps, AUTO, maps.type)(given))
-    picked = field_map(numbers="[counts[0].value, clamp(len(singles), 0, 9)]", texts="[counts[1].key]")
-    expected = wire[1].message_class(many={"numbers": [1, 1], "texts": ["b"]})
-    assert compiled_envelope(wire, many, picked, maps.type)(given) == expected.SerializeToString()
 
 
 def test_a_time_fills_a_timestamp() -> None:
@@ -414,7 +399,6 @@ def test_an_envelope_of_constants_is_that_of_the_reference() -> None:
         ("scalars", field_map(real="1 / int(false)")),
         ("scalars", field_map(single="float32(1e39)")),
         ("scalars", field_map(i32="([1] if true else [1, 2])[5]")),
-        ("closed", field_map(gear="7", number="1")),
     ],
 )
 def test_an_envelope_of_constants_that_no_payload_holds_is_refused(case: str, fields: FieldMap) -> None:

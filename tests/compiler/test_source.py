@@ -95,7 +95,7 @@ FAILING = {
         ZeroDivisionError,
     ),
     "non-ASCII text in the expression": (
-        ["type: std_msgs/msg/String", """fields: {data: "'é€' + str(accel_x / gyro_x)"}"""],
+        ["type: std_msgs/msg/String", """fields: {data: "'é€' + text(accel_x / gyro_x, 1)"}"""],
         "accel_x / gyro_x",
         ZeroDivisionError,
     ),

@@ -9,13 +9,23 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, Union
 
 from router.table.model import Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.oracles.reference_expressions import Context, evaluate
-from tests.oracles.reference_kinds import MAPPING_ERROR, NS, EnumNumber, Nanoseconds, Refused, View, all_of
+from tests.oracles.reference_expressions import Context, elements_of, meaning_of, value_of
+from tests.oracles.reference_kinds import (
+    MAPPING_ERROR,
+    NS,
+    Computation,
+    EnumNumber,
+    Nanoseconds,
+    Refused,
+    View,
+    all_of,
+    known,
+)
 
 Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
 """What fills a field; a message is a dictionary of its fields, in their order."""
@@ -65,15 +75,22 @@ def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, con
         given = tree.get(field.name)
         same_named = auto.read(field.name) if auto and auto.type.field(field.name) else None
         if isinstance(given, Expression):
-            return converted(evaluate(given, context, field.type), field.type)
+            return _of_expression(given, field.type, context)
         if given is None:
             return converted(same_named, field.type)
         assert isinstance(field.type, MessageType)
         return _filled(field.type, given, same_named if isinstance(same_named, View) else None, context)
 
     fields = [each for each in target.fields if each.name in tree or (auto and auto.type.field(each.name))]
-    values = all_of([lambda field=field: fill_field(field) for field in fields])
+    values = all_of([partial(fill_field, field) for field in fields])
     return {field.name: value for field, value in zip(fields, values, strict=True)}
+
+
+def _of_expression(given: Expression, target: Type, context: Context) -> Value:
+    meaning = meaning_of(given, context, target)
+    if isinstance(target, (List, Bytes)):
+        return _to_list(elements_of(meaning, context), target)
+    return converted(value_of(meaning, context), target)
 
 
 def initial(declared: Type, default: object = None) -> Value:
@@ -97,16 +114,13 @@ def initial(declared: Type, default: object = None) -> Value:
             return 0
 
 
-def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a case a type
+def converted(value: Any, target: Type) -> Value:  # noqa: C901 - a case a type
     """The value as a field of the target's type holds it. Raises Refused when it does not fit."""
     match target:
         case MessageType():
             return _to_message(value, target)
         case List():
-            elements = all_of([lambda each=each: converted(each, target.element) for each in value])
-            if len(elements) not in range(target.length or 0, _most_elements(target) + 1):
-                raise Refused(MAPPING_ERROR)
-            return elements
+            return _to_list(known(value), target)
         case _ if isinstance(value, View):
             return converted(value.read(value.type.fields[0].name), target)
         case Bool():
@@ -124,11 +138,27 @@ def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a cas
         case Enum():
             return _to_enum(value, target)
         case Bytes():
-            if target.bound is not None and len(value) > target.bound:
-                raise Refused(MAPPING_ERROR)
-            if any(not 0 <= octet <= 255 for octet in value):
-                raise Refused(MAPPING_ERROR)
-            return bytes(value)
+            return _to_list(known(value), target)
+
+
+_OCTET = Int(8, signed=False)
+
+
+def _to_list(elements: Sequence[Computation], target: List | Bytes) -> Value:
+    """A list or bytes of elements that are still to be computed."""
+    declared = target.element if isinstance(target, List) else _OCTET
+    least, most = (target.length or 0, _most_elements(target)) if isinstance(target, List) else (0, target.bound)
+
+    def check_length() -> None:
+        if len(elements) < least or (most is not None and len(elements) > most):
+            raise Refused(MAPPING_ERROR)
+
+    _, *made = all_of([check_length, *(partial(_converted_to, declared, each) for each in elements)])
+    return made if isinstance(target, List) else bytes(made)
+
+
+def _converted_to(declared: Type, element: Computation) -> Value:
+    return converted(element(), declared)
 
 
 def _most_elements(target: List) -> int:
@@ -171,6 +201,8 @@ def _to_enum(value: int | str, target: Enum) -> int:
     if isinstance(value, str) and value not in numbers:
         raise Refused(MAPPING_ERROR)
     number = numbers[value] if isinstance(value, str) else int(value)
+    if getattr(target, "is_closed", False) and number not in numbers.values():
+        raise Refused(MAPPING_ERROR)
     if not -(1 << 31) <= number < 1 << 31:
         raise Refused(MAPPING_ERROR)
     return number

@@ -8,13 +8,13 @@ does not say what is computed first.
 from __future__ import annotations
 
 import ast
-import itertools
 import keyword
 import math
 import operator
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from router.table.model import Choices, Expression
@@ -31,6 +31,7 @@ from tests.oracles.reference_functions import (
 )
 from tests.oracles.reference_kinds import (
     MAPPING_ERROR,
+    Computation,
     EnumNumber,
     Kind,
     Listing,
@@ -47,6 +48,7 @@ from tests.oracles.reference_kinds import (
     all_of,
     joined,
     kind_of,
+    known,
     number,
     seen,
     shaped,
@@ -73,12 +75,14 @@ class Meaning:
     """What an expression means: its kind, and its value in a context of the same types.
 
     `items` are those of a list literal, whose kinds may differ. `constant` is the value of one that is known.
+    `elements` are those of a list that is computed, each still to be computed; of others it is None.
     """
 
     kind: Kind
     give: Callable[[Context], Any]
     items: tuple[Meaning, ...] | None = None
     constant: Any = None
+    elements: Callable[[Context], list[Computation]] | None = None
 
 
 def evaluate(expression: Expression, context: Context, expected: Type | None = None) -> Any:
@@ -88,9 +92,16 @@ def evaluate(expression: Expression, context: Context, expected: Type | None = N
 
 def value_of(meaning: Meaning, context: Context) -> Any:
     """A list literal gives its items as they are: each fills an element by itself."""
-    if meaning.items is not None:
-        return all_of([lambda item=item: value_of(item, context) for item in meaning.items])
+    if isinstance(meaning.kind, Listing):
+        return all_of(elements_of(meaning, context))
     return meaning.give(context)
+
+
+def elements_of(meaning: Meaning, context: Context) -> list[Computation]:
+    """The elements of a list, still to be computed. Raises Refused where it is made of lists of different length."""
+    if meaning.items is not None:
+        return [partial(value_of, item, context) for item in meaning.items]
+    return _elements(meaning, context)
 
 
 def meaning_of(expression: Expression, context: Context, expected: Type | None = None) -> Meaning:
@@ -144,16 +155,17 @@ def _constant(kind: Kind, value: Any) -> Meaning:
 def _literal(items: Sequence[Meaning]) -> Meaning:
     """A list literal; as one value, its elements have a kind in common."""
     kind = Listing(joined([item.kind for item in items]) if items else None, len(items))
-    whole_items = [_as_value(item) for item in items]
-    return Meaning(kind, lambda context: shaped(_together(whole_items, context), kind), items=tuple(items))
+    each = [_as_value(item) for item in items]
+    made = _list_of(kind, lambda context: _shaped_elements([partial(item.give, context) for item in each], kind))
+    return replace(made, items=tuple(items))
 
 
 def _as_value(meaning: Meaning) -> Meaning:
-    return Meaning(meaning.kind, meaning.give, constant=meaning.constant)
+    return replace(meaning, items=None)
 
 
 def _together(meanings: Sequence[Meaning], context: Context) -> list[Any]:
-    return all_of([lambda each=each: each.give(context) for each in meanings])
+    return all_of([partial(each.give, context) for each in meanings])
 
 
 def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) -> Meaning:
@@ -164,23 +176,43 @@ def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) ->
     kind, compute = rule([each for each in element_kinds if each is not None], [each.constant for each in operands])
     lists = [each.kind for each in operands if isinstance(each.kind, Listing)]
 
-    def give(context: Context) -> Any:
-        values = _together(operands, context)
-        if not lists:
-            return shaped(compute(*values), kind)
-        length = _common_length([v for v, each in zip(values, operands, strict=True) if isinstance(each.kind, Listing)])
-        columns = [
-            value if isinstance(each.kind, Listing) else itertools.repeat(value, length)
-            for value, each in zip(values, operands, strict=True)
-        ]
-        return all_of([lambda row=row: shaped(compute(*row), kind) for row in zip(*columns, strict=True)])
+    if not lists:
 
-    if lists:
-        lengths = [each.length for each in lists if each.length is not None]
-        return Meaning(Listing(kind, lengths[0] if lengths else None), give)
-    if folds and all(operand.constant is not None for operand in operands):
-        return _folded(kind, give)
-    return Meaning(kind, give)
+        def give(context: Context) -> Any:
+            return _computed(compute, kind, [partial(each.give, context) for each in operands])
+
+        if folds and all(operand.constant is not None for operand in operands):
+            return _folded(kind, give)
+        return Meaning(kind, give)
+
+    def elements(context: Context) -> list[Computation]:
+        columns = [_elements(each, context) if isinstance(each.kind, Listing) else None for each in operands]
+        lengths = {len(column) for column in columns if column is not None}
+        if len(lengths) > 1:
+            raise Refused(MAPPING_ERROR)
+        scalars = [partial(each.give, context) for each in operands]
+        return [
+            partial(_computed, compute, kind, [column[index] if column is not None else scalar
+                                               for column, scalar in zip(columns, scalars, strict=True)])
+            for index in range(lengths.pop())
+        ]  # fmt: skip
+
+    lengths = [each.length for each in lists if each.length is not None]
+    return _list_of(Listing(kind, lengths[0] if lengths else None), elements)
+
+
+def _computed(compute: Callable[..., Any], kind: Kind, operands: Sequence[Computation]) -> Any:
+    return shaped(compute(*all_of(operands)), kind)
+
+
+def _list_of(kind: Listing, elements: Callable[[Context], list[Computation]]) -> Meaning:
+    return Meaning(kind, lambda context: all_of(elements(context)), elements=elements)
+
+
+def _elements(values: Meaning, context: Context) -> list[Computation]:
+    if values.elements is not None:
+        return values.elements(context)
+    return known(values.give(context))
 
 
 def _folded(kind: Kind, give: Callable[[Context], Any]) -> Meaning:
@@ -206,16 +238,19 @@ def _element(values: Meaning, index: int) -> Meaning:
     return Meaning(values.kind.element, lambda context: values.give(context)[index])
 
 
-def _common_length(lists: Sequence[Sequence[Any]]) -> int:
-    lengths = {len(each) for each in lists}
-    if len(lengths) > 1:
-        raise Refused(MAPPING_ERROR)
-    return lengths.pop()
-
-
 def _choice(test: Meaning, body: Meaning, orelse: Meaning) -> Meaning:
     kind = joined([body.kind, orelse.kind])
-    return Meaning(kind, lambda context: shaped((body if test.give(context) else orelse).give(context), kind))
+
+    def chosen(context: Context) -> Meaning:
+        return body if test.give(context) else orelse
+
+    if isinstance(kind, Listing):
+        return _list_of(kind, lambda context: _shaped_elements(_elements(chosen(context), context), kind))
+    return Meaning(kind, lambda context: shaped(chosen(context).give(context), kind))
+
+
+def _shaped_elements(elements: Sequence[Computation], kind: Listing) -> list[Computation]:
+    return [partial(_computed, lambda value: value, kind.element, [each]) for each in elements if kind.element]
 
 
 def _chosen(choices: Choices, context: Context, expected: Type | None) -> Meaning:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Union
 
 from router.errors import MappingError
@@ -155,12 +156,16 @@ def shaped(value: Any, kind: Kind) -> Any:
         case Time():
             return Nanoseconds(value)
         case Listing(element) if element is not None:
-            return all_of([lambda each=each: shaped(each, element) for each in value])
+            return all_of([partial(shaped, each, element) for each in value])
         case _:
             return value
 
 
-def all_of(computations: Iterable[Any]) -> list[Any]:
+Computation = Callable[[], Any]
+"""Gives a value, or raises Refused."""
+
+
+def all_of(computations: Iterable[Computation]) -> list[Any]:
     """What each computation gives. If some are refused, it is for one of their reasons."""
     made: list[Any] = []
     reasons: set[str] = set()
@@ -172,6 +177,15 @@ def all_of(computations: Iterable[Any]) -> list[Any]:
     if reasons:
         raise Refused(*reasons)
     return made
+
+
+def known(values: Iterable[Any]) -> list[Computation]:
+    """Values as computations that give them."""
+    return [partial(_itself, value) for value in values]
+
+
+def _itself(value: Any) -> Any:
+    return value
 
 
 # messages
@@ -208,8 +222,7 @@ def seen(raw: Any, declared: Type) -> Any:
         case Bytes():
             return list(raw)
         case List():
-            elements = [*raw]
-            return all_of([lambda each=each: seen(each, declared.element) for each in elements])
+            return all_of([partial(seen, each, declared.element) for each in raw])
         case String() if isinstance(raw, bytes):
             try:
                 return raw.decode()

@@ -6,11 +6,20 @@ import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from router.compiler.expressions import operators, spellings
-from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function
-from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, MessageKind, StringKind, TimeKind
+from router.compiler.expressions import lists, operators, spellings
+from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function, Parameter
+from router.compiler.expressions.kinds import (
+    BoolKind,
+    EnumKind,
+    FloatKind,
+    IntKind,
+    MessageKind,
+    StringKind,
+    TimeKind,
+    is_list,
+)
 from router.compiler.expressions.operators import constant
-from router.compiler.expressions.scope import ExpressionError, Scope, field_of
+from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
 from router.compiler.expressions.syntax import Parsed, dotted, forbidden
 from router.compiler.expressions.tree import (
     MESSAGE,
@@ -19,6 +28,7 @@ from router.compiler.expressions.tree import (
     Constant,
     Listed,
     Node,
+    Operator,
     Present,
     Read,
     Variable,
@@ -49,8 +59,8 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
         return _chosen(expression.choices, expression.span, scope, expected)
     if expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
-        return operators.list_of(items, expression.span)
-    text = Parsed(expression)
+        return lists.list_of(items, expression.span)
+    text = Parsed(expression, scope.field_names())
     return _Checker(text, scope).check(text.tree, expected)
 
 
@@ -73,7 +83,7 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
         if isinstance(subject.kind, EnumKind):
             keys[-1] = Call(last.kind, last.span, "fit", (subject, last, last))
     for (name, _), key, value in reversed(list(zip(choices.values, keys, values, strict=True))):
-        made = operators.choice(operators.equality(subject, key, name.span), value, made, value.span)
+        made = operators.choice(operators.equality(subject, key, name.span), value, made, value.span, scope)
     return replace(made, span=span)
 
 
@@ -126,7 +136,7 @@ def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scop
     if is_source(subject) and scope.sources and covered == {*scope.sources}:
         return
     if not isinstance(subject.kind, EnumKind):
-        message = f"a {subject.kind} has more values than those of this map"
+        message = f"{subject.kind} has more values than those of this map"
         raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
     missing = [name for name, number in subject.kind.enum.values if number not in covered]
     if missing:
@@ -162,7 +172,7 @@ class _Checker:
             case ast.Constant():
                 return operators.constant(node.value, span)
             case ast.List():
-                return operators.list_of([self.check(item, _element(expected)) for item in node.elts], span)
+                return lists.list_of([self.check(item, _element(expected)) for item in node.elts], span)
             case ast.Name():
                 return named(node.id, span, self.scope, expected)
             case ast.Attribute() if path := constant_path(node, self.scope):
@@ -170,33 +180,45 @@ class _Checker:
             case ast.Attribute():
                 return member_of(self.check(node.value), node, self.text)
             case ast.Subscript():
-                return operators.element_of(self.check(node.value), self.check(node.slice), span)
+                return lists.item_of(self.check(node.value), self.check(node.slice), span, self.scope)
             case ast.UnaryOp():
-                return operators.unary(node.op, self.check(node.operand), span)
+                return self._unary(node.op, self.check(node.operand), span)
             case ast.BinOp():
-                operator = operators.want_binary(node.op, span)
-                return operators.binary(operator, self.check(node.left), self.check(node.right), span)
+                return self._binary(operators.want_binary(node.op, span), node, span)
             case ast.BoolOp():
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
             case ast.Compare():
                 operands = [self.check(operand) for operand in (node.left, *node.comparators)]
                 want_senders(operands, self.scope)
-                return operators.comparison(node.ops, operands, span)
+                return operators.comparison(node.ops, operands, span, self.scope)
             case ast.IfExp():
                 test = self.check(node.test)
                 operators.want_bool(test, "if")
-                return operators.choice(test, self.check(node.body, expected), self.check(node.orelse, expected), span)
+                body, orelse = self.check(node.body, expected), self.check(node.orelse, expected)
+                return operators.choice(test, body, orelse, span, self.scope)
             case ast.Call():
                 return self._call(node, span, expected)
             case _:
                 raise forbidden(node, span)
+
+    def _unary(self, op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
+        if isinstance(op, ast.Not):
+            return operators.unary(op, operand, span)
+        return lists.elementwise(lambda parts: operators.unary(op, parts[0], span), [operand], span, self.scope)
+
+    def _binary(self, op: Operator, node: ast.BinOp, span: SourceSpan) -> Node:
+        operands = [self.check(node.left), self.check(node.right)]
+        return lists.elementwise(
+            lambda parts: operators.binary(op, parts[0], parts[1], span), operands, span, self.scope
+        )
 
     def _call(self, node: ast.Call, span: SourceSpan, expected: Type | None) -> Node:
         name = called_name(node, self.text)
         if name == HAS:
             return self._has(node, span)
         function = function_named(name, self.text.span(node.func))
-        return call_of(function, [self.check(argument) for argument in node.args], span, expected)
+        arguments = [self.check(argument) for argument in node.args]
+        return call_of(function, arguments, span, self.scope, expected)
 
     def _has(self, node: ast.Call, span: SourceSpan) -> Node:
         """`has(field)` takes the path of its argument instead of the value; the argument is checked as well."""
@@ -211,7 +233,7 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> N
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
-        return field_of(scope.whole_message(span), member, span)
+        return _readable(field_of(scope.whole_message(span), member, span))
     if text in scope.given:
         return _given(text, span, scope)
     if text in ("true", "false"):  # as YAML spells them
@@ -302,7 +324,12 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         message = f"{holder.kind.type} has no field '{node.attr}'"
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
-    return field_of(holder, member, span)
+    return _readable(field_of(holder, member, span))
+
+
+def _readable(field: Read) -> Read:
+    want_readable(field)
+    return field
 
 
 def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
@@ -380,19 +407,44 @@ def function_named(name: str, span: SourceSpan) -> Function:
     return function
 
 
-def call_of(function: Function, arguments: Sequence[Node], span: SourceSpan, expected: Type | None) -> Node:
+def call_of(
+    function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope, expected: Type | None
+) -> Node:
     """The call as a checked expression; bounds that it leaves out are those of the field `expected`."""
+    if function.of_list is not None and len(arguments) == 1 and is_list(arguments[0].kind):
+        return _whole_list(function, arguments[0], span, scope)
     if function.optional and len(arguments) == len(function.parameters) - function.optional:
-        arguments = [*arguments, *_bounds(function, span, expected)]
+        is_of_list = isinstance(expected, List) and any(is_list(argument.kind) for argument in arguments)
+        arguments = [*arguments, *_bounds(function, span, _element(expected) if is_of_list else expected)]
     _want_count(function, len(arguments), span)
+    return lists.elementwise(lambda parts: _call_of_scalars(function, parts, span, scope), arguments, span, scope)
+
+
+def _whole_list(function: Function, argument: Node, span: SourceSpan, scope: Scope) -> Call:
+    assert function.of_list is not None  # noqa: S101 - see call_of
+    kind = function.of_list(argument.kind)
+    if kind is None:
+        message = f"{function.name}() takes a list of numbers, not {argument.kind}"
+        raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message)
+    return Call(kind, span, function.name, (lists.as_value(argument, scope),))
+
+
+def _call_of_scalars(function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope) -> Call:
     _want_accepted(function, arguments)
     try:
-        kind = function.result([argument.kind for argument in arguments])
+        kind = function.result(arguments)
     except ValueError as error:
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, f"{function.name}(): {error}") from None
-    if function.gives_an_argument:
-        arguments = [operators.as_float(argument, kind) for argument in arguments]
-    return Call(kind, span, function.name, tuple(arguments))
+    if function.gives_an_argument and isinstance(kind, FloatKind):
+        arguments = [lists.as_kind(argument, kind, scope) for argument in arguments]
+    becomes = [parameter.becomes for parameter in _parameters(function, len(arguments))]
+    made = [lists.as_kind(each, kind, scope) if kind else each for each, kind in zip(arguments, becomes, strict=True)]
+    return Call(kind, span, function.name, tuple(made))
+
+
+def _parameters(function: Function, count: int) -> list[Parameter]:
+    """The parameters of a call with so many arguments."""
+    return [*function.parameters, *[function.parameters[-1]] * (count - len(function.parameters))]
 
 
 def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Node]:
@@ -405,15 +457,17 @@ def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list
 def _want_count(function: Function, count: int, span: SourceSpan) -> None:
     takes = len(function.parameters)
     if count < takes or (count > takes and not function.variadic):
-        wanted = plural(takes, "argument") + " or more" * function.variadic
+        wanted = plural(takes, "argument") + " or more, or one list," * function.variadic
         message = f"{function.name}() takes {wanted}, not {count}"
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
 
 
+_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS}
+
+
 def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:
-    repeated = [function.parameters[-1]] * (len(arguments) - len(function.parameters))
-    for parameter, argument in zip([*function.parameters, *repeated], arguments, strict=True):
+    for parameter, argument in zip(_parameters(function, len(arguments)), arguments, strict=True):
         if not isinstance(argument.kind, parameter.accepts):
             message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
-            hint = spellings.INTEGERS if function.name == "int" and isinstance(argument.kind, FloatKind) else ""
+            hint = _OF_FLOATS.get(function.name, "") if isinstance(argument.kind, FloatKind) else ""
             raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message, hint)

@@ -1,33 +1,36 @@
 """The functions of the expression language: each declared once, with documentation, examples and implementation.
 
 The examples are tests (tests/compiler/test_expressions.py) and the reference page is generated from them. Each function
-has a rule that gives the kind of a call from the kinds of its arguments, in order, once their number and kinds are
-checked; it raises ValueError with a sentence when no call with such arguments works. An implementation raises
-MappingError for a value without a result.
+has a rule that gives the kind of a call from its arguments, in order, once their number and kinds are checked; it
+raises ValueError with a sentence when no call with such arguments works. An implementation raises MappingError for a
+value without a result.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from router.compiler.expressions.kinds import (
-    ANY_INT,
+    INT64,
+    UINT32,
+    UINT64,
     BoolKind,
-    BytesKind,
     EnumKind,
     FloatKind,
     IntKind,
     Kind,
-    ListKind,
     Number,
     StringKind,
     TimeKind,
     as_int,
+    element_of,
     float_bits,
-    join,
+    length_of,
+    within_64_bits,
 )
+from router.compiler.expressions.tree import Node, constant_of
 from router.errors import MappingError, NonFiniteError
 
 NS_PER_SECOND = 1_000_000_000
@@ -37,6 +40,9 @@ FLOAT32_END = 3.4028235677973366e38
 
 INT64_END = 1 << 63
 """The first integer that does not fit 64 bits with a sign."""
+
+MOST_DIGITS = 17
+"""Decimals of text(): more do not tell doubles apart."""
 
 # implementations
 
@@ -118,84 +124,131 @@ def fixed(x: float, digits: int) -> str:
 
 # kinds of results
 
-Rule = Callable[[Sequence[Kind]], Kind]
-"""Gives the kind of a call from the kinds of its arguments."""
+Rule = Callable[[Sequence[Node]], Kind]
+"""Gives the kind of a call from its arguments. Raises ValueError for arguments with which no call works."""
 
 
 def _always(kind: Kind) -> Rule:
     return lambda _: kind
 
 
-def _common(kinds: Sequence[Kind]) -> Kind:
-    """The kind that holds all arguments."""
-    joined = kinds[0]
-    for kind in kinds[1:]:
-        joined = join(joined, kind) or joined
-    return joined
+def _integers(nodes: Sequence[Node]) -> list[IntKind] | None:
+    """The arguments as integers; None if one is a float."""
+    found = [kind for node in nodes if (kind := as_int(node.kind))]
+    return found if len(found) == len(nodes) else None
 
 
-def _double(kinds: Sequence[Kind]) -> Kind:
-    return FloatKind(max(map(float_bits, kinds)))
+def _double(nodes: Sequence[Node]) -> FloatKind:
+    return FloatKind(max(float_bits(node.kind) for node in nodes))
 
 
-def _integer(kinds: Sequence[Kind]) -> Kind:
-    """The same integer, or one of unknown range for a float."""
-    return as_int(kinds[0]) or ANY_INT
+def _rounded(compute: Callable[[float], int]) -> Rule:
+    """The same integer, or one of 64 bits for a float; the range that clamp() leaves is kept."""
+
+    def result(nodes: Sequence[Node]) -> Kind:
+        kind = nodes[0].kind
+        if not isinstance(kind, FloatKind):
+            return _integer(nodes)
+        if not all(map(math.isfinite, kind.limits)):
+            return IntKind(INT64.low, INT64.high, is_rounded=True)
+        low, high = map(compute, kind.limits)
+        if low > INT64.high or high < INT64.low:
+            raise ValueError(f"no integer of 64 bits is between {kind.low} and {kind.high}")
+        return IntKind(max(low, INT64.low), min(high, INT64.high), is_rounded=True)
+
+    return result
 
 
-def _integer_or_bool(kinds: Sequence[Kind]) -> Kind:
-    return IntKind(0, 1) if isinstance(kinds[0], BoolKind) else _integer(kinds)
+def _integer(nodes: Sequence[Node]) -> Kind:
+    kind = as_int(nodes[0].kind)
+    assert kind is not None  # noqa: S101 - accepted before
+    return kind
 
 
-def _absolute(kinds: Sequence[Kind]) -> Kind:
-    bounds = _bounds(kinds[0])
-    if bounds is None:
-        return kinds[0]
-    low, high = bounds
-    magnitudes = (abs(low), abs(high))
-    return IntKind(0 if low <= 0 <= high else min(magnitudes), max(magnitudes))
+def _integer_or_bool(nodes: Sequence[Node]) -> Kind:
+    return IntKind(0, 1) if isinstance(nodes[0].kind, BoolKind) else _integer(nodes)
+
+
+def _absolute(nodes: Sequence[Node]) -> Kind:
+    integers = _integers(nodes)
+    if integers is None:
+        return _double(nodes)
+    (kind,) = integers
+    magnitudes = (abs(kind.low), abs(kind.high))
+    return IntKind(0 if kind.low <= 0 <= kind.high else min(magnitudes), max(magnitudes), kind.is_rounded)
 
 
 def _extreme(pick: Callable[[list[int]], int]) -> Rule:
     """For min() and max(): from the picked low bound to the picked high bound."""
 
-    def result(kinds: Sequence[Kind]) -> Kind:
-        known = [bounds for kind in kinds if (bounds := _bounds(kind))]
-        if len(known) != len(kinds):
-            return _common(kinds)
-        return IntKind(pick([low for low, _ in known]), pick([high for _, high in known]))
+    def result(nodes: Sequence[Node]) -> Kind:
+        integers = _integers(nodes)
+        if integers is None:
+            return _double(nodes)
+        low, high = pick([kind.low for kind in integers]), pick([kind.high for kind in integers])
+        return IntKind(low, high, any(kind.is_rounded for kind in integers))
 
     return result
 
 
-def _clamped(kinds: Sequence[Kind]) -> Kind:
-    low, high = _bounds(kinds[1]), _bounds(kinds[2])
-    if low and high:
-        _want_ordered(low[0], high[1])
-    if any(as_int(kind) is None for kind in kinds):
-        return _common(kinds)
-    if low is None or high is None:
-        return ANY_INT
-    return IntKind(min(low[0], high[0]), max(low[1], high[1]))
+def _extreme_of_list(kind: Kind) -> Kind | None:
+    element = element_of(kind)
+    return FloatKind(element.bits) if isinstance(element, FloatKind) else as_int(element) if element else None
 
 
-def _wrapped(kinds: Sequence[Kind]) -> Kind:
-    low, high = _bounds(kinds[1]), _bounds(kinds[2])
-    if low is None or high is None:
-        return ANY_INT
-    _want_ordered(low[0], high[1])
-    # If the bounds may be the wrong way round, the range is known at run time only.
-    return IntKind(low[0], high[1]) if low[1] <= high[0] else ANY_INT
+def _sum_of_list(kind: Kind) -> Kind | None:
+    element, length = element_of(kind), length_of(kind)
+    if isinstance(element, FloatKind):
+        return FloatKind(element.bits)
+    integer = as_int(element) if element else None
+    if integer is None:
+        return None
+    if length is not None:
+        return within_64_bits((length * integer.low, length * integer.high), integer.is_rounded)[0]
+    limits = INT64 if integer.low < 0 else UINT64
+    return IntKind(limits.low, limits.high, integer.is_rounded)
 
 
-def _bounds(kind: Kind) -> tuple[int, int] | None:
-    number = as_int(kind)
-    return number.bounds if number else None
+def _clamped(nodes: Sequence[Node]) -> Kind:
+    integers, (_, low, high) = _integers(nodes), nodes
+    if integers is not None:
+        _want_ordered(integers[1], integers[2])
+        return _between(integers[1:])
+    ends = [constant_of(low), constant_of(high)]
+    if not all(isinstance(end, (int, float)) and math.isfinite(end) for end in ends):
+        return _double(nodes)
+    first, last = (float(end) for end in ends if end is not None)
+    if first > last:
+        raise ValueError(f"the low bound {ends[0]} is above the high bound {ends[1]}")
+    return replace(_double(nodes), low=first, high=last)
 
 
-def _want_ordered(low: int, high: int) -> None:
-    if low > high:
-        raise ValueError(f"the low bound {low} is above the high bound {high}")
+def _wrapped(nodes: Sequence[Node]) -> Kind:
+    integers = _integers(nodes)
+    assert integers is not None  # noqa: S101 - accepted before
+    _, low, high = integers
+    _want_ordered(low, high)
+    return _between([IntKind(low.low, low.low), IntKind(high.high, high.high)])
+
+
+def _between(bounds: Sequence[IntKind]) -> IntKind:
+    """From the lowest to the highest of these."""
+    low, high = min(bound.low for bound in bounds), max(bound.high for bound in bounds)
+    if low < 0 and high > INT64.high:
+        raise ValueError(f"the bounds go from {low} to {high}, which is more than 64 bits hold")
+    return IntKind(low, high)
+
+
+def _want_ordered(low: IntKind, high: IntKind) -> None:
+    if low.low > high.high:
+        raise ValueError(f"the low bound {low.low} is above the high bound {high.high}")
+
+
+def _written(nodes: Sequence[Node]) -> Kind:
+    digits = constant_of(nodes[1])
+    if not isinstance(digits, int) or isinstance(digits, bool) or not 0 <= digits <= MOST_DIGITS:
+        raise ValueError(f"the number of decimals is a literal from 0 to {MOST_DIGITS}")
+    return StringKind()
 
 
 # declarations
@@ -203,20 +256,22 @@ def _want_ordered(low: int, high: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """`accepts` are the kinds that may be passed, `wanted` how a finding calls them."""
+    """`accepts` are the kinds that may be passed, `wanted` how a finding calls them; `becomes` what they turn into."""
 
     name: str
     accepts: tuple[type, ...]
     wanted: str
+    becomes: FloatKind | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One function. `result` tells the kind of a call from the kinds of its arguments.
+    """One function of scalars. `result` tells the kind of a call from its arguments.
 
     The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
     A function with optional bounds takes them from the integer field that it fills (see expressions). One that
-    `gives_an_argument` gives a float if one of them may be one.
+    `gives_an_argument` gives a float if one of them may be one. `of_list` tells the kind of a call with one list, which
+    is taken as a whole; it is None for a list that the function does not take.
     """
 
     name: str
@@ -228,6 +283,7 @@ class Function:
     variadic: bool = False
     optional: int = 0
     gives_an_argument: bool = False
+    of_list: Callable[[Kind], Kind | None] | None = None
 
     @property
     def signature(self) -> str:
@@ -250,19 +306,27 @@ def _real(
     return Function(implementation.__name__, tuple(map(_number, names)), _double, implementation, summary, examples)
 
 
-_SIZED = (StringKind, BytesKind, ListKind)
 _DECLARED = (
     Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
-    Function("min", (_number("a"), _number("b")), _extreme(min), min, "The smallest argument.",
-             (("min(2, 1.5)", 1.5),), variadic=True, gives_an_argument=True),
-    Function("max", (_number("a"), _number("b")), _extreme(max), max, "The largest argument.",
-             (("max(2, 3, 1)", 3),), variadic=True, gives_an_argument=True),
-    Function("round", (_number(),), _integer, round_half_even,
-             "The nearest integer, the even one of two. NaN and infinities drop the target.",
+    Function("min", (_number("a"), _number("b")), _extreme(min), min,
+             "The smallest argument, or the smallest element of a list. An empty list has none, and the target is "
+             "dropped.",
+             (("min(2, 1.5)", 1.5), ("min([3, 1, 2])", 1)), variadic=True, gives_an_argument=True,
+             of_list=_extreme_of_list),
+    Function("max", (_number("a"), _number("b")), _extreme(max), max,
+             "The largest argument, or the largest element of a list, likewise.",
+             (("max(2, 3, 1)", 3), ("max([0.5, 2])", 2.0)), variadic=True, gives_an_argument=True,
+             of_list=_extreme_of_list),
+    Function("sum", (Parameter("x", (), "a list of numbers"),), _double, sum,
+             "The sum of a list, added in order; 0 of an empty one.", (("sum([1, 2, 3])", 6), ("sum([1, 0.5])", 1.5)),
+             of_list=_sum_of_list),
+    Function("round", (_number(),), _rounded(round), round_half_even,
+             "The nearest integer, the even one of two. NaN, infinities and what 64 bits do not hold drop the target.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
-    Function("trunc", (_number(),), _integer, truncate, "The integer towards zero.", (("trunc(-2.7)", -2),)),
-    Function("floor", (_number(),), _integer, floor, "The integer at or below.", (("floor(-2.5)", -3),)),
-    Function("ceil", (_number(),), _integer, ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
+    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The integer towards zero.",
+             (("trunc(-2.7)", -2),)),
+    Function("floor", (_number(),), _rounded(math.floor), floor, "The integer at or below.", (("floor(-2.5)", -3),)),
+    Function("ceil", (_number(),), _rounded(math.ceil), ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
     Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
              "The number, held between two bounds; without bounds, those of the integer field that it fills.",
              (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2, gives_an_argument=True),
@@ -286,10 +350,15 @@ _DECLARED = (
              "Says that a large integer may lose digits in a double.", (("float64(3)", 3.0),)),
     Function("int", (Parameter("x", (BoolKind, IntKind, EnumKind), "a bool, an integer or an enum"),),
              _integer_or_bool, int, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
-    Function("str", (Parameter("x", (BoolKind, IntKind, FloatKind, EnumKind, StringKind), "a scalar"),),
-             _always(StringKind()), str, "A scalar as text.", (("'wheel_' + str(3)", "wheel_3"),)),
-    Function("len", (Parameter("x", _SIZED, "a list, a string or bytes"),), _always(IntKind(0, (1 << 32) - 1)),
-             len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),)),
+    Function("str", (Parameter("x", (BoolKind, IntKind, EnumKind, StringKind), "an integer, an enum, a bool or text"),),
+             _always(StringKind()), str, "An integer, the number of an enum, True or False, as text.",
+             (("'wheel_' + str(3)", "wheel_3"),)),
+    Function("text", (Parameter("x", Number, "a number", becomes=FloatKind(64)), _whole("digits")), _written, fixed,
+             "A number as text, with this many decimals, 0 to 17, which are a literal.",
+             (("text(2.675, 1)", "2.7"), ("text(3, 2)", "3.00"))),
+    Function("len", (Parameter("x", (StringKind,), "a list, a string or bytes"),), _always(UINT32),
+             len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),),
+             of_list=lambda _: UINT32),
     Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)), seconds,
              "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
     Function("time_from_seconds", (_number(),), _always(TimeKind()), time_from_seconds,

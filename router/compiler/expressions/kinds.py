@@ -6,7 +6,9 @@ are both integers).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Union
 
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
@@ -20,6 +22,9 @@ INT32 = Int(32, signed=True)
 OCTET = Int(8, signed=False)
 """An element of bytes."""
 
+INT64, UINT64 = Int(64, signed=True), Int(64, signed=False)
+"""The integers that a value can be: the first ones where its range begins below zero."""
+
 
 @dataclass(frozen=True, slots=True)
 class BoolKind:
@@ -29,31 +34,38 @@ class BoolKind:
 
 @dataclass(frozen=True, slots=True)
 class IntKind:
-    """An integer between `low` and `high`; None if the bounds are known at run time only."""
+    """An integer between `low` and `high`.
 
-    low: int | None
-    high: int | None
+    With `is_rounded` a rounded float went in: it may fill a narrower field, which is checked at run time.
+    """
 
-    @property
-    def bounds(self) -> tuple[int, int] | None:
-        """Both bounds, or None if they are known at run time only."""
-        return None if self.low is None or self.high is None else (self.low, self.high)
+    low: int
+    high: int
+    is_rounded: bool = False
+
+    def holds(self, other: IntKind) -> bool:
+        """Whether all integers of another kind are of this one."""
+        return self.low <= other.low and other.high <= self.high
 
     def __str__(self) -> str:
-        if self.bounds is None:
-            return "int"
         for bits in (8, 16, 32, 64):
             for signed in (False, True):
-                if (Int(bits, signed).low, Int(bits, signed).high) == self.bounds:
+                if (Int(bits, signed).low, Int(bits, signed).high) == (self.low, self.high):
                     return str(Int(bits, signed))
         return f"int {self.low}" if self.low == self.high else f"int {self.low}..{self.high}"
 
 
 @dataclass(frozen=True, slots=True)
 class FloatKind:
-    """`bits` is 64 if a double went in, so that a float32 would lose digits."""
+    """`bits` is 64 if a double went in, so that a float32 would lose digits. What is no NaN is in the range."""
 
     bits: int
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        return self.low, self.high
 
     def __str__(self) -> str:
         return f"float{self.bits}"
@@ -106,7 +118,6 @@ class ListKind:
         return f"list of {self.element}" if self.element else "empty list"
 
 
-ANY_INT = IntKind(None, None)
 UINT32 = IntKind(0, 0xFFFF_FFFF)
 """A number of elements, and the index of one."""
 
@@ -143,13 +154,45 @@ def as_int(kind: Kind) -> IntKind | None:
     return kind if isinstance(kind, IntKind) else None
 
 
+def element_of(kind: Kind) -> Kind | None:
+    """The kind of a list's elements, bytes being a list of uint8; None for other kinds, and for an empty literal."""
+    if isinstance(kind, BytesKind):
+        return kind_of(OCTET)
+    return kind.element if isinstance(kind, ListKind) else None
+
+
+def is_list(kind: Kind) -> bool:
+    """Whether a value of this kind has elements; text has none."""
+    return isinstance(kind, (ListKind, BytesKind))
+
+
+def length_of(kind: Kind) -> int | None:
+    """The length of a list, None where it is known at run time only."""
+    return kind.length if isinstance(kind, ListKind) else None
+
+
+def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind | None, bool]:
+    """The integers between these, as far as 64 bits hold them, and whether others may have to be refused.
+
+    Instead of a kind without integers it is None.
+    """
+    found = [*extremes]
+    low, high = min(found), max(found)
+    limits = INT64 if low < 0 else UINT64
+    cut = IntKind(max(low, limits.low), min(high, limits.high), is_rounded)
+    return (cut if cut.low <= cut.high else None), (cut.low, cut.high) != (low, high)
+
+
 def float_bits(kind: Kind) -> int:
     """The width that this number requires of a float result; integers require 32."""
     return kind.bits if isinstance(kind, FloatKind) else 32
 
 
 def join(left: Kind, right: Kind) -> Kind | None:
-    """The kind of a value that is one or the other, None when nothing holds both."""
+    """The kind of a value that is one or the other, None when nothing holds both.
+
+    Of integers it may hold less than both; what it does not hold is refused at run time.
+    """
     if left == right:
         return left
     if isinstance(left, Number) and isinstance(right, Number):
@@ -159,13 +202,14 @@ def join(left: Kind, right: Kind) -> Kind | None:
     return None
 
 
-def _join_numbers(left: Kind, right: Kind) -> Kind:
+def _join_numbers(left: Kind, right: Kind) -> Kind | None:
     a, b = as_int(left), as_int(right)
     if a is None or b is None:
-        return FloatKind(max(float_bits(left), float_bits(right)))
-    if a.bounds is None or b.bounds is None:
-        return ANY_INT
-    return IntKind(min(*a.bounds, *b.bounds), max(*a.bounds, *b.bounds))
+        bits = max(float_bits(left), float_bits(right))
+        if isinstance(left, FloatKind) and isinstance(right, FloatKind) and left.limits == right.limits:
+            return replace(left, bits=bits)
+        return FloatKind(bits)
+    return within_64_bits((a.low, a.high, b.low, b.high), a.is_rounded or b.is_rounded)[0]
 
 
 def _join_lists(left: ListKind, right: ListKind) -> Kind | None:

@@ -1,4 +1,4 @@
-"""Literals, lists and operators: what they take, the kind of the result, and the bounds of an integer result.
+"""Literals and operators: what they take, the kind of the result, and the range of an integer result.
 
 Operands are checked before.
 """
@@ -8,27 +8,31 @@ from __future__ import annotations
 import ast
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any
 
 from router.compiler.expressions.kinds import (
-    ANY_INT,
+    INT64,
+    UINT64,
     BoolKind,
     EnumKind,
     FloatKind,
     IntKind,
     Kind,
-    ListKind,
     MessageKind,
     Number,
     StringKind,
     TimeKind,
     as_int,
+    element_of,
     float_bits,
+    is_list,
     join,
+    within_64_bits,
 )
-from router.compiler.expressions.scope import ExpressionError
+from router.compiler.expressions.lists import as_kind, as_value
+from router.compiler.expressions.scope import ExpressionError, Scope
 from router.compiler.expressions.syntax import forbidden
 from router.compiler.expressions.tree import (
     Binary,
@@ -37,8 +41,6 @@ from router.compiler.expressions.tree import (
     Compare,
     Constant,
     Contains,
-    Element,
-    Listed,
     Logic,
     Node,
     Operator,
@@ -48,17 +50,14 @@ from router.compiler.expressions.tree import (
 )
 from router.errors import Code, SourceSpan
 
-WIDEST = 512
-"""Bits of the widest integer in an expression."""
-
 
 def constant(value: object, span: SourceSpan) -> Constant:
-    """A literal. Raises ExpressionError for one that the language does not have, or that is infinite."""
+    """A literal. Raises ExpressionError for one that the language does not have, or that is too large."""
     match value:
         case bool():
             return Constant(BoolKind(), span, value)
         case int():
-            return Constant(within_bounds(IntKind(value, value), span), span, value)
+            return Constant(integer([value], span)[0], span, value)
         case float():
             if not math.isfinite(value):
                 raise ExpressionError(span, Code.OUT_OF_RANGE, "a literal this large is infinite")
@@ -69,36 +68,14 @@ def constant(value: object, span: SourceSpan) -> Constant:
             raise forbidden(ast.Constant(None), span)
 
 
-Bounded = TypeVar("Bounded", bound=Kind)
-
-
-def within_bounds(kind: Bounded, span: SourceSpan) -> Bounded:
-    """Refuse integers of more than WIDEST bits, so that powers of powers do not take all memory."""
-    if isinstance(kind, IntKind) and kind.bounds and max(bound.bit_length() for bound in kind.bounds) > WIDEST:
-        raise ExpressionError(span, Code.OUT_OF_RANGE, f"an integer has at most {WIDEST} bits")
-    return kind
-
-
-def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
-    """A list literal, whose elements have one kind in common."""
-    element: Kind | None = items[0].kind if items else None
-    for item in items[1:]:
-        element = join(element, item.kind) if element else None
-        if element is None:
-            raise ExpressionError(item.span, Code.TYPE_MISMATCH, f"a list of {items[0].kind} cannot hold {item.kind}")
-    return Listed(ListKind(element, len(items)), span, tuple(items))
-
-
-def element_of(holder: Node, index: Node, span: SourceSpan) -> Element:
-    """`holder[index]`."""
-    kind, position = holder.kind, constant_of(index)
-    if not isinstance(kind, ListKind) or kind.element is None:
-        raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {kind} has no elements", "only lists are indexed")
-    if not isinstance(position, int) or isinstance(position, bool) or position < 0:
-        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
-    if kind.length is not None and position >= kind.length:
-        raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} of {kind.length} elements")
-    return Element(kind.element, span, holder, position)
+def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False) -> tuple[IntKind, bool]:
+    """The kind of an integer between these, and whether others may have to be refused at run time."""
+    found = [*extremes]
+    kind, is_checked = within_64_bits(found, is_rounded)
+    if kind is None or (is_checked and min(found) == max(found)):
+        message = "an integer has 64 bits, and this one never fits"
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"they hold {INT64.low} to {UINT64.high}")
+    return kind, is_checked
 
 
 LARGEST_EXPONENT = 8
@@ -138,16 +115,6 @@ _DIVISIONS = (Operator.DIVIDE, Operator.FLOOR_DIVIDE, Operator.MODULO)
 # arithmetic
 
 
-def as_float(operand: Node, kind: Kind) -> Node:
-    """An operand of what gives a value of `kind`: where that is a float, an integer becomes one."""
-    if not isinstance(kind, FloatKind) or as_int(operand.kind) is None:
-        return operand
-    literal = constant_of(operand)
-    if literal is None:
-        return Call(kind, operand.span, "float64", (operand,))
-    return Constant(kind, operand.span, float(literal))
-
-
 def unary(op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
     if isinstance(op, ast.Not):
         want_bool(operand, "not")
@@ -155,17 +122,18 @@ def unary(op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
     if not isinstance(op, (ast.USub, ast.UAdd)):
         raise forbidden(op, span)
     _want_number(operand)
-    is_negated = isinstance(op, ast.USub)
-    kind: Kind = as_int(operand.kind) or operand.kind
-    if isinstance(kind, IntKind) and kind.bounds and is_negated:
-        low, high = kind.bounds
-        kind = IntKind(-high, -low)
-    value = constant_of(operand)
+    value, number = constant_of(operand), as_int(operand.kind)
+    if isinstance(op, ast.UAdd):
+        if number is None or number == operand.kind:
+            return operand
+        return Call(number, span, "int", (operand,)) if value is None else Constant(number, span, value)
+    kind: Kind = FloatKind(float_bits(operand.kind))
+    is_checked = False
+    if number is not None:
+        kind, is_checked = integer((-number.low, -number.high), span, number.is_rounded)
     if isinstance(value, (int, float)):
-        return Constant(kind, span, -value if is_negated else value)
-    if is_negated:
-        return Unary(kind, span, Operator.NEGATE, operand)
-    return operand if kind == operand.kind else Call(kind, span, "int", (operand,))
+        return Constant(kind, span, -value)
+    return Unary(kind, span, Operator.NEGATE, operand, is_checked)
 
 
 def want_binary(op: ast.operator, span: SourceSpan) -> Operator:
@@ -184,8 +152,15 @@ def binary(op: Operator, left: Node, right: Node, span: SourceSpan) -> Node:
     _want_number(right)
     if op in _DIVISIONS and constant_of(right) == 0:
         raise _division_by_zero(span)
-    kind = _power(left.kind, right) if op is Operator.POWER else _arithmetic(op, left.kind, right.kind, span)
-    return folded(Binary(within_bounds(kind, span), span, op, left, right))
+    a, b = as_int(left.kind), _exponent(right) if op is Operator.POWER else as_int(right.kind)
+    if a is None or b is None or op is Operator.DIVIDE:
+        is_power = op is Operator.POWER  # whose exponent is a literal
+        bits = float_bits(left.kind) if is_power else max(float_bits(left.kind), float_bits(right.kind))
+        return folded(Binary(FloatKind(bits), span, op, left, right))
+    if (b.low, b.high) == (0, 0) and op in _DIVISIONS:
+        raise _division_by_zero(span)
+    kind, is_checked = integer(_extremes(op, a, b), span, a.is_rounded or b.is_rounded)
+    return folded(Binary(kind, span, op, left, right, is_checked))
 
 
 def folded(made: Binary) -> Binary | Constant:
@@ -201,47 +176,30 @@ def folded(made: Binary) -> Binary | Constant:
         raise ExpressionError(
             made.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is meant"
         )
-    kind = IntKind(value, value) if isinstance(value, int) else made.kind
-    return Constant(kind, made.span, value)
+    return constant(value, made.span)
 
 
-def _arithmetic(op: Operator, left: Kind, right: Kind, span: SourceSpan) -> IntKind | FloatKind:
-    a, b = as_int(left), as_int(right)
-    if a is None or b is None or op is Operator.DIVIDE:
-        return FloatKind(max(float_bits(left), float_bits(right)))
-    if a.bounds is None or b.bounds is None:
-        return ANY_INT
-    if b.bounds == (0, 0) and op in _DIVISIONS:
-        raise _division_by_zero(span)
-    extremes = _extremes(op, a.bounds, b.bounds)
-    return IntKind(min(extremes), max(extremes))
-
-
-def _extremes(op: Operator, left: tuple[int, int], right: tuple[int, int]) -> list[int]:
+def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:
     """Integers that include the smallest and the largest value of `left op right`."""
-    low, high = right
+    bounds, (low, high) = (left.low, left.high), (right.low, right.high)
     if op in _MONOTONE:
-        return [_COMPUTED[op](x, y) for x in left for y in right]
+        return [_COMPUTED[op](x, y) for x in bounds for y in (low, high)]
+    if op is Operator.POWER:
+        return [left.low**high, left.high**high, *[0] * (left.low < 0 < left.high)]
     if op is Operator.MODULO:  # has the divisor's sign
         return [min(low + 1, 0), max(high - 1, 0)]
     divisors = [y for y in (low, high, -1, 1) if low <= y <= high and y != 0]
-    return [x // y for x in left for y in divisors]
+    return [x // y for x in bounds for y in divisors]
 
 
-def _power(base: Kind, exponent: Node) -> IntKind | FloatKind:
-    value = constant_of(exponent)
+def _exponent(node: Node) -> IntKind:
+    """The range of an exponent, which is a literal."""
+    value = constant_of(node)
     if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
         message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
         hint = "sqrt(x) is the root, 1 / x ** 2 has a negative exponent"
-        raise ExpressionError(exponent.span, Code.FORBIDDEN_EXPRESSION, message, hint)
-    number = as_int(base)
-    if number is None:
-        return FloatKind(float_bits(base))
-    if number.bounds is None:
-        return ANY_INT
-    low, high = number.bounds
-    extremes = [low**value, high**value, *[0] * (low < 0 < high)]
-    return IntKind(min(extremes), max(extremes))
+        raise ExpressionError(node.span, Code.FORBIDDEN_EXPRESSION, message, hint)
+    return IntKind(value, value)
 
 
 def _division_by_zero(span: SourceSpan) -> ExpressionError:
@@ -257,6 +215,8 @@ def _want_number(operand: Node) -> None:
 
 # truth
 
+_OF_LISTS = "of a list, compare an element, len(x), min(x) or max(x), or write `value in x`"
+
 
 def boolean(op: ast.boolop, operands: Sequence[Node], span: SourceSpan) -> Logic:
     is_all = isinstance(op, ast.And)
@@ -265,25 +225,35 @@ def boolean(op: ast.boolop, operands: Sequence[Node], span: SourceSpan) -> Logic
     return Logic(BoolKind(), span, is_all, tuple(operands))
 
 
-def comparison(ops: Sequence[ast.cmpop], operands: Sequence[Node], span: SourceSpan) -> Node:
+def comparison(ops: Sequence[ast.cmpop], operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
     """`a < b < c` has two operators and three operands."""
     for op, (left, right) in zip(ops, pairwise(operands), strict=True):
         _want_comparable(op, left, right, span)
     if not any(isinstance(op, (ast.In, ast.NotIn)) for op in ops):
         return Compare(BoolKind(), span, tuple(_RELATIONS[type(op)] for op in ops), tuple(operands))
-    tests = [_test(op, left, right, span) for op, (left, right) in zip(ops, pairwise(operands), strict=True)]
+    tests = [_test(op, left, right, span, scope) for op, (left, right) in zip(ops, pairwise(operands), strict=True)]
     return tests[0] if len(tests) == 1 else Logic(BoolKind(), span, True, tuple(tests))
 
 
-def _test(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -> Compare | Contains:
+def _test(op: ast.cmpop, left: Node, right: Node, span: SourceSpan, scope: Scope) -> Compare | Contains:
     if isinstance(op, (ast.In, ast.NotIn)):
-        return Contains(BoolKind(), span, left, right, isinstance(op, ast.NotIn))
+        return Contains(BoolKind(), span, left, as_value(right, scope), isinstance(op, ast.NotIn))
     return Compare(BoolKind(), span, (_RELATIONS[type(op)],), (left, right))
 
 
 def equality(left: Node, right: Node, span: SourceSpan) -> Node:
     """`left == right`."""
-    return comparison([ast.Eq()], [left, right], span)
+    _want_comparable(ast.Eq(), left, right, span)
+    return Compare(BoolKind(), span, (Relation.EQUAL,), (left, right))
+
+
+def _comparison_hint(left: Node, right: Node) -> str:
+    kinds = (left.kind, right.kind)
+    if any(isinstance(kind, MessageKind) for kind in kinds):
+        return "compare its fields"
+    if any(map(is_list, kinds)):
+        return _OF_LISTS
+    return _comparable_value(left, right) or _comparable_value(right, left)
 
 
 def _comparable_value(held: Node, written: Node) -> str:
@@ -304,27 +274,30 @@ def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -
         )
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
-        if not isinstance(right.kind, ListKind):
+        if not is_list(right.kind):
             raise ExpressionError(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
-        other = right.kind.element
-    if other is None or isinstance(left.kind, (MessageKind, ListKind)) or join(left.kind, other) is None:
+        other = element_of(right.kind)
+    if other is None or isinstance(left.kind, MessageKind) or is_list(left.kind) or join(left.kind, other) is None:
         message = f"{left.kind} cannot be compared with {right.kind}"
-        hint = _comparable_value(left, right) or _comparable_value(right, left)
-        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, _comparison_hint(left, right))
     if isinstance(op, (ast.Lt, ast.LtE, ast.Gt, ast.GtE)) and isinstance(left.kind, BoolKind):
         raise ExpressionError(span, Code.TYPE_MISMATCH, "bools have no order", "use == or !=")
 
 
-def choice(test: Node, body: Node, orelse: Node, span: SourceSpan) -> Choice:
+def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope) -> Choice:
     """`body if test else orelse`, where `test` is a bool."""
     kind = join(body.kind, orelse.kind)
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
-    return Choice(kind, span, test, as_float(body, kind), as_float(orelse, kind))
+    if isinstance(kind, MessageKind) or isinstance(element_of(kind), MessageKind):
+        message, hint = f"a choice cannot give a whole {kind}", "choose at each field, as in a.x if c else b.x"
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
+    return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 
 
 def want_bool(operand: Node, word: str) -> None:
     if not isinstance(operand.kind, BoolKind):
-        hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else ""
+        hint = _OF_LISTS if is_list(operand.kind) else ""
+        hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else hint
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"'{word}' takes a bool, not {operand.kind}", hint)

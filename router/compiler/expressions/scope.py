@@ -9,7 +9,7 @@ from itertools import count
 from router.compiler.expressions.kinds import MessageKind, kind_of
 from router.compiler.expressions.tree import MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
 from router.errors import Code, Diagnostic, SourceSpan
-from router.types.model import Enum, Field, MessageType
+from router.types.model import Enum, Field, List, MessageType, String
 
 
 class ExpressionError(Exception):
@@ -69,3 +69,27 @@ class Scope:
 def field_of(holder: Node, member: Field, span: SourceSpan) -> Read:
     """A field of the message that `holder` is."""
     return Read(kind_of(member.type), span, holder, member)
+
+
+def want_readable(node: Node) -> None:
+    """Raise ExpressionError for a field that expressions do not read, or that is in one."""
+    if not isinstance(node, Read):
+        return
+    want_readable(node.holder)
+    what = _unreadable(node.field)
+    if what is not None:
+        kind, hint = what
+        message = f"'{node.field.name}' is a {kind}, which expressions do not read"
+        raise ExpressionError(node.span, Code.FORBIDDEN_EXPRESSION, message, hint)
+
+
+def _unreadable(member: Field) -> tuple[str, str] | None:
+    """What a field is that expressions do not read, and what to do; None for all others."""
+    declared = member.type.element if isinstance(member.type, List) else member.type
+    if isinstance(declared, MessageType) and declared.is_map_entry:
+        return "map", "destinations get it as it came; for a topic, declare a list of messages with key and value"
+    if member.is_group:
+        return "group", "destinations get it as it came; for a topic, declare it as a message"
+    if isinstance(declared, String) and declared.wide:
+        return "wstring", "declare it as a string"
+    return None

@@ -8,6 +8,7 @@ CONDITIONAL = "write `b if a else c`"
 LEFT_OUT = "a field that is left out keeps its default; `when` keeps a message from being sent"
 ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
+DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
 
 SQUARE = "write x ** 2; there is no power of bits"
@@ -71,13 +72,13 @@ FUNCTIONS = {
     "asin": "write atan2(x, sqrt(1 - x * x))",
     "acos": "write atan2(sqrt(1 - x * x), x)",
     "map": "values are chosen by {map: FIELD, VALUE: ..., else: ...}",
-    "text": "text is {text: WORD}, or in quotes",
     "received_at": "write it without brackets",
     "bool": "compare: x != 0",
     "constrain": "write clamp(x, low, high)",
     **dict.fromkeys(("rad", "deg2rad", "to_radians", "degtorad"), "write radians(x)"),
     **dict.fromkeys(("deg", "rad2deg", "to_degrees", "radtodeg"), "write degrees(x)"),
-    "to_string": "write str(x)",
+    "to_string": "write str(x), or text(x, 2) for decimals",
+    **dict.fromkeys(("avg", "mean", "average"), "write sum(x) / len(x)"),
     "now": ARRIVAL,
     "time": ARRIVAL,
 }

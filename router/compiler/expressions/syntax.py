@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import ast
 import io
+import keyword
+import re
 import tokenize
 import warnings
+from collections.abc import Collection
 from contextlib import suppress
 
 from router.compiler.expressions import spellings
@@ -18,10 +21,14 @@ from router.table.model import Expression
 
 
 class Parsed:
-    """A parsed expression with its syntax `tree`. Raises ExpressionError if it is no Python expression."""
+    """A parsed expression with its syntax `tree`. Raises ExpressionError if it is no Python expression.
 
-    def __init__(self, expression: Expression) -> None:
-        text = expression.text.replace("\n", " ")
+    `names` are those of fields and variables, some of which may be words of Python.
+    """
+
+    def __init__(self, expression: Expression, names: Collection[str] = ()) -> None:
+        text = _with_words_as_names(expression.text.replace("\n", " "))
+        self._names = names
         self._expression = expression
         self._indent = len(text) - len(text.lstrip())
         self._encoded = text.lstrip().encode(errors="replace")
@@ -41,11 +48,18 @@ class Parsed:
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
             message = f"not an expression: {reason}"
-            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, spellings.of_syntax(text)) from None
+            hint = self._of_word(text) or spellings.of_syntax(self._expression.text)
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise ExpressionError(
                 self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}"
             ) from None
+
+    def _of_word(self, text: str) -> str:
+        """A hint if a field's name, which has a meaning of its own here, stands alone."""
+        words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"]}
+        named = sorted(_MEANINGFUL & words & {*self._names})
+        return f"write message.{named[0]} for the field '{named[0]}'" if named else ""
 
     def _blamed(self, error: SyntaxError) -> SourceSpan:
         """The position of a syntax error, which counts characters from 1, may have none, or end on another line."""
@@ -66,6 +80,37 @@ class Parsed:
     def _characters(self, offset: int) -> int:
         """The offset in characters for one in UTF-8 bytes, which ast counts."""
         return self._indent + len(self._encoded[:offset].decode(errors="replace"))
+
+
+_MEANINGFUL = frozenset(
+    {"and", "or", "not", "in", "is", "if", "else", "True", "False", "None", "lambda", "for", "await", "yield"}
+)
+"""Words of Python that are no names in an expression, but behind a dot."""
+
+_LEXEMES = re.compile(
+    r"""
+    '(?:\\.|[^'\\])*' | "(?:\\.|[^"\\])*" |             # quoted
+    \d[\d_]*(?:\.[\d_]*)?(?:[eE][-+]?\d+)?\w* |         # a number
+    (?P<dot>\.\s*)? (?P<name>[^\W\d]\w*)
+    """,
+    re.VERBOSE,
+)
+_WIDE = {chr(letter): chr(letter + 0xFEE0) for letter in range(ord("A"), ord("z") + 1) if chr(letter).isalpha()}
+
+
+def _with_words_as_names(text: str) -> str:
+    """The text with Python's words made names where fields may be meant, in as many characters.
+
+    Python reads a name of wide letters as one of ordinary letters, but no word.
+    """
+
+    def replaced(found: re.Match[str]) -> str:
+        dot, name = found["dot"] or "", found["name"]
+        if not name or not keyword.iskeyword(name) or (name in _MEANINGFUL and not dot):
+            return found[0]
+        return dot + _WIDE[name[0]] + name[1:]
+
+    return _LEXEMES.sub(replaced, text)
 
 
 def _comment(text: str) -> int | None:

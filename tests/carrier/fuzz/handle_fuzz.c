@@ -8,7 +8,7 @@
 enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 3 + REASONS };
 /* Counters of the one route behind those of listeners. */
 enum { ROUTE = LISTENERS * OF_LISTENER, ACCEPTED = ROUTE, SENT, SENT_BYTES, STALE, LIMITED, FULL, FAILED, WAITING,
-       QUEUE_FULL, FILTERED, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
+       QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
 
 int LLVMFuzzerInitialize(int *count, char ***arguments);
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
@@ -19,13 +19,26 @@ static const uint8_t wanted = 1;
 static const uint8_t *const topics[] = {&wanted};
 static const struct waiting target = {1, WAITING, QUEUE_FULL, FILTERED};
 static struct sender nowhere = {.fd = -1};
+/* A condition on the first field that every payload may have. */
+static const struct node_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .node = NONE,
+                                            .choice = NONE, .closed = NONE}};
+static const struct node nodes[] = {[NODE_PAYLOAD] = {.fields = fields, .count = 1}, [NODE_ENVELOPE] = {.count = 0}};
+static const struct value defaults[3], sources[COLUMNS];
+static const struct layout layout = {.nodes = nodes, .defaults = defaults, .slot_count = 3};
+static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6}, {.kind = OP_LOAD, .slot = 2},
+                                             {.kind = OP_DIVIDE}};
+
 static const struct target destinations[] = {
     {.sender = &nowhere, .limit = &limit, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
      .dropped = {[LOSS_STALE] = STALE, [LOSS_RATE_LIMITED] = LIMITED, [LOSS_SEND_BUFFER_FULL] = FULL,
-                 [LOSS_SEND_ERROR] = FAILED}}};
+                 [LOSS_SEND_ERROR] = FAILED}},
+    {.sender = &nowhere, .condition = {condition, 3, 0}, .filtered = UNMET,
+     .dropped = {[LOSS_MAPPING_ERROR] = REFUSED, [LOSS_STALE] = MET, [LOSS_SEND_ERROR] = MET}}};
 static struct part part = {.wanted = topics, .targets = &target, .wanted_count = 1, .target_count = 1};
 static const struct route only = {
-    .sends = {.ttl = 1000000000, .targets = destinations, .count = 1, .topic = NO_NAME}, .parts = &part, .part_count = 1,
+    .sends = {.ttl = 1000000000, .layout = &layout, .sources = sources, .targets = destinations, .count = 2,
+              .topic = NO_NAME},
+    .parts = &part, .part_count = 1,
     .last_message = LAST_MESSAGE, .duration = DURATION};
 static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
 static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
@@ -80,6 +93,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     }
     demand(balance == 0);
     demand(counters[ACCEPTED] == counters[STALE] + counters[LIMITED] + counters[FAILED]);
+    demand(counters[ACCEPTED] == counters[MET] + counters[UNMET] + counters[REFUSED]);
     demand(counters[ACCEPTED] == counters[WAITING] + counters[QUEUE_FULL]);
     return 0;
 }

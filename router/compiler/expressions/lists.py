@@ -1,0 +1,147 @@
+"""Lists in expressions: literals, elements, and what is computed element by element."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from router.compiler.expressions.kinds import (
+    FloatKind,
+    IntKind,
+    Kind,
+    ListKind,
+    MessageKind,
+    as_int,
+    element_of,
+    is_list,
+    join,
+    length_of,
+)
+from router.compiler.expressions.scope import ExpressionError, Scope
+from router.compiler.expressions.tree import Call, Constant, Each, Element, Listed, Node, Variable, constant_of
+from router.errors import Code, SourceSpan
+
+Make = Callable[[Sequence[Node]], Node]
+"""Makes a node of scalar operands. Raises ExpressionError."""
+
+
+def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
+    """A list literal, whose elements have one kind in common; each keeps its own."""
+    element: Kind | None = items[0].kind if items else None
+    for item in items[1:]:
+        element = join(element, item.kind) if element else None
+        if element is None:
+            raise ExpressionError(item.span, Code.TYPE_MISMATCH, f"a list of {items[0].kind} cannot hold {item.kind}")
+    return Listed(ListKind(element, len(items)), span, tuple(items))
+
+
+def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
+    """`holder[index]`."""
+    element, length, position = element_of(holder.kind), length_of(holder.kind), constant_of(index)
+    if element is None:
+        raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {holder.kind} has no elements", "only lists are indexed")
+    if not isinstance(position, int) or isinstance(position, bool) or position < 0:
+        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
+    if length is not None and position >= length:
+        raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} of {length} elements")
+    if isinstance(holder, Listed) and isinstance(element, MessageKind):
+        return holder.items[position]
+    return Element(element, span, as_value(holder, scope), position)
+
+
+# element by element
+
+
+def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
+    """What `make` makes of scalars, or of the elements of lists that are taken side by side."""
+    lists = [operand for operand in operands if is_list(operand.kind)]
+    if not lists:
+        return make(operands)
+    length = _common_length(lists, span)
+    if any(isinstance(operand, Listed) for operand in lists):
+        _want_known_lengths(lists)
+        assert length is not None  # noqa: S101 - that of the literal
+        return list_of([make([_pick(operand, index) for operand in operands]) for index in range(length)], span)
+    pairs: list[tuple[str, Node]] = []
+    elements: list[Node] = []
+    for operand in operands:
+        if isinstance(operand, Each):
+            pairs += operand.lists
+            elements.append(operand.element)
+        elif (kind := element_of(operand.kind)) is not None:
+            variable = Variable(kind, operand.span, scope.element_variable())
+            pairs.append((variable.name, operand))
+            elements.append(variable)
+        else:
+            elements.append(operand)
+    made = make(elements)
+    return Each(ListKind(made.kind, length), span, tuple(pairs), made)
+
+
+def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
+    """The length of all these lists, None if it is known of none."""
+    lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
+    if len(lengths) > 1:
+        message = f"lists of {' and '.join(map(str, lengths))} elements cannot go side by side"
+        hint = "give them one length"
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
+    return lengths[0] if lengths else None
+
+
+def _want_known_lengths(lists: Sequence[Node]) -> None:
+    """Refuse a list of any length beside a literal."""
+    for each in lists:
+        if length_of(each.kind) is None:
+            message = "only a list of known length can stand beside a list literal"
+            hint = "index it, as in [a * x[0], b * x[1]]"
+            raise ExpressionError(each.span, Code.TYPE_MISMATCH, message, hint)
+
+
+def _pick(operand: Node, index: int) -> Node:
+    """An element of a list of known length; another operand counts for every element."""
+    if isinstance(operand, Listed):
+        return operand.items[index]
+    kind = element_of(operand.kind)
+    return operand if kind is None else Element(kind, operand.span, operand, index)
+
+
+# conversion to a common kind
+
+
+def as_value(operand: Node, scope: Scope) -> Node:
+    """A list literal that is used as one value: its elements have the kind that they have in common."""
+    return as_kind(operand, operand.kind, scope) if isinstance(operand, Listed) else operand
+
+
+def as_kind(operand: Node, kind: Kind, scope: Scope) -> Node:
+    """An operand of what gives a value of `kind`: an integer where that is a float, or where it may not fit."""
+    wanted = element_of(kind) if is_list(kind) else None
+    if wanted is not None:
+        kinds = [item.kind for item in operand.items] if isinstance(operand, Listed) else [element_of(operand.kind)]
+        if not any(_has_to_be_converted(each, wanted) for each in kinds):
+            return operand
+        return elementwise(lambda parts: as_kind(parts[0], wanted, scope), [operand], operand.span, scope)
+    if not _has_to_be_converted(operand.kind, kind):
+        return operand
+    if isinstance(kind, IntKind):
+        return fitted(operand, kind)
+    literal = constant_of(operand)
+    if literal is None:
+        return Call(kind, operand.span, "float64", (operand,))
+    return Constant(kind, operand.span, float(literal))
+
+
+def _has_to_be_converted(given: Kind | None, wanted: Kind) -> bool:
+    if given is None:
+        return False
+    if is_list(given):
+        return (inner := element_of(wanted)) is not None and _has_to_be_converted(element_of(given), inner)
+    number = as_int(given)
+    if number is None:
+        return False
+    return isinstance(wanted, FloatKind) or (isinstance(wanted, IntKind) and not wanted.holds(number))
+
+
+def fitted(value: Node, kind: IntKind) -> Call:
+    """An integer, refused at run time if it is outside of a range."""
+    low, high = (Constant(IntKind(bound, bound), value.span, bound) for bound in (kind.low, kind.high))
+    return Call(kind, value.span, "fit", (value, low, high))

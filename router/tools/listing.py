@@ -1,0 +1,281 @@
+"""What `router explain --code` lists: what the carrier reads of a message, and its operations with their places.
+
+Operations have the names of `native/operations.h`, which says what they do.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from router.compiler.checked import CheckedRoute
+from router.compiler.lowering import Lowered, LoweredElements, LoweredTarget
+from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
+from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
+from router.compiler.program import Handler, Program, TargetPlan
+from router.errors import plural
+
+_INDENT = "  "
+_MOST_SHOWN = 16
+"""Bytes of a literal that are shown."""
+
+
+def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
+    """All code of a route: the programs of the carrier, and handlers of targets that need Python."""
+    lowered: Lowered = program.lowered
+    name = checked.route.name
+    for kind, routes in (("destination", lowered.conditions), ("topic", lowered.topics)):
+        if name in routes:
+            yield from _layout(routes[name].layout)
+            for target in routes[name].targets.values():
+                yield from _target(kind, target, routes[name].layout)
+    for topic, feeds in lowered.from_ros.items():
+        for feed in feeds:
+            if feed.route == name:
+                yield ""
+                yield f"  from topic {topic}"
+                yield from _layout(feed.layout)
+                if feed.for_each is not None:
+                    yield from _for_each(feed.for_each, feed.layout, next(iter(feed.targets.values())))
+                for target in feed.targets.values():
+                    yield from _target("destination", target, feed.layout)
+
+
+def python_of(checked: CheckedRoute, program: Program) -> Iterator[str]:
+    """The functions of the targets that need Python."""
+    for handler in program.handlers:
+        if handler.route == checked.route.name and (by_python := _by_python(handler, program)):
+            yield handler.part(by_python).source.text()
+
+
+def _by_python(handler: Handler, program: Program) -> list[TargetPlan]:
+    def place(target: TargetPlan) -> tuple[str, str | None, str | None]:
+        return (handler.route, target.label, None) if target.is_topic else (handler.route, handler.topic, target.label)
+
+    return [target for target in handler.targets if not program.executors[place(target)].is_carrier]
+
+
+# ---- what is read
+
+
+def _layout(layout: Layout) -> Iterator[str]:
+    for number, (node, message) in enumerate(zip(layout.nodes, layout.messages, strict=True)):
+        if node.entries:
+            yield ""
+            yield f"  reads {message}, node {number}"
+        yield from _fields([entry for entry in node.entries if isinstance(entry, NodeField)], layout)
+        depth = 2
+        for step in node.entries:
+            if isinstance(step, ReadOperation):
+                depth -= step.kind is ReadKind.AGAIN
+                yield _INDENT * depth + _step(step, layout)
+                depth += step.kind in (ReadKind.EACH, ReadKind.EACH_SEQUENCE)
+
+
+def _fields(fields: list[NodeField], layout: Layout) -> Iterator[str]:
+    """The fields of a protobuf message of which something is read, and the slots that say which member a oneof has."""
+    for field in fields:
+        places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
+        places += [f"node {field.node}"] if field.node != NONE else []
+        if places:
+            repeated = "repeated " * field.is_repeated
+            yield f"    field {field.number}: {repeated}{_word(field.type)} -> {', '.join(places)}"
+    for choice in dict.fromkeys(field.choice for field in fields if field.choice != NONE):
+        yield f"    oneof -> {_slot(choice, layout)}"
+
+
+def _step(step: ReadOperation, layout: Layout) -> str:
+    """One step through a ROS message."""
+    to = f" -> {_slot(step.slot, layout)}" if step.slot != NONE else ""
+    match step.kind:
+        case ReadKind.SCALAR:
+            return f"{_word(step.type)}{to}"
+        case ReadKind.SKIP:
+            aligned = f", aligned to {step.size}" if step.size > 1 else ""
+            return f"skip {plural(step.elements * step.size, 'byte')}{aligned}"
+        case ReadKind.ARRAY:
+            return f"{_word(step.type)}[{step.elements}]{to}"
+        case ReadKind.SEQUENCE if to:
+            return f"{_word(step.type)}[]{to}"
+        case ReadKind.SEQUENCE:
+            return f"skip a sequence, of {plural(step.size, 'byte')} each"
+        case ReadKind.EACH:
+            return f"each of {step.elements}{to}"
+        case ReadKind.EACH_SEQUENCE:
+            return f"each of a sequence{to}"
+        case _:
+            return f"{_word(step.kind)}{to}"
+
+
+# ---- operations
+
+
+def _target(kind: str, target: LoweredTarget, layout: Layout) -> Iterator[str]:
+    yield ""
+    yield f"  {kind} {target.label}"
+    _, when, _, *places = target.places
+    yield from _listed(target.condition, [when] * len(target.condition), layout)
+    yield from _listed(target.message, places, layout)
+
+
+def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) -> Iterator[str]:
+    _, _, place, *_ = target.places
+    yield ""
+    yield f"  elements, {_stored(elements.scalar)}"
+    yield from _listed(elements.code, [place] * len(elements.code), layout)
+    slots = [_slot(each, layout) for each in (elements.item, elements.index, elements.count) if each != NONE]
+    into = [f"node {elements.node}"] * (elements.node != NONE) + slots
+    yield f"    each -> {', '.join(into)}" if into else "    each"
+
+
+def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:
+    """One operation a line, by number; a line for each place where that changes. Loops are indented."""
+    depth = 0
+    before = ""
+    for number, (operation, place) in enumerate(zip(code, places, strict=True)):
+        if place != before:
+            span, _, field = place.partition(": ")
+            yield f"    # {field}  ({span})" if field else f"    # {span}"
+            before = place
+        depth -= operation.kind is Op.AGAIN
+        words = _OPERANDS.get(operation.kind, _signs)(_Line(number, operation, layout))
+        yield f"    {number:4}  {_INDENT * depth}{_word(operation.kind):16}  {words}".rstrip()
+        depth += operation.kind is Op.REPEAT
+
+
+_RELATIONS = {
+    Relation.EQUAL: "==",
+    Relation.UNEQUAL: "!=",
+    Relation.LESS: "<",
+    Relation.LESS_OR_EQUAL: "<=",
+    Relation.MORE: ">",
+    Relation.MORE_OR_EQUAL: ">=",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """An operation and its number in the code."""
+
+    number: int
+    operation: Operation
+    layout: Layout
+
+    @property
+    def index(self) -> int:
+        """The operation's `slot` as a number."""
+        slot = self.operation.slot
+        return slot if isinstance(slot, int) else slot.index
+
+
+def _of_slot(line: _Line) -> str:
+    return _slot(line.index, line.layout)
+
+
+def _jump(line: _Line) -> str:
+    return f"to {line.number + 1 + line.operation.size}"
+
+
+def _number(line: _Line) -> str:
+    return repr(line.operation.number)
+
+
+def _text(line: _Line) -> str:
+    return repr(line.operation.data.decode("utf-8", "backslashreplace"))
+
+
+def _known(line: _Line) -> str:
+    data = line.operation.data
+    shown = data[:_MOST_SHOWN].hex(" ")
+    rest = f" ... ({len(data)} bytes)" if len(data) > _MOST_SHOWN else ""
+    return shown + rest + (f", aligned to {line.index}" if line.index > 1 else "")
+
+
+def _repeat(line: _Line) -> str:
+    return f"up to {line.number + line.operation.size}" + ", keeping what is made" * bool(line.operation.flag)
+
+
+def _compare(line: _Line) -> str:
+    return f"{_RELATIONS[Relation(line.operation.flag)]}  {_word(Compared(line.index))}"
+
+
+def _member(line: _Line) -> str:
+    numbers = struct.unpack(f"<{line.operation.size}i", line.operation.data)
+    return f"of {', '.join(map(str, numbers))}"
+
+
+def _of_stored(line: _Line) -> str:
+    return _stored(Scalar(line.operation.flag))
+
+
+def _element(line: _Line) -> str:
+    return f"[{line.operation.number}], {_of_stored(line)}"
+
+
+def _tag(line: _Line) -> str:
+    """The field of a protobuf message; packed elements have none."""
+    return f"field {line.operation.size >> 3}" if line.operation.size else "no tag"
+
+
+def _open(line: _Line) -> str:
+    return _tag(line) + ", left out if empty" * (not line.operation.flag)
+
+
+def _write(line: _Line) -> str:
+    return _tag(line) + ", also if 0 or empty" * bool(line.operation.flag)
+
+
+def _signs(line: _Line) -> str:
+    """Which integers are unsigned."""
+    named = [_word(sign) for sign in Sign if line.operation.flag & sign]
+    return f"unsigned: {', '.join(named)}" if named else ""
+
+
+_OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
+    Op.INTEGER: _number,
+    Op.REAL: _number,
+    Op.TEXT: _text,
+    Op.LOAD: _of_slot,
+    Op.KEEP: _of_slot,
+    Op.JUMP: _jump,
+    Op.UNLESS: _jump,
+    Op.AND: _jump,
+    Op.OR: _jump,
+    Op.COMPARE: _compare,
+    Op.DIGITS: lambda line: plural(line.index, "decimal"),
+    Op.FIT_SIZE: lambda line: f"at most {_number(line)} bytes",
+    Op.OCTETS: _of_stored,
+    Op.MEMBER: _member,
+    Op.ELEMENT: _element,
+    Op.ENTER: lambda line: f"node {line.index}, {line.layout.messages[line.index]}",
+    Op.REPEAT: _repeat,
+    Op.NEXT: _of_slot,
+    Op.LIST: lambda line: f"of {line.operation.size}",
+    Op.UNPACK: _of_stored,
+    Op.APPEND: _of_slot,
+    Op.KNOWN: _known,
+    Op.PUT: lambda line: plural(line.index, "byte"),
+    Op.OPEN: _open,
+    Op.WRITE_VARINT: _write,
+    Op.WRITE_ZIGZAG: _write,
+    Op.WRITE_FIXED32: _write,
+    Op.WRITE_FIXED64: _write,
+    Op.WRITE_FLOAT: _write,
+    Op.WRITE_DOUBLE: _write,
+    Op.WRITE_BYTES: _write,
+}
+"""What is said of an operation; of others, which integers are unsigned."""
+
+
+def _slot(slot: int, layout: Layout) -> str:
+    return f"slot {slot}  {layout.names[slot]}".rstrip()
+
+
+def _stored(scalar: Scalar) -> str:
+    return "in cells" if scalar is Scalar.IN_CELLS else f"{_word(scalar)} in a row"
+
+
+def _word(member: Enum) -> str:
+    return member.name.lower()

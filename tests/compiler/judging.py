@@ -1,0 +1,242 @@
+"""The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
+
+A question is a mapping with a condition, from a payload to a ROS message or the other way. A plane answers with bytes,
+FILTERED, or the reason of a refusal. The oracle gives what it may answer.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Any, Union
+
+from router.compiler.cdr import CdrReads, write_message
+from router.compiler.expressions import ExpressionError, Scope, check
+from router.compiler.expressions.tree import Node, paths_in
+from router.compiler.mapping import build
+from router.compiler.namespace import NAMESPACE
+from router.compiler.payload import write_envelope
+from router.compiler.plan import Record, expressions
+from router.compiler.python import NO_VALUES, render
+from router.compiler.source import Source
+from router.engine.delivery import MAPPING_FAILURES
+from router.errors import Code, Diagnostic, NonFiniteError
+from router.rehearsal.cdr import deserialize
+from router.rehearsal.cdr import serialize as cdr
+from router.table.model import Expression, FieldEntry, FieldMap
+from router.types.model import Enum, MessageType, Type
+from router.types.protobuf import PayloadCase
+from tests.carrier.messages import some_payloads
+from tests.compiler.comparing import same
+from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, written
+from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
+from tests.oracles.reference import fill, fill_given
+from tests.oracles.reference_expressions import meaning_of
+from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused, View
+from tests.oracles.reference_protobuf import envelope_of
+
+FILTERED = "filtered"
+Answer = Union[bytes, str]
+Plane = Callable[["Question"], Callable[[bytes], Answer]]
+"""Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
+
+_ABOUT_VALUES = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS, Code.LOSSY_CONVERSION, Code.UNKNOWN_ENUM_VALUE}
+_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds")
+
+
+def is_about_values(finding: Diagnostic) -> bool:
+    """Whether a well-typed question can have this finding: about ranges, lengths, NaN, names of an enum."""
+    return finding.code in _ABOUT_VALUES or any(word in finding.message for word in _ABOUT_LENGTHS)
+
+
+class Misfit(Exception):
+    """What the compiler finds wrong with a question."""
+
+    def __init__(self, findings: Collection[Diagnostic]) -> None:
+        super().__init__(*findings)
+        self.findings = findings
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    language: Language
+    fields: FieldMap
+    when: Expression | None
+    target: MessageType
+
+    @property
+    def source(self) -> MessageType:
+        return self.language.source
+
+    @property
+    def case(self) -> PayloadCase:
+        """That a message from ROS fills."""
+        return language_wire()[1].cases["target"]
+
+    @property
+    def enums(self) -> tuple[Enum, ...]:
+        return tuple(language_wire()[0].enums.values())
+
+    def scope(self) -> Scope:
+        return Scope(self.source, self.enums, ())
+
+    def checked(self) -> tuple[Node | None, Record]:
+        """The compiler's trees. Raises Misfit."""
+        scope = self.scope()
+        try:
+            condition = check(self.when, scope) if self.when else None
+        except ExpressionError as error:
+            raise Misfit([error.diagnostic]) from None
+        mapping = build(self.fields, self.target, scope, SPAN)
+        if mapping.findings:
+            raise Misfit(mapping.findings)
+        assert isinstance(mapping.plan, Record)
+        return condition, mapping.plan
+
+    def __str__(self) -> str:
+        fields = ", ".join(f"{entry.path[-1]}: {entry.value}" for entry in self.fields.entries)
+        types = ", ".join(str(self._type_of(entry.path[-1])) for entry in self.fields.entries)
+        return f"{'ros' if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
+
+    def _type_of(self, name: str) -> Type | None:
+        field = self.target.field(name)
+        return field.type if field else None
+
+
+def question(noise: random.Random, language: Language) -> Question:
+    when = written(language.text(noise, "b", noise.choice((1, 2, 3)))) if noise.randrange(4) == 0 else None
+    if language.is_ros:
+        target, fields = language_wire()[1].cases["target"].type, protobuf_fields(noise)
+    else:
+        target = ros_target(noise)
+        fields = [*target.fields[1:]]
+    entries = [FieldEntry((each.name,), (SPAN,), language.filled(noise, each.type)) for each in fields]
+    return Question(language, FieldMap(SPAN, False, tuple(entries)), when, target)
+
+
+# ---- messages, each with what the oracle sees of it
+
+
+def messages(noise: random.Random, language: Language) -> Iterator[tuple[bytes, View]]:
+    if language.is_ros:
+        for _ in range(10):
+            value = ros_message(noise)
+            yield cdr(language.source, as_written(value)), View(value, language.source)
+        return
+    case = language_wire()[1].cases["source"]
+    for payload in some_payloads(case, noise.getrandbits(64)):
+        yield payload, View(case.message_class.FromString(payload), case.type)
+
+
+# ---- the oracle
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What an answer may be: one message, or why there is none."""
+
+    message: bytes | None
+    reasons: frozenset[str]
+    declared: MessageType
+
+    def allows(self, answer: Answer) -> bool:
+        if isinstance(answer, str):
+            return answer in self.reasons
+        return self.message is not None and (answer == self.message or self._is_same(answer))
+
+    def _is_same(self, answer: bytes) -> bool:
+        """Whether it is equal but for the bits of a NaN."""
+        assert self.message is not None
+        if len(answer) != len(self.message):
+            return False
+        return same(_tree(answer, self.declared), _tree(self.message, self.declared))
+
+
+def oracle(asked: Question) -> Callable[[View], Verdict]:
+    """What may be answered for a message. The question has to be one that the compiler accepts."""
+    schema, envelope = language_wire()
+
+    def judge(view: View) -> Verdict:
+        context = context_of(view.message, view.type, asked.enums)
+        try:
+            if asked.when and not meaning_of(asked.when, context).give(context):
+                return Verdict(None, frozenset([FILTERED]), asked.target)
+            if asked.language.is_ros:
+                payload = fill_given(asked.fields, asked.target, context)
+                return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
+            return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+        except Refused as refused:
+            return Verdict(None, refused.reasons, asked.target)
+
+    return judge
+
+
+def _tree(message: bytes, declared: MessageType) -> Any:
+    if declared.name.startswith("made/"):
+        return _plain(deserialize(declared, message), declared)
+    payload: Any = language_wire()[1].message_class.FromString(message)
+    return {field.name: _listed(value) for field, value in payload.target.ListFields()}
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if hasattr(value, "append") else value
+
+
+def _plain(value: Any, declared: Type) -> Any:
+    if isinstance(declared, MessageType):
+        return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
+    return value
+
+
+# ---- the Python plane
+
+
+def python_plane(asked: Question) -> Callable[[bytes], Answer]:
+    condition, plan = asked.checked()
+    is_ros, out = asked.language.is_ros, Source()
+    with out.block(f"def serve({'cdr' if is_ros else 'm'}, source, received_at):", SPAN):
+        values = NO_VALUES
+        if is_ros:
+            nodes = [*expressions(plan), *([condition] if condition else [])]
+            reads = CdrReads(asked.source, (path for node in nodes for path in paths_in(node)))
+            reads.write(out, SPAN)
+            values = reads.values
+        if condition is not None:
+            with out.block(f"if not {out.expression(render(condition, values))}:", SPAN):
+                out.line("return None", SPAN)
+        if is_ros:
+            out.line(f"return {write_envelope(out, plan, asked.case, 'it', values)}", SPAN)
+        else:
+            out.line(f"return {write_message(out, plan, 'it')}", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    parse = language_wire()[1].cases["source"].message_class.FromString
+
+    def answer(message: bytes) -> Answer:
+        try:
+            made = namespace["serve"](message if is_ros else parse(message), SOURCE, RECEIVED_AT)
+        except MAPPING_FAILURES as error:
+            return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
+        return FILTERED if made is None else bytes(made)
+
+    return answer
+
+
+# ---- the judge
+
+
+def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | None:
+    """What a plane answers otherwise than it may, with the first message for which it does; None for nothing.
+
+    Raises Misfit for a question that the compiler refuses.
+    """
+    serve, judge = plane(asked), oracle(asked)
+    for message, view in messages(noise, asked.language):
+        answer, verdict = serve(message), judge(view)
+        if not verdict.allows(answer):
+            expected = verdict.message.hex() if verdict.message is not None else "|".join(sorted(verdict.reasons))
+            found = answer.hex() if isinstance(answer, bytes) else answer
+            shown = " ".join(str(view.message).split())
+            return f"{asked}\n  is {found}\n  not {expected}\n  of {shown}\n  {message.hex()}"
+    return None

@@ -1,0 +1,329 @@
+"""Expressions and messages at random, for the judge of the language (`judging`).
+
+Expressions are well-typed but for what depends on ranges and lengths, which the compiler may refuse. Everything is
+drawn from a `random.Random`: of Hypothesis, whose examples shrink, or of a script that tries millions.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from router.table.model import Expression
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.compiling import chosen, written
+from tests.compiler.payloads import Wire, wire_of
+
+
+@cache
+def language_wire() -> Wire:
+    return wire_of(Path(__file__).parent / "protos" / "language", "language.Envelope")
+
+
+# ---- a ROS message with a field of each kind
+
+I8, U8, I16, U16, I32, U32, I64, U64 = (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False))
+F32, F64 = Float(32), Float(64)
+TIME = MessageType("builtin_interfaces/msg/Time", (Field("sec", I32), Field("nanosec", U32)))
+DURATION = MessageType("builtin_interfaces/msg/Duration", (Field("sec", I32), Field("nanosec", U32)))
+INNER = MessageType(
+    "made/msg/Inner", (Field("value", I32), Field("in", String()), Field("ratio", F64), Field("many", List(I64)))
+)
+ROS_SOURCE = MessageType(
+    "made/msg/Source",
+    (
+        Field("flag", Bool()), Field("i32", I32), Field("u8", U8), Field("i64", I64), Field("names", List(String())),
+        Field("u32", U32), Field("i16", I16), Field("u64", U64), Field("f32", F32), Field("name", String()),
+        Field("f64", F64), Field("raw", List(U8)), Field("i32s", List(I32)), Field("i64s", List(I64)),
+        Field("stamp", TIME), Field("span", DURATION), Field("u64s", List(U64)), Field("f32s", List(F32)),
+        Field("f64s", List(F64)), Field("flags", List(Bool())), Field("i16x3", List(I16, 3)), Field("inner", INNER),
+        Field("f64x3", List(F64, 3)), Field("u64x2", List(U64, 2)), Field("inners", List(INNER)),
+        Field("textx2", List(String(), 2)), Field("from", I32), Field("in", U64), Field("class", F64),
+        Field("is", Bool()), Field("few", List(U16, None, 4)),
+    ),
+)  # fmt: skip
+
+# ---- expressions: templates by kind, with places for expressions of other kinds
+#
+# i, f, b, s, t: an integer, float, bool, text, time; I, F, B, S: lists of them. k, q: a small literal integer, float.
+
+_TEMPLATES: Mapping[str, Sequence[str]] = {
+    "i": (
+        "({i} + {i})", "({i} - {i})", "({i} * {i})", "({i} // {i})", "({i} % {i})", "(-{i})", "(+{i})", "({i} ** 2)",
+        "({i} ** 3)", "({i} ** 8)", "abs({i})", "min({i}, {i})", "max({i}, {i}, {i})", "clamp({i}, {i}, {i})",
+        "clamp({i}, -100, 100)", "wrap({i}, -180, 179)", "wrap({i}, {i}, {i})", "wrap({i}, 0, 255)", "round({f})",
+        "trunc({f})", "floor({f})", "ceil({f})", "round(clamp({f}, -100, 100))", "round(clamp({f}, 0.0, 1e9))",
+        "int({b})", "int({i})", "round({i})", "({i} if {b} else {i})", "len({s})", "len({I})", "len({S})", "{I}[0]",
+        "{I}[1]", "min({I})", "max({I})", "sum({I})", "len({F})", "[{i}, {i}][1]", "sum([{i}, {i}, {i}])",
+        "max([{i}, {i}])",
+    ),
+    "f": (
+        "({f} + {i})", "({i} - {f})", "({f} * {f})", "({i} / {i})", "({f} / {f})", "({f} // {i})", "({f} % {f})",
+        "({i} % {f})", "(-{f})", "abs({f})", "min({f}, {i})", "max({f}, {f})", "clamp({f}, -1.5, 1.5)",
+        "clamp({f}, {f}, {f})", "clamp({i}, {q}, {f})", "radians({f})", "degrees({i})", "sqrt({f})", "sin({f})",
+        "cos({f})", "tan({f})", "atan2({f}, {f})", "float32({f})", "float64({i})", "({f} if {b} else {i})",
+        "({f} ** 2)", "({f} ** 5)", "seconds({t})", "{F}[0]", "{F}[2]", "min({F})", "max({F})", "sum({F})",
+        "[{f}, {i}][1]", "sum([{f}, {i}])", "({f} if {b} else {f})",
+    ),
+    "b": (
+        "({i} < {i})", "({f} <= {i} < {f})", "({i} == {f})", "({i} >= {f})", "({s} == {s})", "({s} < {s})", "(not {b})",
+        "({b} and {b})", "({b} or {b} or {b})", "({i} in [{i}, {i}, {i}])", "({i} not in {I})", "({f} in {I})",
+        "({i} in {F})", "({s} in {S})", "({b} if {b} else {b})", "({b} == {b})", "({b} != {b})", "({i} != {i} > {i})",
+        "(source == {s})", "({t} == {t})", "({t} < {t} <= {t})", "{B}[0]", "({f} != {f})", "({f} > {f})",
+        "({f} in [{f}, {i}])",
+    ),
+    "s": (
+        "({s} + {s})", "str({i})", "str({b})", "str({s})", "({s} if {b} else {s})", "text({f}, 0)", "text({f}, 2)",
+        "text({f}, 17)", "text({i}, 1)", "{S}[0]", "{S}[1]",
+    ),
+    "t": ("({t} if {b} else {t})", "time_from_seconds({f})", "time_from_milliseconds({f})", "time_from_seconds({k})"),
+    "I": (
+        "({I} + {i})", "({i} - {I})", "({I} * {I})", "({I} - {I})", "({I} // {i})", "({i} % {I})", "({I} % {I})",
+        "(-{I})", "({I} ** 2)", "abs({I})", "min({I}, {i})", "max({i}, {I})", "max({I}, {I})", "clamp({I}, {i}, {I})",
+        "clamp({I}, -100, 100)", "wrap({I}, -180, 179)", "wrap({i}, {I}, {I})", "round({F})", "trunc({F})",
+        "floor({F})", "ceil({F})", "round(clamp({F}, -100, 100))", "int({B})", "({I} if {b} else {I})", "[{i}, {i}]",
+        "([{i}, {i}, {i}] * {i})", "int({I})", "round({I})", "({I})",
+    ),
+    "F": (
+        "({F} + {I})", "({I} / {i})", "({F} * {f})", "({F} / {F})", "({i} / {I})", "({F} // {f})", "({F} % {F})",
+        "(-{F})", "abs({F})", "radians({F})", "degrees({I})", "sqrt({F})", "sin({F})", "cos({I})", "tan({F})",
+        "atan2({F}, {f})", "float32({F})", "float64({I})", "clamp({F}, -1.5, 1.5)", "clamp({F}, {f}, {F})",
+        "min({F}, {I})", "max({f}, {I})", "({F} if {b} else {F})", "({F} if {b} else {I})", "[{f}, {f}, {i}]",
+        "([{f}, {i}] / {i})", "({F} ** 2)",
+    ),
+    "B": ("[{b}, {b}]", "({B} if {b} else {B})"),
+    "S": (
+        "str({I})", "str({B})", "({S} + {s})", "({s} + {S})", "({S} + {S})", "str({S})", "text({F}, 2)",
+        "text({I}, 0)", "[{s}, {s}]", "({S} if {b} else {S})",
+    ),
+}  # fmt: skip
+
+_SHARED: Mapping[str, Sequence[str]] = {
+    "i": ("i32", "u32", "i64", "u64", "message.u64", "inner.value", "message.inner.value", "inners[0].value", "from",
+          "message.from", "message.in", "inner.many[0]", "inners[1].many[0]"),
+    "f": ("f32", "f64", "inner.ratio", "class", "message.class", "inners[0].ratio", "f32s[0]"),
+    "b": ("flag", "message.is", "True", "false"),
+    "s": ("name", "source", "inner.in", "names[0]", "'ab'", "'é'", "''", "inners[0].in"),
+    "t": ("received_at",),
+    "I": ("i32s", "i64s", "u64s", "raw", "inner.many", "inners[0].many"),
+    "F": ("f32s", "f64s"),
+    "B": ("flags",),
+    "S": ("names",),
+}  # fmt: skip
+_PROTOBUF: Mapping[str, Sequence[str]] = {
+    "i": ("mode", "grade", "Mode.LESS", "Grade.POOR", "left", "opt", "modes[0]", "inner.grade", "third.value",
+          "int(grade)", "fourth"),
+    "f": ("third.ratio",),
+    "b": ("has(inner)", "has(opt)", "has(grade)", "has(left)", "has(third.grade)", "has(fourth)", "has(message.third)",
+          "(mode == Mode.ON)", "(grade in [Grade.FAIR, Grade.GOOD])", "(Mode.LOUD in modes)"),
+    "s": ("right", "loose", "str(mode)"),
+    "t": (),
+    "I": ("modes", "grades", "packed", "expanded"),
+    "F": (),
+    "B": (),
+    "S": ("str(grades)",),
+}  # fmt: skip
+_ROS: Mapping[str, Sequence[str]] = {
+    "i": ("u8", "i16", "few[0]", "u64x2[1]"),
+    "f": ("f64x3[1]",),
+    "b": (),
+    "s": ("textx2[1]",),
+    "t": ("stamp", "span"),
+    "I": ("few", "i16x3", "u64x2"),
+    "F": ("f64x3",),
+    "B": (),
+    "S": ("textx2",),
+}
+_INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
+             1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
+_FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18", "-2.5", "nan", "inf", "0.1")
+
+
+@dataclass(frozen=True, slots=True)
+class Language:
+    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted."""
+
+    is_ros: bool
+    is_wild: bool = False
+
+    @property
+    def source(self) -> MessageType:
+        return ROS_SOURCE if self.is_ros else language_wire()[1].cases["source"].type
+
+    def text(self, noise: random.Random, kind: str, depth: int) -> str:
+        """An expression of a kind."""
+        if self.is_wild and noise.randrange(8) == 0:
+            kind = noise.choice([*_TEMPLATES])
+        if kind == "k":
+            return _bracketed(noise.choice((0, 1, 2, 5, -3, 1_700_000_000)))
+        if kind == "q":
+            return noise.choice(("0", "0.5", "-1.5", "10"))
+        if depth == 0 or noise.randrange(4) == 0:
+            return self._leaf(noise, kind)
+        return self._completed(noise, noise.choice(_TEMPLATES[kind]), depth - 1)
+
+    def _leaf(self, noise: random.Random, kind: str) -> str:
+        if kind == "i" and noise.randrange(3) == 0:
+            return _bracketed(noise.choice(_INTEGERS))
+        if kind == "f" and noise.randrange(3) == 0:
+            return noise.choice(_FLOATS)
+        return noise.choice((*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]))
+
+    def filled(self, noise: random.Random, target: Type) -> Expression:
+        """An expression that fills a field, or is refused for its range or length."""
+        if noise.randrange(12) == 0 and not isinstance(target, List):
+            return self._choices(noise, target)
+        return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
+
+    def _value(self, noise: random.Random, target: Type, depth: int) -> str:
+        return self._completed(noise, noise.choice(_filling(target)), depth)
+
+    def _completed(self, noise: random.Random, template: str, depth: int) -> str:
+        parts = template.split("{")
+        return parts[0] + "".join(self.text(noise, part[0], depth) + part[2:] for part in parts[1:])
+
+    def _choices(self, noise: random.Random, target: Type) -> Expression:
+        otherwise = self._value(noise, target, 2)
+        if not self.is_ros and noise.randrange(2):
+            values = {"OFF": 1, "ON": 1, "LOUD": 1, "LESS": 1}
+            subject, is_whole = "mode", noise.randrange(2) == 1
+            if noise.randrange(2):
+                values, subject = {"NONE": 1, "FAIR": 1, "GOOD": 1, "POOR": 1}, "grade"
+        elif noise.randrange(2):
+            values, subject, is_whole = {"true": 1, "false": 1}, self.text(noise, "b", 2), True
+        else:
+            values, subject, is_whole = {"0": 1, "1": 1, "-7": 1}, self.text(noise, "i", 1), False
+        chosen_values = {name: self._value(noise, target, 1) for name in values}
+        return chosen(subject, chosen_values, None if is_whole else otherwise)
+
+
+def _bracketed(number: int) -> str:
+    return f"({number})" if number < 0 else str(number)
+
+
+def _filling(target: Type) -> Sequence[str]:
+    """Templates of what fills a type."""
+    match target:
+        case Bool():
+            return ("{b}",)
+        case Int():
+            least = max(target.low, -9)
+            return ("clamp({i})", "wrap({i})", "round(float64({i}))", "round({f})", "{i}", f"clamp({{i}}, {least}, 99)")
+        case Float(64):
+            return ("{f}", "{f}", "float64({i})")
+        case Float():
+            return ("float32({f})", "{f}", "float32({i})")
+        case String():
+            return ("{s}",)
+        case Bytes():
+            return ("raw", "clamp({I}, 0, 255)", "wrap({I}, 0, 255)", "round({F})")
+        case Enum():
+            return ("round(float64({i}))", "clamp({i}, -8, 301)", "{i}", "wrap({i}, 0, 5)", "name", "{s}")
+        case MessageType():
+            return ("{t}",)
+        case List():
+            return [_raised(template) for template in _filling(target.element)]
+
+
+def _raised(template: str) -> str:
+    """A template with lists in place of scalars."""
+    return re.sub(r"\{(\w)\}", lambda match: f"{{{match[1].upper()}}}", template).replace("name", "names")
+
+
+# ---- what is filled
+
+_SCALARS: Sequence[Type] = (
+    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME,
+)  # fmt: skip
+_LISTS: Sequence[Type] = (
+    List(U8), List(I16, 2), List(I32), List(I64), List(U64, None, 2), List(F32), List(F64), List(F64, 3), List(Bool()),
+    List(String()), List(String(4), None, 3),
+)  # fmt: skip
+
+
+def ros_target(noise: random.Random) -> MessageType:
+    """One to three fields, and one in front of them that shifts what is aligned."""
+    types = [noise.choice(_SCALARS if noise.randrange(2) else _LISTS) for _ in range(noise.choice((1, 1, 2, 3)))]
+    return MessageType(
+        "made/msg/Target", (Field("before", U8), *(Field(f"it_{place}", each) for place, each in enumerate(types)))
+    )
+
+
+def protobuf_fields(noise: random.Random) -> list[Field]:
+    """Some fields of the payload `target`."""
+    fields = [field for field in language_wire()[1].cases["target"].type.fields if field.name not in ("raws", "inner")]
+    return noise.sample(fields, noise.choice((1, 1, 2, 3)))
+
+
+# ---- messages from ROS
+
+_TEXTS = ("", "a", "ab", "é", "wheel", "\U0001f600", "abcdefgh" * 3)
+_EDGES = (0.0, -0.0, 0.5, 1.0, -1.5, 2.5, 90.0, 1e-45, 3.4028234663852886e38, 1e9, 9007199254740992.0, 1.7e308,
+          -1e300, 9.223372036854775e18, 2.0**63, 2.0**64, math.inf, -math.inf, math.nan)  # fmt: skip
+
+
+def ros_message(noise: random.Random) -> dict[str, Any]:
+    """A message of ROS_SOURCE. Text that is not UTF-8 is bytes."""
+    made = {field.name: ros_value(noise, field.type) for field in ROS_SOURCE.fields}
+    if noise.randrange(4) == 0:
+        made["name"] = b"\xffa"
+        made["names"].insert(0, b"\xed\xa0\x80")
+    return made
+
+
+def ros_value(noise: random.Random, declared: Type) -> Any:
+    match declared:
+        case Bool():
+            return noise.randrange(2) == 1
+        case Int():
+            low, high = declared.low, declared.high
+            edges = [each for each in (*_INTEGERS, low, high) if low <= each <= high]
+            return noise.choice(edges) if noise.randrange(2) else noise.randint(low, high)
+        case Float(32):
+            real = noise.choice([each for each in _EDGES if not 3.5e38 < abs(each) < math.inf])
+            return struct.unpack("<f", struct.pack("<f", real))[0]
+        case Float():
+            return noise.choice(_EDGES) if noise.randrange(2) else round(noise.uniform(-1000, 1000), 2)
+        case String():
+            return noise.choice(_TEXTS)
+        case List(element, length, bound):
+            most = 5 if bound is None else bound
+            count = noise.choice([0, 1, 2, 2, 2, 3, most]) if length is None else length
+            return [ros_value(noise, element) for _ in range(count)]
+        case MessageType():
+            return {field.name: ros_value(noise, field.type) for field in declared.fields}
+        case _:
+            raise TypeError(declared)
+
+
+class _NotUtf8(str):
+    """Text that is written as other bytes."""
+
+    __slots__ = ("octets",)
+
+    octets: bytes
+
+    def encode(self, encoding: str = "utf-8", errors: str = "strict") -> bytes:
+        return self.octets
+
+
+def as_written(value: Any) -> Any:
+    """A value of `ros_value` for router.rehearsal.cdr, which encodes text itself."""
+    match value:
+        case bytes():
+            made = _NotUtf8()
+            made.octets = value
+            return made
+        case list():
+            return [as_written(each) for each in value]
+        case dict():
+            return {name: as_written(each) for name, each in value.items()}
+        case _:
+            return value

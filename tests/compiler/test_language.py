@@ -1,0 +1,264 @@
+"""The language of docs/reference/table.md: its examples, the oracle that was written from it, and the planes.
+
+`python -m benchmarks.judge_language` tries many more expressions than the tests here.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import random
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+from router.errors import Diagnostic
+from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.comparing import same
+from tests.compiler.compiling import context_of, written
+from tests.compiler.judging import (
+    Answer,
+    Misfit,
+    Plane,
+    Question,
+    disagreement,
+    is_about_values,
+    python_plane,
+    question,
+)
+from tests.compiler.language import Language
+from tests.oracles.reference_expressions import Context, evaluate
+from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused
+
+MANY = settings(max_examples=20 * settings().max_examples, suppress_health_check=list(HealthCheck))
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "table.md"
+PLANES: dict[str, Plane] = {"python": python_plane}
+
+
+# ---- the page and the oracle
+
+
+def rows(heading: str, columns: int) -> list[list[str]]:
+    """The rows of the tables in a section of the page."""
+    section = PAGE.read_text(encoding="utf-8").split(f"\n### {heading}\n")[1].split("\n### ")[0]
+    lines = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line] for line in lines if len(line) == columns and "---" not in line[0]]
+
+
+def context(**values: Any) -> Context:
+    """Values by name; with the type in front where it is not said by the value."""
+    typed = {name: value if isinstance(value, tuple) else (type_of(value), value) for name, value in values.items()}
+    declared = MessageType("Source", tuple(Field(name, type_) for name, (type_, _) in typed.items()))
+    return context_of({name: value for name, (_, value) in typed.items()}, declared, [MODE])
+
+
+def type_of(value: Any) -> Type:
+    match value:
+        case bool():
+            return Bool()
+        case int():
+            return Int(64, signed=True)
+        case float():
+            return Float(64)
+        case list():
+            return List(type_of(value[0]) if value else Float(64))
+        case _:
+            return String()
+
+
+MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))
+U8, I16, I64, U64, F64 = Int(8, False), Int(16, True), Int(64, True), Int(64, False), Float(64)
+
+
+@pytest.mark.parametrize(("expression", "operands", "result"), rows("Lists", 3)[1:])
+def test_the_page_shows_what_lists_come_to(expression: str, operands: str, result: str) -> None:
+    text, made = expression.strip("`"), result.strip("`")
+    if operands == "scalars":
+        values = {"x": 1.5, "y": -2.0}
+        assert evaluate(written(text), context(**values)) == evaluate(written(made), context(**values))
+        return
+    names = list(dict.fromkeys(re.findall(r"[a-z_]\w*", re.sub(r"'\w*'|\w+\(", "", text))))
+    values = dict(zip(names, map(ast.literal_eval, re.findall(r"\[.*?\]", operands)), strict=True))
+    assert evaluate(written(text), context(**values)) == ast.literal_eval(made)
+
+
+def test_the_page_tells_the_ranges_of_integers() -> None:
+    shown = {row[0].strip("`"): row[1] for row in rows("Numbers", 3) if "`" in row[0]}
+    assert shown["a * b` of two `int16"] == "-2^30+2^15 to 2^30"
+    most = context(a=(I16, -(1 << 15)), b=(I16, (1 << 15) - 1))
+    assert evaluate(written("a * a"), most) == 1 << 30
+    assert evaluate(written("a * b"), most) == -(1 << 30) + (1 << 15)
+
+
+LEAST, MOST, GREATEST = -(1 << 63), (1 << 63) - 1, (1 << 64) - 1
+
+
+@pytest.mark.parametrize(
+    ("text", "values", "result"),
+    [
+        ("a + 1", {"a": MOST}, MAPPING_ERROR),
+        ("a - 1", {"a": LEAST}, MAPPING_ERROR),
+        ("-a", {"a": LEAST}, MAPPING_ERROR),
+        ("abs(a)", {"a": LEAST}, 1 << 63),
+        ("a // -1", {"a": LEAST}, MAPPING_ERROR),
+        ("a % -1", {"a": LEAST}, 0),
+        ("a // 2", {"a": -3}, -2),
+        ("a % 3", {"a": -1}, 2),
+        ("a % -3", {"a": 1}, -2),
+        ("a + b", {"a": (U64, GREATEST), "b": (U64, 1)}, MAPPING_ERROR),
+        ("a + b", {"a": (U64, GREATEST), "b": (U64, 0)}, GREATEST),
+        ("a - b", {"a": (U64, GREATEST), "b": (U64, 0)}, MAPPING_ERROR),
+        ("a - b", {"a": (U64, 0), "b": (U64, 1 << 63)}, LEAST),
+        ("a + b", {"a": (U64, GREATEST), "b": (U8, 0)}, GREATEST),
+        ("a + b", {"a": (U64, GREATEST), "b": (I16, -1)}, MAPPING_ERROR),
+        ("a + b", {"a": (U64, 5), "b": (I16, -9)}, -4),
+        ("a if c else b", {"a": (U64, GREATEST), "b": 1, "c": True}, MAPPING_ERROR),
+        ("a if c else b", {"a": (U64, MOST), "b": 1, "c": True}, MOST),
+        ("max(a, b)", {"a": (U64, GREATEST), "b": 1}, GREATEST),
+        ("min(a, b)", {"a": (U64, GREATEST), "b": -1}, -1),
+        ("a ** 8", {"a": (I16, 200)}, 200**8),
+        ("a ** 8", {"a": (I16, 300)}, MAPPING_ERROR),
+        ("a ** 3", {"a": (U64, 2642245)}, 2642245**3),
+        ("a ** 3", {"a": (U64, 2642246)}, MAPPING_ERROR),
+        ("a / b", {"a": (1 << 53) + 1, "b": 1}, float(1 << 53)),
+        ("a == b", {"a": (1 << 53) + 1, "b": float(1 << 53)}, False),
+        ("a < b", {"a": (U64, GREATEST), "b": 2.0**64}, True),
+        ("a < b", {"a": -1, "b": (U64, GREATEST)}, True),
+        ("a in [b]", {"a": (1 << 53) + 1, "b": float(1 << 53)}, False),
+        ("max(a, 0.5)", {"a": (1 << 53) + 1}, float(1 << 53)),
+        ("1 / a", {"a": 0}, MAPPING_ERROR),
+        ("1 // a", {"a": 0.0}, MAPPING_ERROR),
+        ("1 % a", {"a": -0.0}, MAPPING_ERROR),
+        ("a * a", {"a": 1e300}, math.inf),
+        ("a ** 2", {"a": 1e300}, MAPPING_ERROR),
+        ("a ** 2", {"a": math.inf}, math.inf),
+        ("hypot(a, a)", {"a": 1.7e308}, math.inf),
+        ("sqrt(a)", {"a": -1.0}, MAPPING_ERROR),
+        ("sin(a)", {"a": math.inf}, MAPPING_ERROR),
+        ("sin(a)", {"a": math.nan}, math.nan),
+        ("float32(a)", {"a": 1e39}, MAPPING_ERROR),
+        ("float32(a)", {"a": math.inf}, math.inf),
+        ("round(a)", {"a": math.nan}, NON_FINITE),
+        ("round(a)", {"a": -math.inf}, NON_FINITE),
+        ("round(a)", {"a": 2.0**63}, MAPPING_ERROR),
+        ("round(a)", {"a": -(2.0**63)}, LEAST),
+        ("round(a)", {"a": 2.5}, 2),
+        ("trunc(a)", {"a": -2.5}, -2),
+        ("round(a) + b", {"a": 1.0, "b": (U64, GREATEST - 1)}, MAPPING_ERROR),
+        ("round(clamp(a, 0, 100)) + b", {"a": 1.0, "b": (U64, GREATEST - 1)}, GREATEST),
+        ("clamp(a, -1, 1)", {"a": math.nan}, math.nan),
+        ("min(a, 1)", {"a": math.nan}, math.nan),
+        ("min(1, a)", {"a": math.nan}, 1.0),
+        ("max(a, 0)", {"a": -0.0}, -0.0),
+        ("wrap(a, b, 0)", {"a": 5, "b": 1}, MAPPING_ERROR),
+        ("wrap(190, -180, 179)", {}, -170),
+        ("str(a) + str(b) + str(c)", {"a": -7, "b": True, "c": (MODE, 5)}, "-7True5"),
+        ("text(a, 2)", {"a": 2.675}, "2.67"),
+        ("text(a, 1)", {"a": -0.04}, "-0.0"),
+        ("text(a, 0)", {"a": 2.5}, "2"),
+        ("text(a, 2)", {"a": -math.inf}, "-inf"),
+        ("text(a, 2)", {"a": math.nan}, "nan"),
+        ("text(a, 1)", {"a": (1 << 53) + 1}, "9007199254740992.0"),
+        ("a + b", {"a": [1, 2], "b": [1]}, MAPPING_ERROR),
+        ("a + 1 / b", {"a": [], "b": 0}, []),
+        ("a + 1 // b", {"a": [1], "b": 0}, MAPPING_ERROR),
+        ("len(1 // a)", {"a": [1, 0]}, MAPPING_ERROR),
+        ("a[2]", {"a": [1, 2]}, MAPPING_ERROR),
+        ("(1 / a)[0]", {"a": [1, 0]}, MAPPING_ERROR),
+        ("[1 / a, 2][1]", {"a": 0}, MAPPING_ERROR),
+        ("min(a)", {"a": []}, MAPPING_ERROR),
+        ("sum(a)", {"a": []}, 0.0),
+        ("sum(a)", {"a": [0.1, 0.2, 0.3, -0.6]}, 0.1 + 0.2 + 0.3 - 0.6),
+        ("sum(a)", {"a": [MOST, 1, -5]}, MAPPING_ERROR),
+        ("sum(a)", {"a": (List(U64), [GREATEST - 1, 1])}, GREATEST),
+        ("max(a) - min(a)", {"a": [3, -4, 9]}, 13),
+        ("len(a + 1)", {"a": [3, 4]}, 2),
+        ("4 in a + 1", {"a": [3, 4]}, True),
+        ("0.5 in 1 / a", {"a": [2, 0]}, MAPPING_ERROR),
+        ("round(a)", {"a": [1.0, math.nan]}, NON_FINITE),
+        ("b if a else [1, 2]", {"a": False, "b": [3]}, [1, 2]),
+        ("a == 0 or 1 / a > 0", {"a": 0}, True),
+        ("a > 0 < 1 / a", {"a": 0}, False),
+        ("message.from + from + message.in", {"from": 1, "in": 5}, 7),
+        ("a", {"a": b"\xff"}, MAPPING_ERROR),
+    ],
+)
+def test_the_oracle_does_what_the_page_says(text: str, values: dict[str, Any], result: Any) -> None:
+    if result in (MAPPING_ERROR, NON_FINITE):
+        with pytest.raises(Refused) as refused:
+            evaluate(written(text), context(**values))
+        assert refused.value.reasons == {result}
+        return
+    found = evaluate(written(text), context(**values))
+    assert same(found, result)
+    assert math.copysign(1, found) == math.copysign(1, result) if found == 0 else True
+
+
+def test_of_two_reasons_each_may_be_given() -> None:
+    with pytest.raises(Refused) as refused:
+        evaluate(written("round(a) + 1 // b"), context(a=math.nan, b=0))
+    assert refused.value.reasons == {MAPPING_ERROR, NON_FINITE}
+
+
+# ---- the planes
+
+noises = st.randoms(use_true_random=False)
+
+
+def judged_findings(asked: Question, plane: Plane, noise: random.Random) -> Collection[Diagnostic]:
+    """What the compiler refuses a question for; of one that it accepts, the plane's answers are judged."""
+    try:
+        assert disagreement(asked, plane, noise) is None
+    except Misfit as misfit:
+        return misfit.findings
+    return []
+
+
+@pytest.mark.parametrize("is_ros", [False, True], ids=["from UDP", "from ROS"])
+@pytest.mark.parametrize("plane", PLANES.values(), ids=PLANES)
+def test_mappings_give_what_the_oracle_gives(plane: Plane, is_ros: bool) -> None:
+    @MANY
+    @given(noises)
+    def judged(noise: random.Random) -> None:
+        asked = question(noise, Language(is_ros))
+        findings = judged_findings(asked, plane, noise)
+        assert all(map(is_about_values, findings)), (str(asked), [*map(str, findings)])
+        event("refused" if findings else "judged")
+
+    judged()
+
+
+@pytest.mark.parametrize("is_ros", [False, True], ids=["from UDP", "from ROS"])
+def test_what_is_ill_typed_is_a_finding_and_the_rest_is_right(is_ros: bool) -> None:
+    @MANY
+    @given(noises)
+    def judged(noise: random.Random) -> None:
+        for finding in judged_findings(question(noise, Language(is_ros, is_wild=True)), python_plane, noise):
+            assert finding.span.line == 7
+
+    judged()
+
+
+def test_a_plane_that_is_wrong_by_one_bit_is_found() -> None:
+    def wrong(asked: Question) -> Any:
+        serve = python_plane(asked)
+
+        def answer(message: bytes) -> Answer:
+            made = serve(message)
+            return made if isinstance(made, str) else bytes([*made[:-1], made[-1] ^ 1])
+
+        return answer
+
+    found = set()
+    for seed in range(200):
+        noise = random.Random(seed)
+        try:
+            found.add(disagreement(question(noise, Language(seed % 2 == 1)), wrong, noise) is not None)
+        except Misfit:
+            continue
+    assert True in found
