@@ -10,7 +10,20 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from tests.carrier.evaluating import CDR_HEADER, NONE, C, Layout, Node, NodeField, Operation, Step, integer, load, real, text
+from tests.carrier.evaluating import (
+    CDR_HEADER,
+    NONE,
+    C,
+    Layout,
+    Node,
+    NodeField,
+    Operation,
+    Step,
+    integer,
+    load,
+    real,
+    text,
+)
 
 INTEGER, REAL, TRUTH, TEXT = "integer", "real", "truth", "text"
 IN_CELLS = C["IN_CELLS"]
@@ -227,7 +240,9 @@ class _Expressions:
 
     def __init__(self, layouts: _Layouts) -> None:
         self.noise, self.layouts = layouts.noise, layouts
-        self.fields = Fields([(RECEIVED_AT, INTEGER), (SOURCE, TEXT), *layouts.fields[0].values], [*layouts.fields[0].lists])
+        self.fields = Fields(
+            [(RECEIVED_AT, INTEGER), (SOURCE, TEXT), *layouts.fields[0].values], [*layouts.fields[0].lists]
+        )
         self.loops = 0
         self.boldness = self.noise.choice([0.05, 0.05, 0.5, 1.0])  # how many of the operations that may refuse stay
 
@@ -284,7 +299,10 @@ class _Expressions:
                 name = noise.choice(["NEGATE", "CHECKED_NEGATE", "ABSOLUTE"])
                 return [*self.of(INTEGER, depth - 1), Operation(f"OP_{name}", flag=flag)]
             case "three":
-                return [*self._many(INTEGER, 3, depth), Operation(f"OP_{noise.choice(['CLAMP', 'FIT', 'WRAP'])}", flag=flag)]
+                return [
+                    *self._many(INTEGER, 3, depth),
+                    Operation(f"OP_{noise.choice(['CLAMP', 'FIT', 'WRAP'])}", flag=flag),
+                ]
             case "rounded":
                 name = noise.choice(["ROUND", "TRUNCATE", "FLOOR", "CEIL"])
                 return [*self.of(REAL, depth - 1), Operation(f"OP_{name}")]
@@ -303,8 +321,8 @@ class _Expressions:
 
     def _real(self, depth: int) -> Code:
         noise = self.noise
-        two = ["REAL_ADD", "REAL_SUBTRACT", "REAL_MULTIPLY", "REAL_DIVIDE", "REAL_FLOOR_DIVIDE", "REAL_MODULO", "REAL_POWER",
-               "REAL_LEAST", "REAL_GREATEST", "ATAN2", "HYPOT"]  # fmt: skip
+        two = ["REAL_ADD", "REAL_SUBTRACT", "REAL_MULTIPLY", "REAL_DIVIDE", "REAL_FLOOR_DIVIDE", "REAL_MODULO",
+               "REAL_POWER", "REAL_LEAST", "REAL_GREATEST", "ATAN2", "HYPOT"]  # fmt: skip
         one = ["REAL_NEGATE", "REAL_ABSOLUTE", "SQRT", "SIN", "COS", "TAN", "FLOAT32"]
         match noise.choice(["two", "two", "one", "three", "integer", "element", "sum"]):
             case "two":
@@ -386,9 +404,9 @@ class _Expressions:
             self.fields.values.remove((element, of))
             return [Operation("OP_KEEP", element), Operation("OP_DROP"), *code, Operation("OP_APPEND", made)]
 
-        return [*start, *self._each(*self.list_of(of, depth - 1), body, keeps=True), load(made)]
+        return [*start, *self.for_each(*self.list_of(of, depth - 1), body, keeps=True), load(made)]
 
-    def _each(self, code: Code, stored: int, body: Callable[[int], Code], *, keeps: bool) -> Code:
+    def for_each(self, code: Code, stored: int, body: Callable[[int], Code], *, keeps: bool) -> Code:
         """Execute what `body` gives for each element, which is on the stack first."""
         left, element = self.layouts.slot(), self.layouts.slot()
         self.loops += 1
@@ -400,7 +418,7 @@ class _Expressions:
     def _sum(self, kind: str, start: Code, operation: Operation, depth: int) -> Code:
         if self.loops >= 4:
             return start
-        return [*start, *self._each(*self.list_of(kind, depth - 1), lambda _: [operation], keeps=False)]
+        return [*start, *self.for_each(*self.list_of(kind, depth - 1), lambda _: [operation], keeps=False)]
 
     def _element(self, kind: str, depth: int) -> Code:
         code, stored = self.list_of(kind, depth)
@@ -416,7 +434,7 @@ class _Expressions:
             self.fields = outer
             return made
 
-        return self._each([load(listed.slot)], listed.stored, entered, keeps=False)
+        return self.for_each([load(listed.slot)], listed.stored, entered, keeps=False)
 
 
 class _Messages:
@@ -448,7 +466,11 @@ class _Messages:
         if self.is_cdr:
             return self._fields(depth)
         tag = self._number() << 3 | 2
-        return [Operation("OP_OPEN", flag=self.noise.randrange(2), size=tag), *self._fields(depth), Operation("OP_CLOSE")]
+        return [
+            Operation("OP_OPEN", flag=self.noise.randrange(2), size=tag),
+            *self._fields(depth),
+            Operation("OP_CLOSE"),
+        ]
 
     def _number(self) -> int:
         return self.noise.choice([1, 2, 15, 16, 2047, 2048, (1 << 29) - 1])
@@ -460,33 +482,33 @@ class _Messages:
         if self.is_cdr:
             length = [*code, Operation("OP_SIZE"), Operation("OP_PUT", 4)]
             put = Operation("OP_PUT_DOUBLE") if is_real else Operation("OP_PUT", 8)
-            return [*length, *self.expressions._each(code, stored, lambda _: [put], keeps=False)]
+            return [*length, *self.expressions.for_each(code, stored, lambda _: [put], keeps=False)]
         is_packed = self.noise.random() < 0.5
         put = self._write("DOUBLE" if is_real else "VARINT", 0 if is_packed else self._number())
-        each = self.expressions._each(code, stored, lambda _: [put], keeps=False)
+        each = self.expressions.for_each(code, stored, lambda _: [put], keeps=False)
         return [Operation("OP_OPEN", size=self._number() << 3 | 2), *each, Operation("OP_CLOSE")] if is_packed else each
 
     def _write(self, name: str, number: int) -> Operation:
         wire_type = {"VARINT": 0, "ZIGZAG": 0, "FIXED32": 5, "FLOAT": 5, "BYTES": 2}.get(name, 1)
-        return Operation(f"OP_WRITE_{name}", flag=self.noise.randrange(2), size=number << 3 | wire_type if number else 0)
+        return Operation(
+            f"OP_WRITE_{name}", flag=self.noise.randrange(2), size=number << 3 | wire_type if number else 0
+        )
 
     def _value(self) -> Code:
         noise, of = self.noise, self.expressions.of
-        if self.is_cdr:
-            return noise.choice([
-                lambda: [*of(INTEGER), Operation("OP_PUT", noise.choice([1, 2, 4, 8]))],
-                lambda: [*of(REAL), Operation("OP_PUT_DOUBLE")],
-                lambda: [*of(REAL), Operation("OP_PUT_FLOAT")],
-                lambda: [*of(TEXT), Operation("OP_PUT_TEXT")],
-                lambda: [*of(TEXT), Operation("OP_PUT_BYTES")],
-                lambda: [Operation("OP_KNOWN", noise.choice([1, 2, 4, 8]), data=noise.randbytes(9))],
-            ])()  # fmt: skip
-        return noise.choice([
-            lambda: [*of(INTEGER), self._write(noise.choice(["VARINT", "ZIGZAG", "FIXED32", "FIXED64"]), self._number())],
-            lambda: [*of(REAL), self._write(noise.choice(["FLOAT", "DOUBLE"]), self._number())],
-            lambda: [*of(TEXT), self._write("BYTES", self._number())],
-            lambda: [Operation("OP_KNOWN", 1, data=noise.randbytes(5))],
-        ])()  # fmt: skip
+        kind = noise.choice([INTEGER, REAL, TEXT, "known"])
+        if kind == "known":
+            return [Operation("OP_KNOWN", noise.choice([1, 2, 4, 8]) if self.is_cdr else 1, data=noise.randbytes(9))]
+        return [*of(kind), self._put(kind) if self.is_cdr else self._write(noise.choice(_WRITES[kind]), self._number())]
+
+    def _put(self, kind: str) -> Operation:
+        if kind == INTEGER:
+            return Operation("OP_PUT", self.noise.choice([1, 2, 4, 8]))
+        names = {REAL: ["OP_PUT_FLOAT", "OP_PUT_DOUBLE"], TEXT: ["OP_PUT_TEXT", "OP_PUT_BYTES"]}
+        return Operation(self.noise.choice(names[kind]))
+
+
+_WRITES = {INTEGER: ["VARINT", "ZIGZAG", "FIXED32", "FIXED64"], REAL: ["FLOAT", "DOUBLE"], TEXT: ["BYTES"]}
 
 
 def random_program(seed: int) -> Program:
