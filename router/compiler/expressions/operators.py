@@ -214,7 +214,7 @@ def _division_by_zero(span: SourceSpan) -> ExpressionError:
 
 def _want_number(operand: Node) -> None:
     if not isinstance(operand.kind, Number):
-        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str() makes text of a number"}
+        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str(x), or text(x, 2), makes text of a number"}
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
                       hint.get(type(operand.kind), ""))  # fmt: skip
 
@@ -296,8 +296,11 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
-    if isinstance(kind, MessageKind) or isinstance(element_of(kind), MessageKind):
+    if isinstance(kind, MessageKind):
         message, hint = f"a choice cannot give a whole {kind}", "choose at each field, as in a.x if c else b.x"
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
+    if isinstance(element_of(kind), MessageKind):
+        message, hint = f"a choice cannot give a {kind}", "only lists of scalars are chosen: use one of the two"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 
