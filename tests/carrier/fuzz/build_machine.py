@@ -34,7 +34,9 @@ def build(folder: Path, compile_: Compile = for_libfuzzer, first: int = 0) -> Pa
         program = random_program(first + index)
         declarations += _arrays(index, program)
         rows.append(_row(index, program))
-        messages = [bytes(380), b"\1\0\0\0" * 95, noise.randbytes(60)] if program.layout.is_cdr else [b"", noise.randbytes(40)]
+        messages = (
+            [bytes(380), b"\1\0\0\0" * 95, noise.randbytes(60)] if program.layout.is_cdr else [b"", noise.randbytes(40)]
+        )
         for number, message in enumerate(messages):
             head = struct.pack("<HB", index, 0) + (CDR_HEADER if program.layout.is_cdr else b"")
             (corpus / f"{index}-{number}").write_bytes(head + message)
