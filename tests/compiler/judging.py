@@ -1,19 +1,23 @@
 """The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
 
 A question is a mapping with a condition, from a payload to a ROS message or the other way. A plane answers with bytes,
-FILTERED, or the reason of a refusal. The oracle gives what it may answer.
+FILTERED, or the reason of a refusal; with `for_each`, so for each element. The oracle gives what it may answer.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
-from typing import Any, Union
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Union
+
+from google.protobuf.message import DecodeError
 
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.tree import Node, paths_in
+from router.compiler.expressions.kinds import UINT32, element_of
+from router.compiler.expressions.lists import as_value
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
@@ -32,17 +36,17 @@ from tests.compiler.comparing import same
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, written
 from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
 from tests.oracles.reference import fill, fill_given
-from tests.oracles.reference_expressions import meaning_of
-from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused, View
+from tests.oracles.reference_expressions import Context, meaning_of
+from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Refused, View, Whole
 from tests.oracles.reference_protobuf import envelope_of
 
 FILTERED = "filtered"
 Answer = Union[bytes, str]
-Plane = Callable[["Question"], Callable[[bytes], Answer]]
+Plane = Callable[["Question"], Callable[[bytes], "list[Answer]"]]
 """Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
 
 _ABOUT_VALUES = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS, Code.LOSSY_CONVERSION, Code.UNKNOWN_ENUM_VALUE}
-_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds")
+_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds", "does not fill float")
 
 
 def is_about_values(finding: Diagnostic) -> bool:
@@ -58,12 +62,33 @@ class Misfit(Exception):
         self.findings = findings
 
 
+class Checked(NamedTuple):
+    """A question as the compiler's trees."""
+
+    for_each: Node | None
+    condition: Node | None
+    plan: Record
+
+    def nodes(self) -> list[Node]:
+        return [each for each in (self.for_each, self.condition, *expressions(self.plan)) if each is not None]
+
+
+def _element_names(for_each: Node) -> dict[str, Node]:
+    element = element_of(for_each.kind)
+    assert element is not None
+    return {name: Variable(kind, SPAN, name) for name, kind in ((ITEM, element), (INDEX, UINT32), (COUNT, UINT32))}
+
+
 @dataclass(frozen=True, slots=True)
 class Question:
     language: Language
     fields: FieldMap
     when: Expression | None
     target: MessageType
+
+    @property
+    def for_each(self) -> Expression | None:
+        return written(self.language.for_each) if self.language.for_each else None
 
     @property
     def source(self) -> MessageType:
@@ -78,13 +103,13 @@ class Question:
     def enums(self) -> tuple[Enum, ...]:
         return tuple(language_wire()[0].enums.values())
 
-    def scope(self) -> Scope:
-        return Scope(self.source, self.enums, ())
-
-    def checked(self) -> tuple[Node | None, Record]:
+    def checked(self) -> Checked:
         """The compiler's trees. Raises Misfit."""
-        scope = self.scope()
+        scope = Scope(self.source, self.enums, ())
         try:
+            for_each = as_value(check(self.for_each, scope), scope) if self.for_each else None
+            if for_each is not None:
+                scope = Scope(self.source, self.enums, (), _element_names(for_each))
             condition = check(self.when, scope) if self.when else None
         except ExpressionError as error:
             raise Misfit([error.diagnostic]) from None
@@ -92,12 +117,13 @@ class Question:
         if mapping.findings:
             raise Misfit(mapping.findings)
         assert isinstance(mapping.plan, Record)
-        return condition, mapping.plan
+        return Checked(for_each, condition, mapping.plan)
 
     def __str__(self) -> str:
         fields = ", ".join(f"{entry.path[-1]}: {entry.value}" for entry in self.fields.entries)
         types = ", ".join(str(self._type_of(entry.path[-1])) for entry in self.fields.entries)
-        return f"{'ros' if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
+        of = f"ros, for_each {self.language.for_each}" if self.language.for_each else "ros"
+        return f"{of if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
 
     def _type_of(self, name: str) -> Type | None:
         field = self.target.field(name)
@@ -145,31 +171,55 @@ class Verdict:
             return answer in self.reasons
         return self.message is not None and (answer == self.message or self._is_same(answer))
 
+    def __str__(self) -> str:
+        return self.message.hex() if self.message is not None else "|".join(sorted(self.reasons))
+
     def _is_same(self, answer: bytes) -> bool:
         """Whether it is equal but for the bits of a NaN."""
         assert self.message is not None
         if len(answer) != len(self.message):
             return False
-        return same(_tree(answer, self.declared), _tree(self.message, self.declared))
-
-
-def oracle(asked: Question) -> Callable[[View], Verdict]:
-    """What may be answered for a message. The question has to be one that the compiler accepts."""
-    schema, envelope = language_wire()
-
-    def judge(view: View) -> Verdict:
-        context = context_of(view.message, view.type, asked.enums)
         try:
-            if asked.when and not meaning_of(asked.when, context).give(context):
-                return Verdict(None, frozenset([FILTERED]), asked.target)
-            if asked.language.is_ros:
-                payload = fill_given(asked.fields, asked.target, context)
-                return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
-            return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+            return same(_tree(answer, self.declared), _tree(self.message, self.declared))
+        except (*MAPPING_FAILURES, DecodeError):
+            return False
+
+
+def oracle(asked: Question) -> Callable[[View], list[Verdict]]:
+    """What may be answered for a message. The question has to be one that the compiler accepts."""
+
+    def judge(view: View) -> list[Verdict]:
+        context = context_of(view.message, view.type, asked.enums)
+        if asked.for_each is None:
+            return [_verdict(asked, context)]
+        meaning = meaning_of(asked.for_each, context)
+        assert isinstance(meaning.kind, Listing)
+        assert meaning.kind.element is not None
+        try:
+            elements = meaning.give(context)
         except Refused as refused:
-            return Verdict(None, refused.reasons, asked.target)
+            return [Verdict(None, refused.reasons, asked.target)]
+        count = (len(elements), Whole(0, (1 << 32) - 1))
+        return [
+            _verdict(asked, replace(context, names={
+                ITEM: (element, meaning.kind.element), INDEX: (index, count[1]), COUNT: count}))
+            for index, element in enumerate(elements)
+        ]  # fmt: skip
 
     return judge
+
+
+def _verdict(asked: Question, context: Context) -> Verdict:
+    schema, envelope = language_wire()
+    try:
+        if asked.when and not meaning_of(asked.when, context).give(context):
+            return Verdict(None, frozenset([FILTERED]), asked.target)
+        if asked.language.is_ros:
+            payload = fill_given(asked.fields, asked.target, context)
+            return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
+        return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+    except Refused as refused:
+        return Verdict(None, refused.reasons, asked.target)
 
 
 def _tree(message: bytes, declared: MessageType) -> Any:
@@ -192,35 +242,53 @@ def _plain(value: Any, declared: Type) -> Any:
 # ---- the Python plane
 
 
-def python_plane(asked: Question) -> Callable[[bytes], Answer]:
-    condition, plan = asked.checked()
+def python_plane(asked: Question) -> Callable[[bytes], list[Answer]]:
+    checked = asked.checked()
     is_ros, out = asked.language.is_ros, Source()
-    with out.block(f"def serve({'cdr' if is_ros else 'm'}, source, received_at):", SPAN):
-        values = NO_VALUES
-        if is_ros:
-            nodes = [*expressions(plan), *([condition] if condition else [])]
-            reads = CdrReads(asked.source, (path for node in nodes for path in paths_in(node)))
+    given = f"{'cdr' if is_ros else 'm'}, source, received_at"
+    reads = CdrReads(asked.source, (path for node in checked.nodes() for path in paths_in(node))) if is_ros else None
+    values = reads.values if reads else NO_VALUES
+    if checked.for_each is not None:
+        assert reads is not None
+        with out.block(f"def elements({given}):", SPAN):
             reads.write(out, SPAN)
-            values = reads.values
-        if condition is not None:
-            with out.block(f"if not {out.expression(render(condition, values))}:", SPAN):
+            out.line(f"return {out.expression(render(checked.for_each, values))}", SPAN)
+    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0):", SPAN):
+        if reads is not None:
+            reads.write(out, SPAN)
+        if checked.condition is not None:
+            with out.block(f"if not {out.expression(render(checked.condition, values))}:", SPAN):
                 out.line("return None", SPAN)
         if is_ros:
-            out.line(f"return {write_envelope(out, plan, asked.case, 'it', values)}", SPAN)
+            out.line(f"return {write_envelope(out, checked.plan, asked.case, 'it', values)}", SPAN)
         else:
-            out.line(f"return {write_message(out, plan, 'it')}", SPAN)
+            out.line(f"return {write_message(out, checked.plan, 'it')}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     parse = language_wire()[1].cases["source"].message_class.FromString
 
-    def answer(message: bytes) -> Answer:
+    def answer(*message: Any) -> Answer:
         try:
-            made = namespace["serve"](message if is_ros else parse(message), SOURCE, RECEIVED_AT)
+            made = namespace["serve"](*message)
         except MAPPING_FAILURES as error:
-            return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
+            return _reason(error)
         return FILTERED if made is None else bytes(made)
 
-    return answer
+    def answers(data: bytes) -> list[Answer]:
+        message = data if is_ros else parse(data), SOURCE, RECEIVED_AT
+        if checked.for_each is None:
+            return [answer(*message)]
+        try:
+            elements = [*namespace["elements"](*message)]
+        except MAPPING_FAILURES as error:
+            return [_reason(error)]
+        return [answer(*message, element, index, len(elements)) for index, element in enumerate(elements)]
+
+    return answers
+
+
+def _reason(error: BaseException) -> str:
+    return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
 
 
 # ---- the judge
@@ -233,10 +301,21 @@ def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | N
     """
     serve, judge = plane(asked), oracle(asked)
     for message, view in messages(noise, asked.language):
-        answer, verdict = serve(message), judge(view)
-        if not verdict.allows(answer):
-            expected = verdict.message.hex() if verdict.message is not None else "|".join(sorted(verdict.reasons))
-            found = answer.hex() if isinstance(answer, bytes) else answer
+        answers, verdicts = serve(message), judge(view)
+        is_right = len(answers) == len(verdicts) and all(
+            verdict.allows(answer) for verdict, answer in zip(verdicts, answers, strict=True)
+        )
+        if not is_right:
             shown = " ".join(str(view.message).split())
-            return f"{asked}\n  is {found}\n  not {expected}\n  of {shown}\n  {message.hex()}"
+            found = [answer.hex() if isinstance(answer, bytes) else answer for answer in answers]
+            return f"{asked}\n  is {found}\n  not {[*map(str, verdicts)]}\n  of {shown}\n  {message.hex()}"
     return None
+
+
+def judged_findings(asked: Question, plane: Plane, noise: random.Random) -> Collection[Diagnostic]:
+    """What the compiler refuses a question for; of one that it accepts, asserts that the plane's answers are right."""
+    try:
+        assert disagreement(asked, plane, noise) is None
+    except Misfit as misfit:
+        return misfit.findings
+    return []

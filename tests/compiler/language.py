@@ -1,7 +1,7 @@
 """Expressions and messages at random, for the judge of the language (`judging`).
 
 Expressions are well-typed but for what depends on ranges and lengths, which the compiler may refuse. Everything is
-drawn from a `random.Random`: of Hypothesis, whose examples shrink, or of a script that tries millions.
+drawn from a `random.Random`, since a script tries millions of them.
 """
 
 from __future__ import annotations
@@ -141,6 +141,15 @@ _ROS: Mapping[str, Sequence[str]] = {
     "B": (),
     "S": ("textx2",),
 }
+ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
+    "inners": {"i": ("item.value", "item.many[0]", "len(item.many)"), "f": ("item.ratio",), "s": ("item.in",),
+               "I": ("item.many",)},
+    "i64s": {"i": ("item",)}, "message.u64s": {"i": ("item",)}, "raw": {"i": ("item",)}, "names": {"s": ("item",)},
+    "f64x3": {"f": ("item",)}, "u64s * 2": {"i": ("item",)}, "radians(f32s)": {"f": ("item",)},
+    "[i32, u64]": {"i": ("item",)}, "i16x3 if flag else few": {"i": ("item",)},
+}  # fmt: skip
+"""Lists for `for_each`, and what expressions see of their elements."""
+
 _INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
              1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
 _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18", "-2.5", "nan", "inf", "0.1")
@@ -148,10 +157,14 @@ _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted."""
+    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted.
+
+    `for_each` is one of ITEMS, or empty.
+    """
 
     is_ros: bool
     is_wild: bool = False
+    for_each: str = ""
 
     @property
     def source(self) -> MessageType:
@@ -174,7 +187,12 @@ class Language:
             return _bracketed(noise.choice(_INTEGERS))
         if kind == "f" and noise.randrange(3) == 0:
             return noise.choice(_FLOATS)
-        return noise.choice((*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]))
+        if self.for_each and noise.randrange(2):
+            of_item: list[str] = [*ITEMS[self.for_each].get(kind, ()), *(("index", "count") if kind == "i" else ())]
+            if of_item:
+                return noise.choice(of_item)
+        known: list[str] = [*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]]
+        return noise.choice(known)
 
     def filled(self, noise: random.Random, target: Type) -> Expression:
         """An expression that fills a field, or is refused for its range or length."""
@@ -202,6 +220,12 @@ class Language:
             values, subject, is_whole = {"0": 1, "1": 1, "-7": 1}, self.text(noise, "i", 1), False
         chosen_values = {name: self._value(noise, target, 1) for name in values}
         return chosen(subject, chosen_values, None if is_whole else otherwise)
+
+
+def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
+    """From UDP, from ROS, or from ROS for each element of a list."""
+    is_ros = noise.randrange(2) == 1
+    return Language(is_ros, is_wild, noise.choice(["", *ITEMS]) if is_ros and noise.randrange(3) == 0 else "")
 
 
 def _bracketed(number: int) -> str:
