@@ -43,11 +43,12 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
         feed = CheckedSubscription(topic, asked.source, condition, for_each, None, (target,))
         lowered, findings = lower_table([CheckedRoute(route, asked.case, subscriptions=(feed,))], envelope)
     else:
-        target = CheckedTarget(topic, type=asked.target, when=condition, plan=plan)
+        declared = topic if plan is not None else Destination(Located("endpoint", span), span)
+        target = CheckedTarget(declared, type=asked.target, when=condition, plan=plan)
         lowered, findings = lower_table([CheckedRoute(route, envelope.cases["source"], (target,))], envelope)
     if findings:
         raise Misfit(findings)
     if asked.language.is_ros:
         (made,) = lowered.from_ros[SOURCE]
         return made
-    return lowered.topics[_ROUTE]
+    return lowered.topics[_ROUTE] if plan is not None else lowered.conditions[_ROUTE]

@@ -1,6 +1,7 @@
 """The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
 
-A question is a mapping with a condition, from a payload to a ROS message or the other way. A plane answers with bytes,
+A question is a mapping with a condition, from a payload to a ROS message or the other way, or a condition for a payload
+that is forwarded. A plane answers with bytes,
 FILTERED, or the reason of a refusal; with `for_each`, so for each element. The oracle gives what it may answer.
 """
 
@@ -22,14 +23,14 @@ from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
-from router.compiler.python import NO_VALUES, render
+from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, Diagnostic, NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.types.model import Enum, MessageType, Type
+from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.messages import some_payloads
 from tests.compiler.comparing import same
@@ -67,10 +68,11 @@ class Checked(NamedTuple):
 
     for_each: Node | None
     condition: Node | None
-    plan: Record
+    plan: Record | None
 
     def nodes(self) -> list[Node]:
-        return [each for each in (self.for_each, self.condition, *expressions(self.plan)) if each is not None]
+        planned = expressions(self.plan) if self.plan is not None else ()
+        return [each for each in (self.for_each, self.condition, *planned) if each is not None]
 
 
 def _element_names(for_each: Node) -> dict[str, Node]:
@@ -84,7 +86,8 @@ class Question:
     language: Language
     fields: FieldMap
     when: Expression | None
-    target: MessageType
+    target: MessageType | None
+    """None: the payload is forwarded."""
 
     @property
     def for_each(self) -> Expression | None:
@@ -113,6 +116,8 @@ class Question:
             condition = check(self.when, scope) if self.when else None
         except ExpressionError as error:
             raise Misfit([error.diagnostic]) from None
+        if self.target is None:
+            return Checked(for_each, condition, None)
         mapping = build(self.fields, self.target, scope, SPAN)
         if mapping.findings:
             raise Misfit(mapping.findings)
@@ -126,12 +131,17 @@ class Question:
         return f"{of if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
 
     def _type_of(self, name: str) -> Type | None:
-        field = self.target.field(name)
+        field = self.target.field(name) if self.target else None
         return field.type if field else None
 
 
 def question(noise: random.Random, language: Language) -> Question:
-    when = written(language.text(noise, "b", noise.choice((1, 2, 3)))) if noise.randrange(4) == 0 else None
+    is_forwarded = not language.is_ros and noise.randrange(8) == 0
+    when = None
+    if is_forwarded or noise.randrange(4) == 0:
+        when = written(language.text(noise, "b", noise.choice((1, 2, 3))))
+    if is_forwarded:
+        return Question(language, FieldMap(SPAN, False, ()), when, None)
     if language.is_ros:
         target, fields = language_wire()[1].cases["target"].type, protobuf_fields(noise)
     else:
@@ -164,7 +174,7 @@ class Verdict:
 
     message: bytes | None
     reasons: frozenset[str]
-    declared: MessageType
+    declared: MessageType | None
 
     def allows(self, answer: Answer) -> bool:
         if isinstance(answer, str):
@@ -177,7 +187,7 @@ class Verdict:
     def _is_same(self, answer: bytes) -> bool:
         """Whether it is equal but for the bits of a NaN."""
         assert self.message is not None
-        if len(answer) != len(self.message):
+        if len(answer) != len(self.message) or self.declared is None:
             return False
         try:
             return same(_tree(answer, self.declared), _tree(self.message, self.declared))
@@ -185,13 +195,13 @@ class Verdict:
             return False
 
 
-def oracle(asked: Question) -> Callable[[View], list[Verdict]]:
-    """What may be answered for a message. The question has to be one that the compiler accepts."""
+def oracle(asked: Question) -> Callable[[bytes, View], list[Verdict]]:
+    """What may be answered for a message, which the question is about. The compiler has accepted it."""
 
-    def judge(view: View) -> list[Verdict]:
+    def judge(message: bytes, view: View) -> list[Verdict]:
         context = context_of(view.message, view.type, asked.enums)
         if asked.for_each is None:
-            return [_verdict(asked, context)]
+            return [_verdict(asked, message, context)]
         meaning = meaning_of(asked.for_each, context)
         assert isinstance(meaning.kind, Listing)
         assert meaning.kind.element is not None
@@ -201,7 +211,7 @@ def oracle(asked: Question) -> Callable[[View], list[Verdict]]:
             return [Verdict(None, refused.reasons, asked.target)]
         count = (len(elements), Whole(0, (1 << 32) - 1))
         return [
-            _verdict(asked, replace(context, names={
+            _verdict(asked, message, replace(context, names={
                 ITEM: (element, meaning.kind.element), INDEX: (index, count[1]), COUNT: count}))
             for index, element in enumerate(elements)
         ]  # fmt: skip
@@ -209,11 +219,13 @@ def oracle(asked: Question) -> Callable[[View], list[Verdict]]:
     return judge
 
 
-def _verdict(asked: Question, context: Context) -> Verdict:
+def _verdict(asked: Question, message: bytes, context: Context) -> Verdict:
     schema, envelope = language_wire()
     try:
         if asked.when and not meaning_of(asked.when, context).give(context):
             return Verdict(None, frozenset([FILTERED]), asked.target)
+        if asked.target is None:
+            return Verdict(message, frozenset(), None)
         if asked.language.is_ros:
             payload = fill_given(asked.fields, asked.target, context)
             return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
@@ -226,65 +238,86 @@ def _tree(message: bytes, declared: MessageType) -> Any:
     if declared.name.startswith("made/"):
         return _plain(deserialize(declared, message), declared)
     payload: Any = language_wire()[1].message_class.FromString(message)
-    return {field.name: _listed(value) for field, value in payload.target.ListFields()}
+    return _listed(payload.target)
 
 
 def _listed(value: Any) -> Any:
-    return list(value) if hasattr(value, "append") else value
+    """Of protobuf's objects: dictionaries and lists."""
+    if hasattr(value, "ListFields"):
+        return {field.name: _listed(inner) for field, inner in value.ListFields()}
+    if hasattr(value, "items"):
+        return dict(value)
+    return [*map(_listed, value)] if hasattr(value, "append") else value
 
 
 def _plain(value: Any, declared: Type) -> Any:
-    if isinstance(declared, MessageType):
-        return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
-    return value
+    match declared:
+        case MessageType():
+            return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
+        case List():
+            return [_plain(each, declared.element) for each in value]
+        case _:
+            return value
 
 
 # ---- the Python plane
 
 
 def python_plane(asked: Question) -> Callable[[bytes], list[Answer]]:
-    checked = asked.checked()
-    is_ros, out = asked.language.is_ros, Source()
-    given = f"{'cdr' if is_ros else 'm'}, source, received_at"
-    reads = CdrReads(asked.source, (path for node in checked.nodes() for path in paths_in(node))) if is_ros else None
-    values = reads.values if reads else NO_VALUES
-    if checked.for_each is not None:
-        assert reads is not None
-        with out.block(f"def elements({given}):", SPAN):
-            reads.write(out, SPAN)
-            out.line(f"return {out.expression(render(checked.for_each, values))}", SPAN)
-    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0):", SPAN):
-        if reads is not None:
-            reads.write(out, SPAN)
-        if checked.condition is not None:
-            with out.block(f"if not {out.expression(render(checked.condition, values))}:", SPAN):
-                out.line("return None", SPAN)
-        if is_ros:
-            out.line(f"return {write_envelope(out, checked.plan, asked.case, 'it', values)}", SPAN)
-        else:
-            out.line(f"return {write_message(out, checked.plan, 'it')}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    checked, is_ros = asked.checked(), asked.language.is_ros
+    functions = _functions(asked, checked)
     parse = language_wire()[1].cases["source"].message_class.FromString
 
     def answer(*message: Any) -> Answer:
         try:
-            made = namespace["serve"](*message)
+            made = functions["serve"](*message)
         except MAPPING_FAILURES as error:
             return _reason(error)
         return FILTERED if made is None else bytes(made)
 
     def answers(data: bytes) -> list[Answer]:
         message = data if is_ros else parse(data), SOURCE, RECEIVED_AT
+        if asked.target is None:
+            return [data if answer(*message) == b"" else answer(*message)]
         if checked.for_each is None:
             return [answer(*message)]
         try:
-            elements = [*namespace["elements"](*message)]
+            elements = [*functions["elements"](*message)]
         except MAPPING_FAILURES as error:
             return [_reason(error)]
         return [answer(*message, element, index, len(elements)) for index, element in enumerate(elements)]
 
     return answers
+
+
+def _functions(asked: Question, checked: Checked) -> dict[str, Any]:
+    """`elements` and `serve`, which return what a message gives."""
+    is_ros, out = asked.language.is_ros, Source()
+    given = f"{'cdr' if is_ros else 'm'}, source, received_at"
+    reads = CdrReads(asked.source, (path for node in checked.nodes() for path in paths_in(node))) if is_ros else None
+    values = reads.values if reads else NO_VALUES
+    with out.block(f"def elements({given}):", SPAN):
+        if reads is not None:
+            reads.write(out, SPAN)
+        out.line(f"return {out.expression(render(checked.for_each, values)) if checked.for_each else '[]'}", SPAN)
+    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0):", SPAN):
+        if reads is not None:
+            reads.write(out, SPAN)
+        if checked.condition is not None:
+            with out.block(f"if not {out.expression(render(checked.condition, values))}:", SPAN):
+                out.line("return None", SPAN)
+        out.line(f"return {_written(out, asked, checked.plan, values)}", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return namespace
+
+
+def _written(out: Source, asked: Question, plan: Record | None, values: Values) -> str:
+    if plan is None:
+        return "b''"
+    return (
+        write_envelope(out, plan, asked.case, "it", values) if asked.language.is_ros else write_message(out, plan, "it")
+    )
 
 
 def _reason(error: BaseException) -> str:
@@ -301,7 +334,7 @@ def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | N
     """
     serve, judge = plane(asked), oracle(asked)
     for message, view in messages(noise, asked.language):
-        answers, verdicts = serve(message), judge(view)
+        answers, verdicts = serve(message), judge(message, view)
         is_right = len(answers) == len(verdicts) and all(
             verdict.allows(answer) for verdict, answer in zip(verdicts, answers, strict=True)
         )

@@ -36,6 +36,7 @@ DURATION = MessageType("builtin_interfaces/msg/Duration", (Field("sec", I32), Fi
 INNER = MessageType(
     "made/msg/Inner", (Field("value", I32), Field("in", String()), Field("ratio", F64), Field("many", List(I64)))
 )
+PAIR = MessageType("made/msg/Pair", (Field("key", String()), Field("value", String())))
 ROS_SOURCE = MessageType(
     "made/msg/Source",
     (
@@ -46,7 +47,7 @@ ROS_SOURCE = MessageType(
         Field("f64s", List(F64)), Field("flags", List(Bool())), Field("i16x3", List(I16, 3)), Field("inner", INNER),
         Field("f64x3", List(F64, 3)), Field("u64x2", List(U64, 2)), Field("inners", List(INNER)),
         Field("textx2", List(String(), 2)), Field("from", I32), Field("in", U64), Field("class", F64),
-        Field("is", Bool()), Field("few", List(U16, None, 4)),
+        Field("is", Bool()), Field("few", List(U16, None, 4)), Field("pairs", List(PAIR)),
     ),
 )  # fmt: skip
 
@@ -196,7 +197,7 @@ class Language:
 
     def filled(self, noise: random.Random, target: Type) -> Expression:
         """An expression that fills a field, or is refused for its range or length."""
-        if noise.randrange(12) == 0 and not isinstance(target, List):
+        if noise.randrange(12) == 0 and not isinstance(_innermost(target), MessageType):
             return self._choices(noise, target)
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
 
@@ -232,7 +233,7 @@ def _bracketed(number: int) -> str:
     return f"({number})" if number < 0 else str(number)
 
 
-def _filling(target: Type) -> Sequence[str]:
+def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
     """Templates of what fills a type."""
     match target:
         case Bool():
@@ -251,9 +252,15 @@ def _filling(target: Type) -> Sequence[str]:
         case Enum():
             return ("round(float64({i}))", "clamp({i}, -8, 301)", "{i}", "wrap({i}, 0, 5)", "name", "{s}")
         case MessageType():
-            return ("{t}",)
+            return ("{t}",) if target == TIME else ("inner", "message.inner", "inners[0]", "inners[1]")
+        case List(MessageType() as of):
+            return ("pairs",) if of.is_map_entry else ("inners", "[inner, inners[0]]", "[inner]")
         case List():
             return [_raised(template) for template in _filling(target.element)]
+
+
+def _innermost(declared: Type) -> Type:
+    return declared.element if isinstance(declared, List) else declared
 
 
 def _raised(template: str) -> str:
@@ -264,11 +271,11 @@ def _raised(template: str) -> str:
 # ---- what is filled
 
 _SCALARS: Sequence[Type] = (
-    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME,
+    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME, INNER,
 )  # fmt: skip
 _LISTS: Sequence[Type] = (
     List(U8), List(I16, 2), List(I32), List(I64), List(U64, None, 2), List(F32), List(F64), List(F64, 3), List(Bool()),
-    List(String()), List(String(4), None, 3),
+    List(String()), List(String(4), None, 3), List(INNER), List(INNER, 2), List(INNER, None, 2),
 )  # fmt: skip
 
 
@@ -282,7 +289,7 @@ def ros_target(noise: random.Random) -> MessageType:
 
 def protobuf_fields(noise: random.Random) -> list[Field]:
     """Some fields of the payload `target`."""
-    fields = [field for field in language_wire()[1].cases["target"].type.fields if field.name not in ("raws", "inner")]
+    fields = language_wire()[1].cases["target"].type.fields
     return noise.sample(fields, noise.choice((1, 1, 2, 3)))
 
 
