@@ -247,7 +247,7 @@ class Machine:
         return _Layout(self._keep(nodes), self._keep(defaults), self._keep(closed), ctypes.addressof(literals),
                        layout.slot_count, layout.is_cdr)  # fmt: skip
 
-    def _default(self, value: int | float | bytes) -> bytes:
+    def _default(self, value: float | bytes) -> bytes:
         if isinstance(value, bytes):
             return struct.pack("<QII", self._keep(value), len(value), 0)
         if isinstance(value, float):

@@ -50,10 +50,23 @@ class Fields:
 
 
 @dataclass(frozen=True)
+class ForEach:
+    """A program that leaves a list, how this is stored, and where an element goes: NONE for the other one."""
+
+    code: Code
+    stored: int
+    node: int
+    item: int
+
+
+@dataclass(frozen=True)
 class Program:
     layout: Layout
     condition: Code
     message: Code
+    for_each: ForEach | None = None
+    has_envelope: bool = False
+    """The second node is the envelope around the message."""
 
 
 class _Layouts:
