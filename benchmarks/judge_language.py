@@ -13,11 +13,25 @@ import random
 import sys
 import traceback
 from collections import Counter
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
 
+from router.carrier.build import build
+from tests.carrier.answering import carrier_plane
+from tests.carrier.delivering import delivering
 from tests.compiler.judging import Misfit, Plane, disagreement, is_about_values, python_plane, question
-from tests.compiler.language import Language
+from tests.compiler.language import some_language
 
-PLANES: dict[str, Plane] = {"python": python_plane}
+
+@cache
+def carrier() -> Plane:
+    folder = Path(mkdtemp())
+    return carrier_plane(delivering(folder / "delivering.so", build(folder / "libcarrier.so"), is_sanitized=False))
+
+
+PLANES: dict[str, Callable[[], Plane]] = {"python": lambda: python_plane, "carrier": carrier}
 MESSAGES = 10
 """Of each mapping."""
 
@@ -34,9 +48,9 @@ def main() -> int:
     problems: dict[str, str] = {}
     for number in range(arguments.count // MESSAGES):
         noise = random.Random(f"{arguments.seed} {number}")
-        asked = question(noise, Language(noise.randrange(2) == 1, arguments.wild))
+        asked = question(noise, some_language(noise, is_wild=arguments.wild))
         try:
-            found = disagreement(asked, PLANES[arguments.plane], noise)
+            found = disagreement(asked, PLANES[arguments.plane](), noise)
             outcomes["judged" if found is None else "disagreed"] += 1
             if found is not None:
                 _keep(problems, f"disagreement {number}", found)

@@ -60,7 +60,9 @@ class Operation:
                 number = len(literals)
                 literals += self.data
         head = struct.pack("<BBHI", C[self.name], self.flag, self.slot, size)
-        return head + (struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64)))
+        return head + (
+            struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64))
+        )
 
 
 @dataclass(frozen=True)
@@ -260,7 +262,6 @@ class Machine:
         made = ctypes.create_string_buffer(packed, max(1, len(packed)))
         self._running = made
         return _Code(ctypes.addressof(made), len(operations), 0)
-
 
 
 def integer(value: int) -> Operation:

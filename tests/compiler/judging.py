@@ -1,48 +1,53 @@
 """The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
 
-A question is a mapping with a condition, from a payload to a ROS message or the other way. A plane answers with bytes,
-FILTERED, or the reason of a refusal. The oracle gives what it may answer.
+A question is a mapping with a condition, from a payload to a ROS message or the other way, or a condition for a payload
+that is forwarded. A plane answers with bytes,
+FILTERED, or the reason of a refusal; with `for_each`, so for each element. The oracle gives what it may answer.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
-from typing import Any, Union
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Union
+
+from google.protobuf.message import DecodeError
 
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.tree import Node, paths_in
+from router.compiler.expressions.kinds import UINT32, element_of
+from router.compiler.expressions.lists import as_value
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
-from router.compiler.python import NO_VALUES, render
+from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, Diagnostic, NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.types.model import Enum, MessageType, Type
+from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.messages import some_payloads
 from tests.compiler.comparing import same
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, written
 from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
 from tests.oracles.reference import fill, fill_given
-from tests.oracles.reference_expressions import meaning_of
-from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused, View
+from tests.oracles.reference_expressions import Context, meaning_of
+from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Refused, View, Whole
 from tests.oracles.reference_protobuf import envelope_of
 
 FILTERED = "filtered"
 Answer = Union[bytes, str]
-Plane = Callable[["Question"], Callable[[bytes], Answer]]
+Plane = Callable[["Question"], Callable[[bytes], "list[Answer]"]]
 """Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
 
 _ABOUT_VALUES = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS, Code.LOSSY_CONVERSION, Code.UNKNOWN_ENUM_VALUE}
-_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds")
+_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds", "does not fill float")
 
 
 def is_about_values(finding: Diagnostic) -> bool:
@@ -58,12 +63,35 @@ class Misfit(Exception):
         self.findings = findings
 
 
+class Checked(NamedTuple):
+    """A question as the compiler's trees."""
+
+    for_each: Node | None
+    condition: Node | None
+    plan: Record | None
+
+    def nodes(self) -> list[Node]:
+        planned = expressions(self.plan) if self.plan is not None else ()
+        return [each for each in (self.for_each, self.condition, *planned) if each is not None]
+
+
+def _element_names(for_each: Node) -> dict[str, Node]:
+    element = element_of(for_each.kind)
+    assert element is not None
+    return {name: Variable(kind, SPAN, name) for name, kind in ((ITEM, element), (INDEX, UINT32), (COUNT, UINT32))}
+
+
 @dataclass(frozen=True, slots=True)
 class Question:
     language: Language
     fields: FieldMap
     when: Expression | None
-    target: MessageType
+    target: MessageType | None
+    """None: the payload is forwarded."""
+
+    @property
+    def for_each(self) -> Expression | None:
+        return written(self.language.for_each) if self.language.for_each else None
 
     @property
     def source(self) -> MessageType:
@@ -78,34 +106,42 @@ class Question:
     def enums(self) -> tuple[Enum, ...]:
         return tuple(language_wire()[0].enums.values())
 
-    def scope(self) -> Scope:
-        return Scope(self.source, self.enums, ())
-
-    def checked(self) -> tuple[Node | None, Record]:
+    def checked(self) -> Checked:
         """The compiler's trees. Raises Misfit."""
-        scope = self.scope()
+        scope = Scope(self.source, self.enums, ())
         try:
+            for_each = as_value(check(self.for_each, scope), scope) if self.for_each else None
+            if for_each is not None:
+                scope = Scope(self.source, self.enums, (), _element_names(for_each))
             condition = check(self.when, scope) if self.when else None
         except ExpressionError as error:
             raise Misfit([error.diagnostic]) from None
+        if self.target is None:
+            return Checked(for_each, condition, None)
         mapping = build(self.fields, self.target, scope, SPAN)
         if mapping.findings:
             raise Misfit(mapping.findings)
         assert isinstance(mapping.plan, Record)
-        return condition, mapping.plan
+        return Checked(for_each, condition, mapping.plan)
 
     def __str__(self) -> str:
         fields = ", ".join(f"{entry.path[-1]}: {entry.value}" for entry in self.fields.entries)
         types = ", ".join(str(self._type_of(entry.path[-1])) for entry in self.fields.entries)
-        return f"{'ros' if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
+        of = f"ros, for_each {self.language.for_each}" if self.language.for_each else "ros"
+        return f"{of if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
 
     def _type_of(self, name: str) -> Type | None:
-        field = self.target.field(name)
+        field = self.target.field(name) if self.target else None
         return field.type if field else None
 
 
 def question(noise: random.Random, language: Language) -> Question:
-    when = written(language.text(noise, "b", noise.choice((1, 2, 3)))) if noise.randrange(4) == 0 else None
+    is_forwarded = not language.is_ros and noise.randrange(8) == 0
+    when = None
+    if is_forwarded or noise.randrange(4) == 0:
+        when = written(language.text(noise, "b", noise.choice((1, 2, 3))))
+    if is_forwarded:
+        return Question(language, FieldMap(SPAN, False, ()), when, None)
     if language.is_ros:
         target, fields = language_wire()[1].cases["target"].type, protobuf_fields(noise)
     else:
@@ -138,89 +174,154 @@ class Verdict:
 
     message: bytes | None
     reasons: frozenset[str]
-    declared: MessageType
+    declared: MessageType | None
 
     def allows(self, answer: Answer) -> bool:
         if isinstance(answer, str):
             return answer in self.reasons
         return self.message is not None and (answer == self.message or self._is_same(answer))
 
+    def __str__(self) -> str:
+        return self.message.hex() if self.message is not None else "|".join(sorted(self.reasons))
+
     def _is_same(self, answer: bytes) -> bool:
         """Whether it is equal but for the bits of a NaN."""
         assert self.message is not None
-        if len(answer) != len(self.message):
+        if len(answer) != len(self.message) or self.declared is None:
             return False
-        return same(_tree(answer, self.declared), _tree(self.message, self.declared))
-
-
-def oracle(asked: Question) -> Callable[[View], Verdict]:
-    """What may be answered for a message. The question has to be one that the compiler accepts."""
-    schema, envelope = language_wire()
-
-    def judge(view: View) -> Verdict:
-        context = context_of(view.message, view.type, asked.enums)
         try:
-            if asked.when and not meaning_of(asked.when, context).give(context):
-                return Verdict(None, frozenset([FILTERED]), asked.target)
-            if asked.language.is_ros:
-                payload = fill_given(asked.fields, asked.target, context)
-                return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
-            return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+            return same(_tree(answer, self.declared), _tree(self.message, self.declared))
+        except (*MAPPING_FAILURES, DecodeError):
+            return False
+
+
+def oracle(asked: Question) -> Callable[[bytes, View], list[Verdict]]:
+    """What may be answered for a message, which the question is about. The compiler has accepted it."""
+
+    def judge(message: bytes, view: View) -> list[Verdict]:
+        context = context_of(view.message, view.type, asked.enums)
+        if asked.for_each is None:
+            return [_verdict(asked, message, context)]
+        meaning = meaning_of(asked.for_each, context)
+        assert isinstance(meaning.kind, Listing)
+        assert meaning.kind.element is not None
+        try:
+            elements = meaning.give(context)
         except Refused as refused:
-            return Verdict(None, refused.reasons, asked.target)
+            return [Verdict(None, refused.reasons, asked.target)]
+        count = (len(elements), Whole(0, (1 << 32) - 1))
+        return [
+            _verdict(asked, message, replace(context, names={
+                ITEM: (element, meaning.kind.element), INDEX: (index, count[1]), COUNT: count}))
+            for index, element in enumerate(elements)
+        ]  # fmt: skip
 
     return judge
+
+
+def _verdict(asked: Question, message: bytes, context: Context) -> Verdict:
+    schema, envelope = language_wire()
+    try:
+        if asked.when and not meaning_of(asked.when, context).give(context):
+            return Verdict(None, frozenset([FILTERED]), asked.target)
+        if asked.target is None:
+            return Verdict(message, frozenset(), None)
+        if asked.language.is_ros:
+            payload = fill_given(asked.fields, asked.target, context)
+            return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
+        return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+    except Refused as refused:
+        return Verdict(None, refused.reasons, asked.target)
 
 
 def _tree(message: bytes, declared: MessageType) -> Any:
     if declared.name.startswith("made/"):
         return _plain(deserialize(declared, message), declared)
     payload: Any = language_wire()[1].message_class.FromString(message)
-    return {field.name: _listed(value) for field, value in payload.target.ListFields()}
+    return _listed(payload.target)
 
 
 def _listed(value: Any) -> Any:
-    return list(value) if hasattr(value, "append") else value
+    """Of protobuf's objects: dictionaries and lists."""
+    if hasattr(value, "ListFields"):
+        return {field.name: _listed(inner) for field, inner in value.ListFields()}
+    if hasattr(value, "items"):
+        return dict(value)
+    return [*map(_listed, value)] if hasattr(value, "append") else value
 
 
 def _plain(value: Any, declared: Type) -> Any:
-    if isinstance(declared, MessageType):
-        return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
-    return value
+    match declared:
+        case MessageType():
+            return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
+        case List():
+            return [_plain(each, declared.element) for each in value]
+        case _:
+            return value
 
 
 # ---- the Python plane
 
 
-def python_plane(asked: Question) -> Callable[[bytes], Answer]:
-    condition, plan = asked.checked()
-    is_ros, out = asked.language.is_ros, Source()
-    with out.block(f"def serve({'cdr' if is_ros else 'm'}, source, received_at):", SPAN):
-        values = NO_VALUES
-        if is_ros:
-            nodes = [*expressions(plan), *([condition] if condition else [])]
-            reads = CdrReads(asked.source, (path for node in nodes for path in paths_in(node)))
-            reads.write(out, SPAN)
-            values = reads.values
-        if condition is not None:
-            with out.block(f"if not {out.expression(render(condition, values))}:", SPAN):
-                out.line("return None", SPAN)
-        if is_ros:
-            out.line(f"return {write_envelope(out, plan, asked.case, 'it', values)}", SPAN)
-        else:
-            out.line(f"return {write_message(out, plan, 'it')}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+def python_plane(asked: Question) -> Callable[[bytes], list[Answer]]:
+    checked, is_ros = asked.checked(), asked.language.is_ros
+    functions = _functions(asked, checked)
     parse = language_wire()[1].cases["source"].message_class.FromString
 
-    def answer(message: bytes) -> Answer:
+    def answer(*message: Any) -> Answer:
         try:
-            made = namespace["serve"](message if is_ros else parse(message), SOURCE, RECEIVED_AT)
+            made = functions["serve"](*message)
         except MAPPING_FAILURES as error:
-            return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
+            return _reason(error)
         return FILTERED if made is None else bytes(made)
 
-    return answer
+    def answers(data: bytes) -> list[Answer]:
+        message = data if is_ros else parse(data), SOURCE, RECEIVED_AT
+        if asked.target is None:
+            return [data if answer(*message) == b"" else answer(*message)]
+        if checked.for_each is None:
+            return [answer(*message)]
+        try:
+            elements = [*functions["elements"](*message)]
+        except MAPPING_FAILURES as error:
+            return [_reason(error)]
+        return [answer(*message, element, index, len(elements)) for index, element in enumerate(elements)]
+
+    return answers
+
+
+def _functions(asked: Question, checked: Checked) -> dict[str, Any]:
+    """`elements` and `serve`, which return what a message gives."""
+    is_ros, out = asked.language.is_ros, Source()
+    given = f"{'cdr' if is_ros else 'm'}, source, received_at"
+    reads = CdrReads(asked.source, (path for node in checked.nodes() for path in paths_in(node))) if is_ros else None
+    values = reads.values if reads else NO_VALUES
+    with out.block(f"def elements({given}):", SPAN):
+        if reads is not None:
+            reads.write(out, SPAN)
+        out.line(f"return {out.expression(render(checked.for_each, values)) if checked.for_each else '[]'}", SPAN)
+    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0):", SPAN):
+        if reads is not None:
+            reads.write(out, SPAN)
+        if checked.condition is not None:
+            with out.block(f"if not {out.expression(render(checked.condition, values))}:", SPAN):
+                out.line("return None", SPAN)
+        out.line(f"return {_written(out, asked, checked.plan, values)}", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return namespace
+
+
+def _written(out: Source, asked: Question, plan: Record | None, values: Values) -> str:
+    if plan is None:
+        return "b''"
+    return (
+        write_envelope(out, plan, asked.case, "it", values) if asked.language.is_ros else write_message(out, plan, "it")
+    )
+
+
+def _reason(error: BaseException) -> str:
+    return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
 
 
 # ---- the judge
@@ -233,10 +334,21 @@ def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | N
     """
     serve, judge = plane(asked), oracle(asked)
     for message, view in messages(noise, asked.language):
-        answer, verdict = serve(message), judge(view)
-        if not verdict.allows(answer):
-            expected = verdict.message.hex() if verdict.message is not None else "|".join(sorted(verdict.reasons))
-            found = answer.hex() if isinstance(answer, bytes) else answer
+        answers, verdicts = serve(message), judge(message, view)
+        is_right = len(answers) == len(verdicts) and all(
+            verdict.allows(answer) for verdict, answer in zip(verdicts, answers, strict=True)
+        )
+        if not is_right:
             shown = " ".join(str(view.message).split())
-            return f"{asked}\n  is {found}\n  not {expected}\n  of {shown}\n  {message.hex()}"
+            found = [answer.hex() if isinstance(answer, bytes) else answer for answer in answers]
+            return f"{asked}\n  is {found}\n  not {[*map(str, verdicts)]}\n  of {shown}\n  {message.hex()}"
     return None
+
+
+def judged_findings(asked: Question, plane: Plane, noise: random.Random) -> Collection[Diagnostic]:
+    """What the compiler refuses a question for; of one that it accepts, asserts that the plane's answers are right."""
+    try:
+        assert disagreement(asked, plane, noise) is None
+    except Misfit as misfit:
+        return misfit.findings
+    return []

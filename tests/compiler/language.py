@@ -1,7 +1,7 @@
 """Expressions and messages at random, for the judge of the language (`judging`).
 
 Expressions are well-typed but for what depends on ranges and lengths, which the compiler may refuse. Everything is
-drawn from a `random.Random`: of Hypothesis, whose examples shrink, or of a script that tries millions.
+drawn from a `random.Random`, since a script tries millions of them.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ DURATION = MessageType("builtin_interfaces/msg/Duration", (Field("sec", I32), Fi
 INNER = MessageType(
     "made/msg/Inner", (Field("value", I32), Field("in", String()), Field("ratio", F64), Field("many", List(I64)))
 )
+PAIR = MessageType("made/msg/Pair", (Field("key", String()), Field("value", String())))
 ROS_SOURCE = MessageType(
     "made/msg/Source",
     (
@@ -46,7 +47,7 @@ ROS_SOURCE = MessageType(
         Field("f64s", List(F64)), Field("flags", List(Bool())), Field("i16x3", List(I16, 3)), Field("inner", INNER),
         Field("f64x3", List(F64, 3)), Field("u64x2", List(U64, 2)), Field("inners", List(INNER)),
         Field("textx2", List(String(), 2)), Field("from", I32), Field("in", U64), Field("class", F64),
-        Field("is", Bool()), Field("few", List(U16, None, 4)),
+        Field("is", Bool()), Field("few", List(U16, None, 4)), Field("pairs", List(PAIR)),
     ),
 )  # fmt: skip
 
@@ -141,6 +142,15 @@ _ROS: Mapping[str, Sequence[str]] = {
     "B": (),
     "S": ("textx2",),
 }
+ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
+    "inners": {"i": ("item.value", "item.many[0]", "len(item.many)"), "f": ("item.ratio",), "s": ("item.in",),
+               "I": ("item.many",)},
+    "i64s": {"i": ("item",)}, "message.u64s": {"i": ("item",)}, "raw": {"i": ("item",)}, "names": {"s": ("item",)},
+    "f64x3": {"f": ("item",)}, "u64s * 2": {"i": ("item",)}, "radians(f32s)": {"f": ("item",)},
+    "[i32, u64]": {"i": ("item",)}, "i16x3 if flag else few": {"i": ("item",)},
+}  # fmt: skip
+"""Lists for `for_each`, and what expressions see of their elements."""
+
 _INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
              1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
 _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18", "-2.5", "nan", "inf", "0.1")
@@ -148,10 +158,14 @@ _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted."""
+    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted.
+
+    `for_each` is one of ITEMS, or empty.
+    """
 
     is_ros: bool
     is_wild: bool = False
+    for_each: str = ""
 
     @property
     def source(self) -> MessageType:
@@ -174,11 +188,16 @@ class Language:
             return _bracketed(noise.choice(_INTEGERS))
         if kind == "f" and noise.randrange(3) == 0:
             return noise.choice(_FLOATS)
-        return noise.choice((*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]))
+        if self.for_each and noise.randrange(2):
+            of_item: list[str] = [*ITEMS[self.for_each].get(kind, ()), *(("index", "count") if kind == "i" else ())]
+            if of_item:
+                return noise.choice(of_item)
+        known: list[str] = [*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]]
+        return noise.choice(known)
 
     def filled(self, noise: random.Random, target: Type) -> Expression:
         """An expression that fills a field, or is refused for its range or length."""
-        if noise.randrange(12) == 0 and not isinstance(target, List):
+        if noise.randrange(12) == 0 and not isinstance(_innermost(target), MessageType):
             return self._choices(noise, target)
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
 
@@ -204,11 +223,17 @@ class Language:
         return chosen(subject, chosen_values, None if is_whole else otherwise)
 
 
+def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
+    """From UDP, from ROS, or from ROS for each element of a list."""
+    is_ros = noise.randrange(2) == 1
+    return Language(is_ros, is_wild, noise.choice(["", *ITEMS]) if is_ros and noise.randrange(3) == 0 else "")
+
+
 def _bracketed(number: int) -> str:
     return f"({number})" if number < 0 else str(number)
 
 
-def _filling(target: Type) -> Sequence[str]:
+def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
     """Templates of what fills a type."""
     match target:
         case Bool():
@@ -227,9 +252,15 @@ def _filling(target: Type) -> Sequence[str]:
         case Enum():
             return ("round(float64({i}))", "clamp({i}, -8, 301)", "{i}", "wrap({i}, 0, 5)", "name", "{s}")
         case MessageType():
-            return ("{t}",)
+            return ("{t}",) if target == TIME else ("inner", "message.inner", "inners[0]", "inners[1]")
+        case List(MessageType() as of):
+            return ("pairs",) if of.is_map_entry else ("inners", "[inner, inners[0]]", "[inner]")
         case List():
             return [_raised(template) for template in _filling(target.element)]
+
+
+def _innermost(declared: Type) -> Type:
+    return declared.element if isinstance(declared, List) else declared
 
 
 def _raised(template: str) -> str:
@@ -240,11 +271,11 @@ def _raised(template: str) -> str:
 # ---- what is filled
 
 _SCALARS: Sequence[Type] = (
-    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME,
+    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME, INNER,
 )  # fmt: skip
 _LISTS: Sequence[Type] = (
     List(U8), List(I16, 2), List(I32), List(I64), List(U64, None, 2), List(F32), List(F64), List(F64, 3), List(Bool()),
-    List(String()), List(String(4), None, 3),
+    List(String()), List(String(4), None, 3), List(INNER), List(INNER, 2), List(INNER, None, 2),
 )  # fmt: skip
 
 
@@ -258,7 +289,7 @@ def ros_target(noise: random.Random) -> MessageType:
 
 def protobuf_fields(noise: random.Random) -> list[Field]:
     """Some fields of the payload `target`."""
-    fields = [field for field in language_wire()[1].cases["target"].type.fields if field.name not in ("raws", "inner")]
+    fields = language_wire()[1].cases["target"].type.fields
     return noise.sample(fields, noise.choice((1, 1, 2, 3)))
 
 

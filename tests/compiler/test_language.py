@@ -9,7 +9,8 @@ import ast
 import math
 import random
 import re
-from collections.abc import Collection
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,27 +18,25 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.errors import Diagnostic
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import context_of, written
 from tests.compiler.judging import (
     Answer,
     Misfit,
-    Plane,
     Question,
     disagreement,
     is_about_values,
+    judged_findings,
     python_plane,
     question,
 )
-from tests.compiler.language import Language
+from tests.compiler.language import some_language
 from tests.oracles.reference_expressions import Context, evaluate
 from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused
 
-MANY = settings(max_examples=20 * settings().max_examples, suppress_health_check=list(HealthCheck))
+MANY = settings(max_examples=10 * settings().max_examples, suppress_health_check=list(HealthCheck))
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "table.md"
-PLANES: dict[str, Plane] = {"python": python_plane}
 
 
 # ---- the page and the oracle
@@ -207,58 +206,38 @@ def test_of_two_reasons_each_may_be_given() -> None:
 
 # ---- the planes
 
-noises = st.randoms(use_true_random=False)
+noises = st.integers(0, (1 << 64) - 1).map(random.Random)
+"""They do not shrink, but there can be many of them."""
 
 
-def judged_findings(asked: Question, plane: Plane, noise: random.Random) -> Collection[Diagnostic]:
-    """What the compiler refuses a question for; of one that it accepts, the plane's answers are judged."""
-    try:
-        assert disagreement(asked, plane, noise) is None
-    except Misfit as misfit:
-        return misfit.findings
-    return []
+@MANY
+@given(noises)
+def test_mappings_give_in_python_what_the_oracle_gives(noise: random.Random) -> None:
+    asked = question(noise, some_language(noise))
+    findings = judged_findings(asked, python_plane, noise)
+    assert all(map(is_about_values, findings)), (str(asked), [*map(str, findings)])
+    event("refused" if findings else "judged")
 
 
-@pytest.mark.parametrize("is_ros", [False, True], ids=["from UDP", "from ROS"])
-@pytest.mark.parametrize("plane", PLANES.values(), ids=PLANES)
-def test_mappings_give_what_the_oracle_gives(plane: Plane, is_ros: bool) -> None:
-    @MANY
-    @given(noises)
-    def judged(noise: random.Random) -> None:
-        asked = question(noise, Language(is_ros))
-        findings = judged_findings(asked, plane, noise)
-        assert all(map(is_about_values, findings)), (str(asked), [*map(str, findings)])
-        event("refused" if findings else "judged")
-
-    judged()
-
-
-@pytest.mark.parametrize("is_ros", [False, True], ids=["from UDP", "from ROS"])
-def test_what_is_ill_typed_is_a_finding_and_the_rest_is_right(is_ros: bool) -> None:
-    @MANY
-    @given(noises)
-    def judged(noise: random.Random) -> None:
-        for finding in judged_findings(question(noise, Language(is_ros, is_wild=True)), python_plane, noise):
-            assert finding.span.line == 7
-
-    judged()
+@MANY
+@given(noises)
+def test_what_is_ill_typed_is_a_finding_and_the_rest_is_right(noise: random.Random) -> None:
+    for finding in judged_findings(question(noise, some_language(noise, is_wild=True)), python_plane, noise):
+        assert finding.span.line == 7
 
 
 def test_a_plane_that_is_wrong_by_one_bit_is_found() -> None:
-    def wrong(asked: Question) -> Any:
+    def wrong(asked: Question) -> Callable[[bytes], list[Answer]]:
         serve = python_plane(asked)
 
-        def answer(message: bytes) -> Answer:
-            made = serve(message)
-            return made if isinstance(made, str) else bytes([*made[:-1], made[-1] ^ 1])
+        def answers(message: bytes) -> list[Answer]:
+            return [made if isinstance(made, str) else bytes([*made[:-1], made[-1] ^ 1]) for made in serve(message)]
 
-        return answer
+        return answers
 
-    found = set()
-    for seed in range(200):
+    found = []
+    for seed in range(40):
         noise = random.Random(seed)
-        try:
-            found.add(disagreement(question(noise, Language(seed % 2 == 1)), wrong, noise) is not None)
-        except Misfit:
-            continue
-    assert True in found
+        with suppress(Misfit):
+            found.append(disagreement(question(noise, some_language(noise)), wrong, noise))
+    assert len([each for each in found if each]) > len(found) / 2

@@ -201,7 +201,7 @@ def _to_enum(value: int | str, target: Enum) -> int:
     if isinstance(value, str) and value not in numbers:
         raise Refused(MAPPING_ERROR)
     number = numbers[value] if isinstance(value, str) else int(value)
-    if getattr(target, "is_closed", False) and number not in numbers.values():
+    if target.is_closed and number not in numbers.values():
         raise Refused(MAPPING_ERROR)
     if not -(1 << 31) <= number < 1 << 31:
         raise Refused(MAPPING_ERROR)

@@ -50,7 +50,6 @@ from tests.oracles.reference_kinds import (
     kind_of,
     known,
     number,
-    seen,
     shaped,
 )
 
@@ -59,7 +58,7 @@ from tests.oracles.reference_kinds import (
 class Context:
     """What expressions can see: a message, who sent it, when (ns since 1970), and the constants by holder.
 
-    `names` are values beside the fields, which win over fields of the same name, with their types.
+    `names` are values beside the fields, which win over fields of the same name, with their kinds.
     """
 
     view: View
@@ -67,7 +66,7 @@ class Context:
     received_at: int
     enums: Collection[Enum]
     ros_types: Collection[MessageType]
-    names: Mapping[str, tuple[Any, Type]] = field(default_factory=dict)
+    names: Mapping[str, tuple[Any, Kind]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +188,7 @@ def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) ->
         columns = [_elements(each, context) if isinstance(each.kind, Listing) else None for each in operands]
         lengths = {len(column) for column in columns if column is not None}
         if len(lengths) > 1:
-            raise Refused(MAPPING_ERROR)
+            all_of([_different_lengths, *(each for column in columns if column is not None for each in column)])
         scalars = [partial(each.give, context) for each in operands]
         return [
             partial(_computed, compute, kind, [column[index] if column is not None else scalar
@@ -199,6 +198,10 @@ def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) ->
 
     lengths = [each.length for each in lists if each.length is not None]
     return _list_of(Listing(kind, lengths[0] if lengths else None), elements)
+
+
+def _different_lengths() -> None:
+    raise Refused(MAPPING_ERROR)
 
 
 def _computed(compute: Callable[..., Any], kind: Kind, operands: Sequence[Computation]) -> Any:
@@ -363,7 +366,7 @@ class _Reader:
 
     def _named(self, name: str, expected: Type | None) -> Meaning:
         if name in self.context.names:
-            return Meaning(kind_of(self.context.names[name][1]), lambda context: seen(*context.names[name]))
+            return Meaning(self.context.names[name][1], lambda context: context.names[name][0])
         if self.context.view.type.field(name) is not None:
             return self._field(self._message(), name)
         values = dict(expected.values) if isinstance(expected, Enum) else {}
