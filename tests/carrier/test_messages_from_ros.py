@@ -322,12 +322,12 @@ def test_expressions_have_the_same_values(delivering: CDLL, case: str, fields: d
         ("texts", {"text": "item", "u32": "count"}, "item != ''"),
         ("pair", {"u32": "count"}, ""),
         ("times", {"real": "seconds(item)"}, ""),
-        ("octets", {"u32": "item", "text": "text"}, ""),
+        ("octets", {"u32": "item", "i64": "i64"}, ""),
         ("[i32, u32, -1]", {"i64": "item", "text": "'wheel_' + str(index)"}, ""),
         ("longs", {"u64": "item", "flag": "item > f64"}, "index != 1"),
         ("[text, short]", {"text": "item + source"}, "len(item) > 0"),
         ("[point, point]", {"text": "item.name", "u32": "len(points)"}, "index > 0"),
-        ("flags", {"flag": "item", "text": "short"}, "item"),
+        ("flags", {"flag": "item", "i32": "i8"}, "item"),
     ],
 )  # fmt: skip
 def test_each_element_is_a_message(delivering: CDLL, for_each: str, fields: dict[str, str], when: str) -> None:
