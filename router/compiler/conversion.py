@@ -262,8 +262,9 @@ def _to_float(value: Node, target: Float) -> Node:
 
 def _to_string(value: Node, target: String) -> Node:
     if not isinstance(value.kind, StringKind):
-        numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
-        raise mismatch(value, target, "str() makes text of it" if numeric else "")
+        is_float = isinstance(value.kind, FloatKind)
+        hint = "str() makes text of it" if isinstance(value.kind, (IntKind, EnumKind, BoolKind)) else ""
+        raise mismatch(value, target, "text(x, 2) makes text of it" if is_float else hint)
     if target.wide:
         hint = "leave it out, and it keeps its default; or declare it as a string"
         raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions do not fill a wstring", hint)

@@ -361,7 +361,8 @@ def _elements(kind: List, value: Any) -> Sequence[Any]:
     element = kind.element
     if isinstance(element, MessageType) and element.is_map_entry:
         return [_Entry(key, value[key]) for key in sorted(value)]  # its own order differs from run to run
-    return value
+    elements: Sequence[Any] = value
+    return elements
 
 
 def _time_of(kind: MessageType, value: Any) -> int:

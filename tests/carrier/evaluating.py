@@ -60,7 +60,9 @@ class Operation:
                 number = len(literals)
                 literals += self.data
         head = struct.pack("<BBHI", C[self.name], self.flag, self.slot, size)
-        return head + (struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64)))
+        return head + (
+            struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64))
+        )
 
 
 @dataclass(frozen=True)
@@ -247,7 +249,7 @@ class Machine:
         return _Layout(self._keep(nodes), self._keep(defaults), self._keep(closed), ctypes.addressof(literals),
                        layout.slot_count, layout.is_cdr)  # fmt: skip
 
-    def _default(self, value: int | float | bytes) -> bytes:
+    def _default(self, value: float | bytes) -> bytes:
         if isinstance(value, bytes):
             return struct.pack("<QII", self._keep(value), len(value), 0)
         if isinstance(value, float):
@@ -260,7 +262,6 @@ class Machine:
         made = ctypes.create_string_buffer(packed, max(1, len(packed)))
         self._running = made
         return _Code(ctypes.addressof(made), len(operations), 0)
-
 
 
 def integer(value: int) -> Operation:

@@ -10,8 +10,8 @@ from typing import Any
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions import Scope, check
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.expressions.kinds import UINT32, ListKind
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE

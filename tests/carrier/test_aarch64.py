@@ -12,7 +12,7 @@ import pytest
 
 from router.carrier import build as carrier
 from router.carrier.build import NATIVE
-from tests.carrier.fuzz import build, build_compose, build_convert
+from tests.carrier.fuzz import build, build_machine
 from tests.carrier.fuzz.compiling import Compile, for_corpus
 
 GCC, QEMU = "aarch64-linux-gnu-gcc", "qemu-aarch64-static"
@@ -78,10 +78,9 @@ def test_programs_pass(name: str, arguments: Sequence[str], library: Path, tmp_p
     [
         lambda folder, compile_: build.build(folder, "envelope_fuzz", compile_),
         lambda folder, compile_: build.build(folder, "handle_fuzz", compile_),
-        build_convert.build,
-        build_compose.build,
+        build_machine.build,
     ],
-    ids=["envelope", "handle", "convert", "compose"],
+    ids=["envelope", "handle", "machine"],
 )
 def test_inputs_of_fuzz_targets_have_the_same_outcome(fuzzed: Build, tmp_path: Path) -> None:
     for command in (GCC, QEMU):

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.fuzz_carrier import fuzz
 from tests.carrier.decisions import SCHEMAS
-from tests.carrier.fuzz import build_compose, build_convert
+from tests.carrier.fuzz import build_machine
 from tests.carrier.fuzz.build import TARGETS, build
 
 
@@ -23,14 +23,8 @@ def test_a_minute_of_libfuzzer(target: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
-def test_a_minute_of_libfuzzer_on_commands(tmp_path: Path) -> None:
-    fuzz_for_a_minute(build_convert.build(tmp_path), tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
-def test_a_minute_of_libfuzzer_on_messages_of_topics(tmp_path: Path) -> None:
-    fuzz_for_a_minute(build_compose.build(tmp_path), tmp_path)
+def test_a_minute_of_libfuzzer_on_programs(tmp_path: Path) -> None:
+    fuzz_for_a_minute(build_machine.build(tmp_path), tmp_path)
 
 
 def fuzz_for_a_minute(program: Path, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""From CDR bytes to datagrams: the carrier gives the bytes of the generated handlers, or refuses as they do."""
+"""From messages of ROS to datagrams: the carrier gives the bytes of the generated handlers, or refuses as they do."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.cdr import CdrReads
-from router.compiler.commands import NeedsPythonError
+from router.compiler.expressions import ExpressionError
 from router.compiler.lookup import Definitions
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.carrier.conversions import Convert, by_carrier, in_python, lowered
+from router.types.protobuf import PayloadCase
+from tests.carrier.planes import MAPPING_ERROR, Misfit, Plane, from_ros
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome
 from tests.compiler.generated_types import mirror, payload_sources, values
-from tests.compiler.payloads import Wire, compiled_envelope, made_wire, rover_wire
+from tests.compiler.payloads import made_wire, rover_wire
+from tests.compiler.test_expressions import SOURCE as PAYLOAD
+from tests.compiler.test_expressions import texts
 from tests.oracles.reference import fill
 
 MANY = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
@@ -29,11 +30,8 @@ F32, F64, U8, I32, U32, I64, U64 = (
 )  # fmt: skip
 
 
-def both(library: CDLL, wire: Wire, case: str, fields: FieldMap, source: MessageType) -> tuple[Convert, Convert]:
-    """Python's function and the carrier's. Raises NeedsPythonError."""
-    declared = wire[1].cases[case]
-    carried = by_carrier(library, lowered(wire, declared, fields, source))
-    return in_python(compiled_envelope(wire, declared, fields, source, CdrReads(source))), carried
+def case_of(name: str) -> PayloadCase:
+    return made_wire()[1].cases[name]
 
 
 def serialized(declared: MessageType, message: Any) -> bytes:
@@ -104,50 +102,44 @@ def damaged(draw: st.DrawFn, message: bytes) -> bytes:
 
 @MANY
 @given(data=st.data())
-def test_random_mappings_make_the_same_datagrams(library: CDLL, data: st.DataObject) -> None:
+def test_random_mappings_make_the_same_datagrams(delivering: CDLL, data: st.DataObject) -> None:
     wire = made_wire()
     case = data.draw(st.sampled_from(["scalars", "optional", "many", "choice", "names", "bounded", "nothing"]))
     source = as_ros(data.draw(payload_sources(wire[1].cases[case].type)))
     assume(source.fields)
     try:
-        python, carrier = both(library, wire, case, AUTO, source)
-    except NeedsPythonError as error:
-        event(f"needs Python: {error}")
+        python, carrier = from_ros(delivering, wire, wire[1].cases[case], AUTO, source)
+    except Misfit:
+        event("nothing in common")
         return
     for _ in range(3):
         message = data.draw(messages(source))
         assert carrier(message) == python(message)
         hostile = data.draw(damaged(message))
-        event("refused" if python(hostile) is None else "sent")
+        event("refused" if python(hostile) == [MAPPING_ERROR] else "sent")
         assert carrier(hostile) == python(hostile)
 
 
-def test_all_commands_of_the_rover_make_the_same_datagrams(library: CDLL, definitions: Definitions) -> None:
+def test_all_commands_of_the_rover_make_the_same_datagrams(delivering: CDLL, definitions: Definitions) -> None:
     """Those of its table, and whatever else boards take."""
     wire = rover_wire()
-    lowerable = 0
     for case in wire[1].cases.values():
         declared = definitions.interfaces.get(f"comms/msg/{_ROS_NAMES.get(case.name, case.type.name)}")
         assert declared is not None
-        try:
-            python, carrier = both(library, wire, case.name, AUTO, declared)
-        except NeedsPythonError:
-            continue
-        lowerable += 1
+        python, carrier = from_ros(delivering, wire, case, AUTO, declared)
         _assert_equal(declared, python, carrier)
-    assert lowerable > len(wire[1].cases) // 2
 
 
 _ROS_NAMES = {"imu_info": "ImuSensorInformation"}
 """Of the one ROS type that has another name than its payload."""
 
 
-def _assert_equal(declared: MessageType, python: Convert, carrier: Convert) -> None:
+def _assert_equal(declared: MessageType, python: Plane, carrier: Plane) -> None:
     @settings(max_examples=settings().max_examples, suppress_health_check=list(HealthCheck))
     @given(st.data())
     def equal(data: st.DataObject) -> None:
         message = data.draw(messages(declared))
-        assert carrier(message) == python(message) is not None
+        assert carrier(message) == python(message) != [MAPPING_ERROR]
         hostile = data.draw(damaged(message))
         assert carrier(hostile) == python(hostile)
 
@@ -158,41 +150,43 @@ def _assert_equal(declared: MessageType, python: Convert, carrier: Convert) -> N
 
 
 @pytest.mark.parametrize("bits", [0x7F800001, 0xFF812345, 0x7FC00001, 0x7F800000, 0xFF800000, 0x80000000, 0x00000001])
-def test_float32_keeps_what_the_handlers_keep(library: CDLL, bits: int) -> None:
+def test_float32_keeps_what_the_handlers_keep(delivering: CDLL, bits: int) -> None:
     message = b"\0\1\0\0" + struct.pack("<I", bits)
     for fields in (field_map(single="x"), field_map(real="x")):
-        python, carrier = both(library, made_wire(), "scalars", fields, source_of(x=F32))
+        python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), fields, source_of(x=F32))
         assert carrier(message) == python(message)
 
 
 @pytest.mark.parametrize("value", [0.0, -0.0, math.nan, math.inf, -1e39, 3.4028235677973366e38, 3.4028235677973362e38])
-def test_float64_is_narrowed_where_the_table_says_so(library: CDLL, value: float) -> None:
+def test_float64_is_narrowed_where_the_table_says_so(delivering: CDLL, value: float) -> None:
     message = b"\0\1\0\0" + struct.pack("<d", value)
-    python, carrier = both(library, made_wire(), "scalars", field_map(single="float32(x)"), source_of(x=F64))
+    python, carrier = from_ros(
+        delivering, made_wire(), case_of("scalars"), field_map(single="float32(x)"), source_of(x=F64)
+    )
     assert carrier(message) == python(message)
 
 
 @pytest.mark.parametrize("name", ["i32", "s32", "sf32", "u32", "f32", "i64", "s64", "sf64", "u64", "f64", "rock"])
-def test_integers_are_encoded_up_to_their_bounds(library: CDLL, name: str) -> None:
+def test_integers_are_encoded_up_to_their_bounds(delivering: CDLL, name: str) -> None:
     wire = made_wire()
     member = wire[1].cases["scalars"].type.field(name)
     assert member is not None
     declared = member.type if isinstance(member.type, Int) else I32
     source = source_of(flag=Bool(), x=declared)
-    python, carrier = both(library, wire, "scalars", field_map(**{name: "x"}), source)
+    python, carrier = from_ros(delivering, wire, case_of("scalars"), field_map(**{name: "x"}), source)
     for value in (declared.low, declared.low // 2, 0, 1, 127, 128, declared.high):
         message = cdr(source, {"flag": True, "x": value})
-        assert carrier(message) == python(message) is not None
+        assert carrier(message) == python(message) != [MAPPING_ERROR]
 
 
 @pytest.mark.parametrize("declared", [I32, U32, I64, U64])
-def test_large_integers_are_rounded_where_the_table_says_so(library: CDLL, declared: Int) -> None:
+def test_large_integers_are_rounded_where_the_table_says_so(delivering: CDLL, declared: Int) -> None:
     source = source_of(x=declared)
     for fields in (field_map(single="float32(x)"), field_map(real="float64(x)")):
-        python, carrier = both(library, made_wire(), "scalars", fields, source)
+        python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), fields, source)
         for value in (declared.low, declared.high, declared.high // 3, (1 << 24) + 1, 0):
             message = cdr(source, {"x": value})
-            assert carrier(message) == python(message) is not None
+            assert carrier(message) == python(message) != [MAPPING_ERROR]
 
 
 @pytest.mark.parametrize(
@@ -200,29 +194,31 @@ def test_large_integers_are_rounded_where_the_table_says_so(library: CDLL, decla
     [b"", b"\0", b"a", b"a\0", b"\xc3\xa9\0", b"\xc3\0", b"\xed\xa0\x80\0", b"abc\0", b"a\0c\0", b"abcdefg\0",
      b"\xf0\x9f\x98\x80\0", b"\xf4\x90\x80\x80\0"],
 )  # fmt: skip
-def test_texts_are_decoded_or_refused(library: CDLL, text: bytes) -> None:
+def test_texts_are_decoded_or_refused(delivering: CDLL, text: bytes) -> None:
     message = b"\0\1\0\0" + struct.pack("<I", len(text)) + text
     for case, name in (("scalars", "text"), ("optional", "text"), ("bounded", "text")):
-        python, carrier = both(library, made_wire(), case, field_map(**{name: "x"}), source_of(x=String()))
+        python, carrier = from_ros(
+            delivering, made_wire(), case_of(case), field_map(**{name: "x"}), source_of(x=String())
+        )
         assert carrier(message) == python(message)
 
 
-def test_constants_stand_beside_fields(library: CDLL) -> None:
+def test_constants_stand_beside_fields(delivering: CDLL) -> None:
     fields = field_map(
         i32="-1", single="radians(90)", text="'stop'", data="[1, 2]", rock="ROCK_BLUE", u32="x", flag="false"
     )
-    python, carrier = both(library, made_wire(), "scalars", fields, source_of(x=U8))
+    python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), fields, source_of(x=U8))
     message = cdr(source_of(x=U8), {"x": 7})
-    assert carrier(message) == python(message) is not None
+    assert carrier(message) == python(message) != [MAPPING_ERROR]
     fields = field_map(numbers="[1, x, -3]", texts="['a', t, '']", rocks="[ROCK_BLUE]", flags="[]")
     source = source_of(x=U8, t=String())
-    python, carrier = both(library, made_wire(), "many", fields, source)
+    python, carrier = from_ros(delivering, made_wire(), case_of("many"), fields, source)
     for text in ("", "ä", "x" * 300):
         message = cdr(source, {"x": 0, "t": text})
-        assert carrier(message) == python(message) is not None
+        assert carrier(message) == python(message) != [MAPPING_ERROR]
 
 
-def test_lists_and_texts_that_are_not_wanted_are_stepped_over(library: CDLL) -> None:
+def test_lists_and_texts_that_are_not_wanted_are_stepped_over(delivering: CDLL) -> None:
     point = MessageType("made/msg/Point", (Field("name", String()), Field("x", F64)))
     line = MessageType(
         "made/msg/Line", (Field("points", List(point)), Field("ids", List(I64)), Field("pair", List(U8, 3)))
@@ -231,13 +227,13 @@ def test_lists_and_texts_that_are_not_wanted_are_stepped_over(library: CDLL) -> 
         texts=List(String()), wide=String(wide=True), lines=List(line), spans=List(MessageType("made/msg/Span", (
             Field("a", U8), Field("b", F64))), None), nothing=MessageType("made/msg/Nothing"), x=I32,
     )  # fmt: skip
-    python, carrier = both(library, made_wire(), "scalars", field_map(i32="x"), source)
+    python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), field_map(i32="x"), source)
 
     @settings(suppress_health_check=list(HealthCheck))
     @given(st.data())
     def equal(data: st.DataObject) -> None:
         message = data.draw(messages(source))
-        assert carrier(message) == python(message) is not None
+        assert carrier(message) == python(message) != [MAPPING_ERROR]
         hostile = data.draw(damaged(message))
         assert carrier(hostile) == python(hostile)
 
@@ -247,44 +243,103 @@ def test_lists_and_texts_that_are_not_wanted_are_stepped_over(library: CDLL) -> 
 @pytest.mark.parametrize(
     "head", [b"", b"\0", b"\0\1", b"\0\1\0", b"\0\1\0\0", b"\0\0\0\0\0\0\0\7", b"\0\7\0\0\0\0\0\7"]
 )
-def test_what_is_no_little_endian_cdr_is_refused(library: CDLL, head: bytes) -> None:
+def test_what_is_no_little_endian_cdr_is_refused(delivering: CDLL, head: bytes) -> None:
     for fields in (field_map(i32="x"), field_map(i32="1")):
-        python, carrier = both(library, made_wire(), "scalars", fields, source_of(x=I32))
+        python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), fields, source_of(x=I32))
         assert carrier(head) == python(head)
 
 
-def test_more_than_a_datagram_holds_is_converted_to_nothing_that_could_be_sent(library: CDLL) -> None:
+def test_more_than_a_datagram_holds_is_converted_to_nothing_that_could_be_sent(delivering: CDLL) -> None:
     source = source_of(x=List(U8), t=String())
     fields = field_map(data="x", text="t")
-    python, carrier = both(library, made_wire(), "scalars", fields, source)
+    python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), fields, source)
     for size in (65_000, 65_507, 65_536, 200_000):
         message = cdr(source, {"x": [7] * size, "t": "a"})
-        assert carrier(message) == python(message) is not None
+        assert carrier(message) == python(message) != [MAPPING_ERROR]
     refused = cdr(source, {"x": [7] * 200_000, "t": "abcdefg"})[:-2]
     assert carrier(refused) == python(refused)
 
 
-# ---- what needs Python
+# ---- expressions
+
+
+POINT = MessageType("made/msg/Point", (Field("name", String()), Field("x", F64), Field("ids", List(I64))))
+STAMP = MessageType("builtin_interfaces/msg/Time", (Field("sec", I32), Field("nanosec", U32)))
+HEADER = MessageType("std_msgs/msg/Header", (Field("stamp", STAMP), Field("frame_id", String())))
+SOURCE = source_of(
+    header=HEADER, flag=Bool(), u8=U8, i8=Int(8, True), i32=I32, u32=U32, i64=I64, u64=U64, f32=F32, f64=F64,
+    text=String(), short=String(3), wide=String(wide=True), octets=List(U8), three=List(I32, 3), few=List(F32, None, 4),
+    texts=List(String()), pair=List(String(), 2), points=List(POINT), two=List(POINT, 2), point=POINT,
+    times=List(STAMP), flags=List(Bool()), longs=List(U64),
+)  # fmt: skip
+EXPRESSED = as_ros(PAYLOAD)
+"""What the random expressions read, in ROS."""
+
+EXPRESSIONS: list[tuple[str, dict[str, str]]] = [
+    ("scalars", {"i32": "round(clamp(100 * (f32 - f64), -100, 100))", "single": "float32(f64 / 3)"}),
+    ("scalars", {"text": "text + '/' + short + str(i64) + str(u64) + str(flag)", "flag": "not flag and i32 > u32"}),
+    ("scalars", {"data": "octets", "u32": "len(octets)", "i32": "octets[1]", "u64": "len(text)"}),
+    ("scalars", {"data": "[u8, 7, clamp(i32, 0, 255)]", "real": "seconds(header.stamp)", "flag": "u8 in [1, i8]"}),
+    ("scalars", {"rock": "ROCK_BLUE if u8 > 3 else ROCK_GREEN", "i64": "i64 // i32", "u64": "u64 // 3 % 10"}),
+    ("scalars", {"i32": "points[0].ids[1] % 7", "real": "two[1].x", "text": "two[0].name", "single": "few[2]"}),
+    ("scalars", {"u32": "len(points)", "i32": "three[2]", "flag": "flags[0]", "real": "seconds(times[0])"}),
+    ("scalars", {"text": "texts[0] + pair[1]", "u32": "len(texts)"}),
+    ("many", {"numbers": "three", "singles": "few", "texts": "texts", "flags": "flags"}),
+    ("many", {"texts": "pair", "rocks": "[1, u8]", "numbers": "[1, i32, -1]"}),
+    ("stamped", {"stamp": "received_at"}),
+    ("optional", {"number": "i32", "text": "source"}),
+]
+
+
+@pytest.mark.parametrize(("case", "fields"), EXPRESSIONS)
+def test_expressions_have_the_same_values(delivering: CDLL, case: str, fields: dict[str, str]) -> None:
+    python, carrier = from_ros(delivering, made_wire(), case_of(case), field_map(**fields), SOURCE)
+    _assert_equal(SOURCE, python, carrier)
 
 
 @pytest.mark.parametrize(
-    ("case", "fields", "reason"),
+    ("for_each", "fields", "when"),
     [
-        ("scalars", field_map(i32="x + 1"), "`i32: x + 1` needs it"),
-        ("scalars", field_map(text="str(x)"), "`text: str(x)` needs it"),
-        ("scalars", field_map(text="w"), "`text: w` needs it"),
-        ("scalars", field_map(single="floats[0]"), "`single: floats[0]` needs it"),
-        ("many", field_map(texts="ts"), "`texts: ts` needs it"),
-        ("many", field_map(points="points"), "`points: points` needs it"),
-        ("closed", field_map(gear="x", number="1"), "`gear: x` needs it"),
-        ("stamped", field_map(stamp="received_at"), "`stamp: received_at` needs it"),
-        ("scalars", field_map(i32="clamp(x, 0, 5)"), "`i32: clamp(x, 0, 5)` needs it"),
+        ("points", {"text": "item.name", "real": "item.x", "u32": "len(item.ids) + index", "i32": "clamp(count, 0, 5)"}, ""),
+        ("points", {"i32": "clamp(item.ids[0])"}, "item.x > 0"),
+        ("two", {"u32": "index"}, "f64 < item.x"),
+        ("three", {"i32": "item", "i64": "item * index"}, "item % 2 == 0"),
+        ("few", {"single": "item"}, ""),
+        ("texts", {"text": "item", "u32": "count"}, "item != ''"),
+        ("pair", {"u32": "count"}, ""),
+        ("times", {"real": "seconds(item)"}, ""),
+        ("octets", {"u32": "item", "text": "text"}, ""),
+        ("[i32, u32, -1]", {"i64": "item", "text": "'wheel_' + str(index)"}, ""),
+        ("longs", {"u64": "item", "flag": "item > f64"}, "index != 1"),
+        ("[text, short]", {"text": "item + source"}, "len(item) > 0"),
+        ("[point, point]", {"text": "item.name", "u32": "len(points)"}, "index > 0"),
+        ("flags", {"flag": "item", "text": "short"}, "item"),
     ],
+)  # fmt: skip
+def test_each_element_is_a_message(delivering: CDLL, for_each: str, fields: dict[str, str], when: str) -> None:
+    wire = made_wire()
+    python, carrier = from_ros(delivering, wire, case_of("scalars"), field_map(**fields), SOURCE, when, for_each)
+    _assert_equal(SOURCE, python, carrier)
+
+
+@MANY
+@given(
+    fields=st.dictionaries(st.sampled_from(["i32", "real", "flag", "text"]), st.just(""), min_size=1), data=st.data()
 )
-def test_what_cannot_be_lowered_is_said(library: CDLL, case: str, fields: FieldMap, reason: str) -> None:
-    point = MessageType("made/msg/Point", (Field("x", F32), Field("y", F32)))
-    source = source_of(x=U8, w=String(wide=True), floats=List(F32), ts=List(String()), points=List(point))
-    with pytest.raises(NeedsPythonError) as caught:
-        both(library, made_wire(), case, fields, source)
-    assert str(caught.value) == reason
-    assert caught.value.span.line == 7
+def test_random_expressions_have_the_same_values(delivering: CDLL, fields: dict[str, str], data: st.DataObject) -> None:
+    kinds = {"i32": "i", "real": "f", "flag": "b", "text": "s"}
+    written = {name: data.draw(texts(kinds[name], 2)) for name in fields}
+    written = {name: f"clamp({text}, -9, 99)" if name == "i32" else text for name, text in written.items()}
+    written = {name: f"float64({text})" if name == "real" else text for name, text in written.items()}
+    when = data.draw(st.just("") | texts("b", 2))
+    assume("hypot" not in str(written) + when)  # it differs by the last bit at most
+    try:
+        python, carrier = from_ros(delivering, made_wire(), case_of("scalars"), field_map(**written), EXPRESSED, when)
+    except (Misfit, ExpressionError):
+        event("does not fit")
+        return
+    for _ in range(3):
+        message = data.draw(messages(EXPRESSED))
+        expected = python(message)
+        event(str(*expected) if isinstance(expected[0], str) else "sent")
+        assert carrier(message) == expected, (written, when)

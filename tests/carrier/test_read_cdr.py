@@ -76,7 +76,9 @@ def test_scalars_are_aligned_to_their_size(evaluating: CDLL, names: list[str], d
         values.append(data.draw(_value_of(name)))
         written.scalar(SCALARS[name], values[-1])
         wanted = data.draw(st.booleans())
-        steps.append(Step("READ_SCALAR", slot, type=f"SCALAR_{name}") if wanted else Step("READ_SKIP", size=_size(name), count=1))
+        steps.append(
+            Step("READ_SCALAR", slot, type=f"SCALAR_{name}") if wanted else Step("READ_SKIP", size=_size(name), count=1)
+        )
     machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
     message = written.message()
     assert machine.read(message)

@@ -67,7 +67,7 @@ def scalar_pairs(draw: st.DrawFn) -> Pair:
             st.just(Bool()),
             st.sampled_from(INTS),
             st.sampled_from([Float(32), Float(64)]),
-            st.builds(String, st.none() | st.integers(1, 6), st.booleans()),
+            st.builds(String, st.none() | st.integers(1, 6)),
         )
     )
     match target:
@@ -102,6 +102,10 @@ def _wrapped(pair: Pair) -> st.SearchStrategy[Pair]:
     )
 
 
+_WIDE: st.SearchStrategy[Pair] = st.builds(lambda bound: (String(bound, wide=True), String()), st.none() | st.just(6))
+"""Of a field that nothing fills: expressions do not fill wide strings."""
+
+
 @st.composite
 def message_pairs(draw: st.DrawFn, members: st.SearchStrategy[Pair], *, top: bool = False) -> Pair:
     """Same-named fields in any order, fields of the target that nothing fills, none at all."""
@@ -111,7 +115,7 @@ def message_pairs(draw: st.DrawFn, members: st.SearchStrategy[Pair], *, top: boo
     targets = [Field(f"field_{index}", target) for index, (target, _) in enumerate(shared)]
     sources = [Field(f"field_{index}", source) for index, (_, source) in enumerate(shared)]
     unset = [Field(f"unset_{index}", type_, default=draw(defaults(type_))) for index, (type_, _) in
-             enumerate(draw(st.lists(members, max_size=2)))]  # fmt: skip
+             enumerate(draw(st.lists(members | _WIDE, max_size=2)))]  # fmt: skip
     return (
         message(True, *draw(st.permutations([*targets, *unset]))),
         message(False, *draw(st.permutations(sources))),

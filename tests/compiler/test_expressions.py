@@ -14,22 +14,35 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
+from router.compiler import plan
 from router.compiler.cdr import CdrReads
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import (
     INT64,
+    UINT64,
     BoolKind,
     FloatKind,
     IntKind,
     Kind,
+    ListKind,
     MessageKind,
     StringKind,
     TimeKind,
     kind_of,
 )
 from router.compiler.expressions.scope import field_of
-from router.compiler.expressions.tree import Node, Variable, paths_in
+from router.compiler.expressions.tree import (
+    Binary,
+    Each,
+    Listed,
+    Node,
+    Unary,
+    Variable,
+    constant_of,
+    path_of,
+    paths_in,
+)
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
@@ -37,7 +50,7 @@ from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.rehearsal.cdr import serialize as cdr
-from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import (
     SPAN,
@@ -62,9 +75,10 @@ SOURCE = MessageType(
     "Source",
     fields=(
         Field("i8", Int(8, True)), Field("u8", Int(8, False)), Field("i32", Int(32, True)),
-        Field("u64", Int(64, False)),
+        Field("u64", Int(64, False)), Field("i64", Int(64, True)),
         Field("f32", Float(32)), Field("f64", Float(64)), Field("flag", Bool()), Field("name", String()),
         Field("mode", MODE), Field("numbers", List(Int(32, True))), Field("outer", OUTER, has_presence=True),
+        Field("three", List(Float(32), 3)), Field("data", Bytes()),
         Field("a", MessageType("A", (Field("b_c", INNER),))),
         Field("a_b", MessageType("AB", (Field("c", INNER),))),
     ),
@@ -242,11 +256,114 @@ ROUNDED = IntKind(INT64.low, INT64.high, is_rounded=True)
         ("f32 * f64", FloatKind(64)),
         ("i32 / 2", FloatKind(32)),
         ("[i8, u8][0]", IntKind(-128, 255)),
+        ("u64 + 1", IntKind(1, UINT64.high)),
+        ("u64 - u64", IntKind(INT64.low, INT64.high)),
+        ("u64 * i8", IntKind(INT64.low, INT64.high)),
+        ("-u64", IntKind(INT64.low, 0)),
+        ("u64 if flag else i8", IntKind(-128, INT64.high)),
+        ("min(u64, i8)", IntKind(-128, 127)),
+        ("max(u64, i8)", IntKind(0, UINT64.high)),
+        ("round(clamp(f64, -100, 2.6))", IntKind(-100, 3, is_rounded=True)),
+        ("round(clamp(f64, 0, inf))", ROUNDED),
+        ("round(f32) + 1", IntKind(INT64.low + 1, INT64.high, is_rounded=True)),
+        ("max(round(f32), 0)", IntKind(0, INT64.high, is_rounded=True)),
+        ("clamp(f64, -1, 1)", FloatKind(64, -1.0, 1.0)),
+        ("clamp(f64, -1, f32)", FloatKind(64)),
+        ("numbers / 100", ListKind(FloatKind(32))),
+        ("numbers * f64", ListKind(FloatKind(64))),
+        ("[i8, 2] + 1", ListKind(IntKind(-127, 128), 2)),
+        ("three + numbers", ListKind(FloatKind(32), 3)),
+        ("str(numbers)", ListKind(StringKind())),
+        ("max(numbers, 0)", ListKind(IntKind(0, (1 << 31) - 1))),
+        ("max(numbers)", IntKind(-(1 << 31), (1 << 31) - 1)),
+        ("sum(numbers)", IntKind(INT64.low, INT64.high)),
+        ("sum([u8, u8, u8])", IntKind(0, 765)),
+        ("sum(three)", FloatKind(32)),
+        ("data[0]", IntKind(0, 255)),
+        ("data % 16", ListKind(IntKind(0, 15))),
     ],
 )
 def test_inferred_kind(text: str, kind: Kind) -> None:
     node, _ = compiled(text, scope_of(SOURCE, [MODE]))
     assert node.kind == kind
+
+
+@pytest.mark.parametrize(
+    ("text", "is_checked"),
+    [
+        ("i32 + i32", False), ("u64 + 1", True), ("u64 - 1", True), ("u64 // 2", False), ("-i32", False),
+        ("-u64", True), ("i32 ** 2", False), ("i32 ** 3", True), ("i64 // i64", True), ("i64 % i64", False),
+        ("u64 + 0.5", False), ("-round(f64)", True), ("round(clamp(f64, 0, 9)) * 100", False),
+    ],
+)  # fmt: skip
+def test_an_operation_is_checked_if_its_result_may_not_fit_64_bits(text: str, is_checked: bool) -> None:
+    node = check(written(text), scope_of(SOURCE))
+    assert isinstance(node, (Unary, Binary))
+    assert node.is_checked == is_checked
+
+
+def test_an_integer_is_fitted_where_a_choice_or_a_list_cannot_have_it() -> None:
+    for text in ("u64 if flag else i8", "[u64, i8][0]", "max([u64, i8])"):
+        assert "'fit'" in str(check(written(text), scope_of(SOURCE))), text
+    for text in ("u64 if flag else u8", "max(u64, i8)", "u64 == i8", "i8 in [u64]"):
+        assert "'fit'" not in str(check(written(text), scope_of(SOURCE))), text
+
+
+def test_operations_on_lists_are_one_loop() -> None:
+    node = check(written("clamp(round(numbers / 100 + three), 0, len(numbers))"), scope_of(SOURCE))
+    assert isinstance(node, Each)
+    assert [path_of(each) for _, each in node.lists] == [("numbers",), ("three",)]
+    assert not isinstance(node.element, Each)
+    mapping = build(
+        field_map(it="numbers / 100"), MessageType("It", (Field("it", List(Float(32))),)), scope_of(SOURCE), SPAN
+    )
+    ((_, filled),) = mapping.plan.members
+    assert isinstance(filled, plan.Each)
+    assert [path_of(each) for _, each in filled.lists] == [("numbers",)]
+
+
+def test_a_list_literal_is_computed_item_by_item() -> None:
+    node = check(written("[i8, 4, 3.0] * three / 2"), scope_of(SOURCE))
+    assert isinstance(node, Listed)
+    assert [type(item) for item in node.items] == [Binary] * 3
+    folded = check(written("[1, 2] / 2"), scope_of(SOURCE))
+    assert isinstance(folded, Listed)
+    assert [constant_of(item) for item in folded.items] == [0.5, 1.0]
+
+
+WORDS = MessageType(
+    "Words",
+    (
+        *(Field(name, Int(32, True)) for name in ("from", "class", "in", "is", "not", "None", "with", "ä")),
+        Field("as", MessageType("As", (Field("if", Int(8, True), has_presence=True),))),
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["from + class", "message.from", "message.in + message.is * message.not", "message . None", "as.if", "has(as.if)",
+     "has(message.as.if)", "from if with in [class] else message.in", "5. in [1]", "'in is' == 'with from'"],
+)  # fmt: skip
+def test_words_of_python_are_names_where_they_mean_nothing_else(text: str) -> None:
+    check(written(text), scope_of(WORDS))
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "words"),
+    [
+        ("in + 1", "in", "message.in"),
+        ("from + message.is.x", "message.is.x", "only messages have fields"),
+        ("ä + from + clss", "clss", "did you mean 'class'?"),
+        ("'äöü' == from", "'äöü' == from", ""),
+    ],
+)
+def test_findings_beside_words_of_python_are_where_they_belong(text: str, columns: str, words: str) -> None:
+    with pytest.raises(ExpressionError) as raised:
+        check(written(text), scope_of(WORDS))
+    span = raised.value.diagnostic.span
+    assert text[span.column - 3 : span.end_column - 3] == columns
+    assert words in raised.value.diagnostic.hint
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ def checked(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **par
     """`gateways` on one line in braces. Without the finding that there are few routes."""
     found = check_text(f"{routes}\ngateways: {{{gateways}}}\n", **parts)
     rest = [each for each in found.diagnostics if each.code is not Code.UNCOVERED_PAYLOAD_CASE]
-    return Checked(found.path, rest, found.table, found.schema, found.envelope, found.routes, found.gateways)
+    return replace(found, diagnostics=rest)
 
 
 def codes(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> list[Code]:

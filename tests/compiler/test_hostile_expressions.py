@@ -17,7 +17,7 @@ from router.compiler.python import render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
-from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, compiled, scope_of
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))
@@ -27,7 +27,8 @@ SOURCE = MessageType(
     fields=(
         Field("a", Int(32, True)), Field("f", Float(64)), Field("flag", Bool()), Field("name", String()),
         Field("mode", MODE), Field("numbers", List(Int(8, False))), Field("inner", INNER, has_presence=True),
-        Field("many", List(INNER)),
+        Field("many", List(INNER)), Field("data", Bytes()), Field("three", List(Float(32), 3)),
+        Field("from", Int(64, False)), Field("in", Int(64, True)),
     ),
 )  # fmt: skip
 
@@ -129,7 +130,7 @@ _TOKENS = st.sampled_from(
         "received_at", "has", "abs", "clamp", "wrap", "round", "str", "int", "len", "min", "0", "1", "2", "-1", "0.5",
         "'a'", "''", "True", "None", "(", ")", "[", "]", ",", ".", "+", "-", "*", "/", "//", "%", "**", "<", "<=", "==",
         "!=", "in", "not", "and", "or", "if", "else", "is", "lambda", ":", ":=", "{", "}", "@", "~", "=", "seconds",
-        "time_from_seconds", "float32", "nan", "inf",
+        "time_from_seconds", "float32", "nan", "inf", "sum", "max", "text", "data", "three", "from", "message.in",
     ]
 )  # fmt: skip
 
@@ -141,7 +142,10 @@ def test_any_tokens_and_any_text_end_in_a_kind_or_a_finding(text: str) -> None:
 
 
 @given(
-    st.sampled_from(FORBIDDEN + OTHERS), st.sampled_from(["abs({})", "[{}]", "({}) + 1", "1 if {} else 2", "{} < 1"])
+    st.sampled_from(FORBIDDEN + OTHERS),
+    st.sampled_from(
+        ["abs({})", "[{}]", "({}) + 1", "({}) * numbers", "[1, {}] * three", "sum({})", "1 if {} else 2", "{} < 1"]
+    ),
 )
 def test_odd_text_inside_others_ends_in_a_kind_or_a_finding(text: str, around: str) -> None:
     check_ends_well(around.format(text))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 
 from router.engine.delivery import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
-from router.types.model import Field, Int, MessageType, String
+from router.types.model import Field, Int, List, MessageType, String, Type
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
 from tests.compiler.generated_types import EACH_TYPE, mirror, values
@@ -33,11 +34,30 @@ def package() -> Iterator[InterfacePackage]:
     made.close()
 
 
+def without_wide_text(declared: MessageType) -> MessageType:
+    """A source message without what expressions do not read."""
+    return MessageType(
+        declared.name, tuple(replace(field, type=made) for field in declared.fields if (made := _readable(field.type)))
+    )
+
+
+def _readable(declared: Type) -> Type | None:
+    match declared:
+        case String(wide=True):
+            return None
+        case List():
+            element = _readable(declared.element)
+            return None if element is None else replace(declared, element=element)
+        case MessageType():
+            return without_wide_text(declared)
+        case _:
+            return declared
+
+
 @pytest.mark.parametrize("name", MESSAGES)
-def test_message_is_written_and_read_as_rclpy_does(package: InterfacePackage, name: str) -> None:
+def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) -> None:
     declared = declared_type(package, name)
-    source = mirror(declared)
-    _, read_whole = reader(declared, [WHOLE])
+    source = without_wide_text(mirror(declared))
 
     @EACH_TYPE
     @given(values(source))
@@ -51,6 +71,22 @@ def test_message_is_written_and_read_as_rclpy_does(package: InterfacePackage, na
         theirs, read = package.ask(name, value, ours)
         assert_same_message(ours, theirs, declared, value)
         assert same(read, value)
+
+    equal()
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_message_of_rclpy_is_read(package: InterfacePackage, name: str) -> None:
+    declared = declared_type(package, name)
+    source = mirror(declared)
+    _, read_whole = reader(declared, [WHOLE])
+
+    @EACH_TYPE
+    @given(values(source))
+    def equal(message: Any) -> None:
+        value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
+        assume(value is not MAPPING_FAILURES)
+        theirs, _ = package.ask(name, value, cdr(declared, value))
         (found,) = read_whole(theirs)
         assert same(field_values(found, declared), value)
 
@@ -66,15 +102,6 @@ def test_unmapped_fields_have_the_defaults_of_rclpy(package: InterfacePackage) -
     assert_same_message(ours, theirs, declared, value)
     assert read["text"] == "it is"
     assert read["inside"]["number"] == 7
-
-
-@pytest.mark.parametrize("text", ["", "a", "é€", "a\0b", "\N{GRINNING FACE}", "x\N{GRINNING FACE}y"])
-def test_wide_text_arrives(package: InterfacePackage, text: str) -> None:
-    declared = declared_type(package, "WideText")
-    source = MessageType("Source", fields=(Field("given", String()),))
-    ours = serializer(field_map(text="given"), declared, scope_of(source))(SimpleNamespace(given=text))
-    _, read = package.ask("WideText", {}, ours)
-    assert read["text"] == text
 
 
 def test_text_with_a_nul_is_refused_because_rclpy_would_cut_it() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.carrier.test_commands import drive, twist
+from tests.carrier.test_from_ros import drive, twist
 from tests.engine.rig import BASESTATION, HEAD, Rig, program
 from tests.engine.test_both_directions import MS, SECOND, enveloped
 

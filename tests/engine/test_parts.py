@@ -20,7 +20,7 @@ from tests.engine.wire import framed
 ROUTES = """\
   imu_info:
     source: sensor_board
-    destinations: [basestation, {endpoint: recorder, when: accel_x > 1}]
+    destinations: [basestation, {endpoint: recorder, when: accel_x > 1, max_rate: 1000 Hz, on_limit: latest}]
     topics:
       - {topic: accel/x, type: std_msgs/msg/Float32, fields: {data: accel_x}, when: accel_x < 5}
       - {topic: accel_x, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 10 Hz}
@@ -124,7 +124,7 @@ def test_it_is_told_which_counters_its_messages_are_taken_off(carried: Carried) 
 FRAMES = """\
   imu_info:
     source: sensor_board
-    destinations: [{endpoint: basestation, when: accel_x > 1}]
+    destinations: [{endpoint: basestation, when: accel_x > 1, max_rate: 1000 Hz, on_limit: latest}]
     collect: {by: 1, count: 2, order: "round(accel_x / 2)", timeout: 100ms}
     topics: [{topic: both, type: std_msgs/msg/Float32, fields: {data: "items[1].accel_x"}}]
 """

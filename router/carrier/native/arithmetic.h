@@ -48,6 +48,10 @@ static inline bool checked_negate(struct value *a, unsigned flags) {
 
 /* The quotient is rounded down, so that the remainder has the divisor's sign. */
 static inline bool divide(struct value *a, const struct value *b, unsigned flags) {
+    if (!flags && b->integer > 0) {
+        a->integer = a->integer / b->integer - (a->integer % b->integer < 0);
+        return true;
+    }
     wide dividend = widened(a, flags, FIRST_UNSIGNED), divisor = widened(b, flags, SECOND_UNSIGNED);
     if (!divisor) return false;
     wide quotient = dividend / divisor;
@@ -61,6 +65,11 @@ static inline wide remainder_of(wide dividend, wide divisor) {
 }
 
 static inline bool modulo(struct value *a, const struct value *b, unsigned flags) {
+    if (!flags && b->integer > 0) {
+        int64_t remainder = a->integer % b->integer;
+        a->integer = remainder < 0 ? remainder + b->integer : remainder;
+        return true;
+    }
     wide dividend = widened(a, flags, FIRST_UNSIGNED), divisor = widened(b, flags, SECOND_UNSIGNED);
     return divisor && narrow(a, remainder_of(dividend, divisor), flags);
 }

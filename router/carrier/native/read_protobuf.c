@@ -107,14 +107,18 @@ static bool has_type(const struct node_field *field, uint32_t wire_type) {
     return wire_type == declared || (wire_type == LEN && field->is_repeated);
 }
 
-/* Note that a field is there: it clears the other members of its oneof. */
-static void mark(struct machine *machine, const struct node_field *field) {
+/* A member of a oneof clears the others. */
+static void choose(struct machine *machine, const struct node_field *field) {
     struct value *slots = machine->slots;
-    if (field->choice != NONE && slots[field->choice].integer != field->number) {
-        memcpy(slots + field->cleared, machine->layout->defaults + field->cleared, field->cleared_count * sizeof *slots);
-        slots[field->choice].integer = field->number;
-    }
-    if (field->presence != NONE) slots[field->presence].integer = 1;
+    if (slots[field->choice].integer == field->number) return;
+    memcpy(slots + field->cleared, machine->layout->defaults + field->cleared, field->cleared_count * sizeof *slots);
+    slots[field->choice].integer = field->number;
+}
+
+/* Note that a field is there. */
+static inline void mark(struct machine *machine, const struct node_field *field) {
+    if (field->choice != NONE) choose(machine, field);
+    if (field->presence != NONE) machine->slots[field->presence].integer = 1;
 }
 
 /* A number that a closed enum does not have is an unknown field: it neither clears nor marks anything. */

@@ -12,22 +12,29 @@
 #include "operations.h"
 #include "output.h"
 
-enum { CDR_HEADER = 4 };
+enum { CDR_HEADER = 4, WIDEST = 8 /* bytes of a scalar */ };
 
-/* Append `size` bytes at a multiple of `alignment`, which counts from behind the header. */
+/* Fill up to a multiple of `alignment`, which counts from behind the header. There is room for WIDEST bytes. */
+static inline void align(struct output *output, size_t alignment) {
+    memset(output->data + output->size, 0, WIDEST); /* of a size that is known, it is one store */
+    output->size += (CDR_HEADER - output->size) & (alignment - 1);
+}
+
 static inline bool put(struct output *output, const void *bytes, size_t size, size_t alignment) {
-    size_t padding = (CDR_HEADER - output->size) & (alignment - 1);
-    if (!has_room(output, padding + size)) return false;
-    memset(output->data + output->size, 0, padding);
-    if (size) memcpy(output->data + output->size + padding, bytes, size);
-    output->size += padding + size;
+    if (!has_room(output, WIDEST + size)) return false;
+    align(output, alignment);
+    if (size) memcpy(output->data + output->size, bytes, size);
+    output->size += size;
     return true;
 }
 
+/* Append the lowest `size` bytes of an integer. All its bytes are stored; those behind are overwritten by what comes. */
 static inline bool put_integer(struct output *output, uint64_t bits, uint16_t size) {
-    uint8_t bytes[8];
-    store_little_endian(bytes, bits, size);
-    return put(output, bytes, size, size);
+    if (!has_room(output, WIDEST + sizeof bits)) return false;
+    align(output, size);
+    store_little_endian(output->data + output->size, bits, sizeof bits);
+    output->size += size;
+    return true;
 }
 
 static inline bool put_float(struct output *output, double number) {

@@ -1,4 +1,4 @@
-"""The expressions of a table: a closed subset of Python, checked and typed.
+"""The expressions of a table, in the syntax of Python: checked and typed.
 
 `checker` walks an expression and applies the rules of the modules beside it. What comes out is a `tree`. Whether the
 value fits the field that it fills is checked in `conversion`.

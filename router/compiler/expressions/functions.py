@@ -235,7 +235,7 @@ def _between(bounds: Sequence[IntKind]) -> IntKind:
     """From the lowest to the highest of these."""
     low, high = min(bound.low for bound in bounds), max(bound.high for bound in bounds)
     if low < 0 and high > INT64.high:
-        raise ValueError(f"no integer is between {low} and {high}: it has 64 bits")
+        raise ValueError(f"the bounds go from {low} to {high}, which is more than 64 bits hold")
     return IntKind(low, high)
 
 

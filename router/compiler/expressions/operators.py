@@ -154,13 +154,19 @@ def binary(op: Operator, left: Node, right: Node, span: SourceSpan) -> Node:
         raise _division_by_zero(span)
     a, b = as_int(left.kind), _exponent(right) if op is Operator.POWER else as_int(right.kind)
     if a is None or b is None or op is Operator.DIVIDE:
-        is_power = op is Operator.POWER  # whose exponent is a literal
-        bits = float_bits(left.kind) if is_power else max(float_bits(left.kind), float_bits(right.kind))
-        return folded(Binary(FloatKind(bits), span, op, left, right))
+        if op is Operator.POWER:
+            return folded(Binary(FloatKind(float_bits(left.kind)), span, op, left, right))
+        kind = FloatKind(max(float_bits(left.kind), float_bits(right.kind)))
+        return folded(Binary(kind, span, op, _literal_as_float(left), _literal_as_float(right)))
     if (b.low, b.high) == (0, 0) and op in _DIVISIONS:
         raise _division_by_zero(span)
-    kind, is_checked = integer(_extremes(op, a, b), span, a.is_rounded or b.is_rounded)
-    return folded(Binary(kind, span, op, left, right, is_checked))
+    whole, is_checked = integer(_extremes(op, a, b), span, a.is_rounded or b.is_rounded)
+    return folded(Binary(whole, span, op, left, right, is_checked))
+
+
+def _literal_as_float(operand: Node) -> Node:
+    literal = constant_of(operand)
+    return Constant(FloatKind(32), operand.span, float(literal)) if isinstance(literal, int) else operand
 
 
 def folded(made: Binary) -> Binary | Constant:
@@ -208,7 +214,7 @@ def _division_by_zero(span: SourceSpan) -> ExpressionError:
 
 def _want_number(operand: Node) -> None:
     if not isinstance(operand.kind, Number):
-        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str() makes text of a number"}
+        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str(x), or text(x, 2), makes text of a number"}
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
                       hint.get(type(operand.kind), ""))  # fmt: skip
 
@@ -290,8 +296,11 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
-    if isinstance(kind, MessageKind) or isinstance(element_of(kind), MessageKind):
+    if isinstance(kind, MessageKind):
         message, hint = f"a choice cannot give a whole {kind}", "choose at each field, as in a.x if c else b.x"
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
+    if isinstance(element_of(kind), MessageKind):
+        message, hint = f"a choice cannot give a {kind}", "only lists of scalars are chosen: use one of the two"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 

@@ -57,7 +57,7 @@ class Parsed:
 
     def _of_word(self, text: str) -> str:
         """A hint if a field's name, which has a meaning of its own here, stands alone."""
-        words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"]}
+        words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"] and not found["dot"]}
         named = sorted(_MEANINGFUL & words & {*self._names})
         return f"write message.{named[0]} for the field '{named[0]}'" if named else ""
 
@@ -153,7 +153,7 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.SetComp: "expressions have no loops",
     ast.DictComp: "expressions have no loops",
     ast.NamedExpr: "expressions assign nothing",
-    ast.JoinedStr: "join strings with + and str()",
+    ast.JoinedStr: "join strings with +, str() and text()",
     ast.Tuple: "remove the ',', or write a list, [a, b]; a decimal number has a point, 9.81",
     ast.Is: "use ==",
     ast.IsNot: "use ==",

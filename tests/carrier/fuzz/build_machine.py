@@ -16,42 +16,62 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from router.carrier.build import NATIVE
-from tests.carrier.evaluating import CDR_HEADER, SOURCES, Layout, Operation
+from tests.carrier.evaluating import CDR_HEADER, NONE, SOURCES, Layout, Operation
 from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
-from tests.carrier.fuzz.random_programs import Program, random_program
+from tests.carrier.fuzz.lowered_programs import Seeds, lowered_programs
+from tests.carrier.fuzz.random_programs import ForEach, Program, random_program
 
-PROGRAMS = 300
+RANDOM_PROGRAMS = 300
+SEEDS = 10
 
 
-def build(folder: Path, compile_: Compile = for_libfuzzer, first: int = 0) -> Path:
+def build(folder: Path, compile_: Compile = for_libfuzzer, first: int = 0, count: int = RANDOM_PROGRAMS) -> Path:
     """Return the program. `folder` gets it, `programs.h` and `corpus`."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     noise = random.Random(first)
     declarations = ['#include "operations.h"', _STRUCTURE]
     rows = []
-    for index in range(PROGRAMS):
-        program = random_program(first + index)
+    made = [(random_program(first + index), _random_seeds) for index in range(count)]
+    for index, (program, seeds) in enumerate([*lowered_programs(), *made]):
         declarations += _arrays(index, program)
         rows.append(_row(index, program))
-        messages = [bytes(380), b"\1\0\0\0" * 95, noise.randbytes(60)] if program.layout.is_cdr else [b"", noise.randbytes(40)]
-        for number, message in enumerate(messages):
-            head = struct.pack("<HB", index, 0) + (CDR_HEADER if program.layout.is_cdr else b"")
-            (corpus / f"{index}-{number}").write_bytes(head + message)
+        for number, (is_envelope, message) in enumerate(_messages(program, seeds, noise)):
+            (corpus / f"{index}-{number}").write_bytes(struct.pack("<HB", index, is_envelope) + message)
     declarations.append(f"enum {{ PROGRAM_COUNT = {len(rows)} }};")
     declarations.append(f"static const struct fuzzed programs[] = {{{', '.join(rows)}}};")
     (folder / "programs.h").write_text("\n".join(declarations) + "\n")
-    made = folder / "machine_fuzz"
-    compile_([HERE / "machine_fuzz.c", *(NATIVE / name for name in SOURCES)], made)
-    return made
+    target = folder / "machine_fuzz"
+    compile_([HERE / "machine_fuzz.c", *(NATIVE / name for name in SOURCES)], target)
+    return target
 
 
-_STRUCTURE = "struct fuzzed { struct layout layout; struct code condition, message; int has_envelope; };"
+def _messages(program: Program, seeds: Seeds, noise: random.Random) -> Iterator[tuple[bool, bytes]]:
+    """Seeds, and whether each is an envelope."""
+    for _ in range(SEEDS):
+        payload, envelope = seeds()
+        yield from ((is_envelope, data) for is_envelope, data in ((False, payload), (True, envelope)) if data)
+    if program.layout.is_cdr:
+        for body in (bytes(380), b"\1\0\0\0" * 95, noise.randbytes(60)):
+            yield False, CDR_HEADER + body
+    else:
+        yield from ((False, body) for body in (b"", noise.randbytes(40)))
+
+
+def _random_seeds() -> tuple[bytes, bytes]:
+    return b"", b""
+
+
+_STRUCTURE = (
+    "struct fuzzed { struct layout layout; struct code condition, message, list; "
+    "uint16_t stored, node, item, has_envelope; };"
+)
 
 
 def _arrays(index: int, program: Program) -> Iterator[str]:
     literals = bytearray()
-    for name, code in (("condition", program.condition), ("message", program.message)):
+    each = program.for_each.code if program.for_each else []
+    for name, code in (("condition", program.condition), ("message", program.message), ("list", each)):
         yield _bytes(f"{name}_{index}", b"".join(operation.packed(literals) for operation in code))
     yield _bytes(f"literals_{index}", bytes(literals))
     yield from _layout(index, program.layout)
@@ -68,17 +88,31 @@ def _layout(index: int, layout: Layout) -> Iterator[str]:
         yield _bytes(name, b"".join(entry.packed() for entry in node.entries))
         nodes.append(f"{{{{(const void *){name}}}, {len(node.entries)}, {node.first_slot}, {node.slot_count}}}")
     yield f"static const struct node nodes_{index}[] = {{{', '.join(nodes)}}};"
-    yield f"static const struct value defaults_{index}[{layout.slot_count}];"
+    defaults = ", ".join(f"[{slot}] = {_value(value)}" for slot, value in layout.defaults.items())
+    yield f"static const struct value defaults_{index}[{layout.slot_count}] = {{{defaults or '{.size = 0}'}}};"
     closed = []
     for number, numbers in enumerate(layout.closed):
         yield f"static const int32_t closed_{index}_{number}[] = {{{', '.join(map(str, numbers))}}};"
         closed.append(f"{{closed_{index}_{number}, {len(numbers)}, 0}}")
-    yield f"static const struct closed_enum closed_{index}[] = {{{', '.join(closed)}}};"
+    yield f"static const struct closed_enum closed_{index}[] = {{{', '.join(closed) or '{.count = 0}'}}};"
+
+
+def _value(value: float | bytes) -> str:
+    if isinstance(value, bytes):
+        text = "".join(f"\\{byte:03o}" for byte in value)
+        return f'{{.bytes = (const uint8_t *)"{text}", .size = {len(value)}}}'
+    if isinstance(value, float):
+        (value,) = struct.unpack("<Q", struct.pack("<d", value))
+    return f"{{.bits = {int(value) % (1 << 64)}u}}"
 
 
 def _row(index: int, program: Program) -> str:
-    layout = f"{{nodes_{index}, defaults_{index}, closed_{index}, literals_{index}, {program.layout.slot_count}, {int(program.layout.is_cdr)}}}"
-    return f"{{{layout}, {_code(f'condition_{index}', program.condition)}, {_code(f'message_{index}', program.message)}, 0}}"
+    layout, each = program.layout, program.for_each or ForEach([], 0, NONE, NONE)
+    arrays = ", ".join(f"{name}_{index}" for name in ("nodes", "defaults", "closed", "literals"))
+    codes = {"condition": program.condition, "message": program.message, "list": each.code}
+    code = ", ".join(_code(f"{name}_{index}", code) for name, code in codes.items())
+    of_each = f"{int(each.stored)}, {each.node}, {each.item}"
+    return f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}, {int(program.has_envelope)}}}"
 
 
 def _code(name: str, code: Sequence[Operation]) -> str:

@@ -9,6 +9,7 @@
 #include "envelope.h"
 #include "evaluate.h"
 #include "events.h"
+#include "lists.h"
 #include "outcome.h"
 #include "programs.h"
 
@@ -36,22 +37,45 @@ static void demand_order(int outcome, uint32_t at, uint32_t count) {
     demand(machine.output.size <= machine.output.capacity);
 }
 
+/* Evaluate a condition and make the message of a target. Return the outcome. */
+static int make(const struct fuzzed *chosen) {
+    uint32_t at = UINT32_MAX;
+    bool is_true;
+    if (chosen->condition.count) {
+        int outcome = evaluate_condition(&machine, &chosen->condition, &is_true, &at);
+        demand_order(outcome, at, chosen->condition.count);
+        if (outcome != EVALUATED) return outcome;
+    }
+    int outcome = evaluate_message(&machine, &chosen->message, &at);
+    demand_order(outcome, at, chosen->message.count);
+    return outcome;
+}
+
+/* Make one for each element of a list. Return the last outcome. */
+static int make_for_each(const struct fuzzed *chosen) {
+    uint32_t at = UINT32_MAX, cell_count;
+    struct value list;
+    int outcome = evaluate_list(&machine, &chosen->list, &list, &at);
+    demand_order(outcome, at, chosen->list.count);
+    if (outcome != EVALUATED) return outcome;
+    for (cell_count = machine.cell_count; list.size; machine.cell_count = cell_count) {
+        struct value element = list_next(&machine, &list, chosen->stored);
+        if (chosen->node == NONE) machine.slots[chosen->item] = element;
+        else if (!machine_enter(&machine, chosen->node, &element)) return LOSS_MAPPING_ERROR;
+        outcome = make(chosen);
+    }
+    return outcome;
+}
+
 /* Read and evaluate as the threads do. Return the outcome. */
 static int run(const struct fuzzed *chosen, uint16_t node, const uint8_t *data, size_t size) {
-    uint32_t at = UINT32_MAX, slot_count = chosen->layout.slot_count;
-    bool is_true;
+    machine.output.size = 0;
     machine_begin(&machine, &chosen->layout);
-    memset(machine.slots + slot_count, 0xa5, sizeof *machine.slots); /* behind them, nothing is to be used */
+    memset(machine.slots + chosen->layout.slot_count, 0xa5, sizeof *machine.slots); /* nobody is to use it */
     machine.slots[RECEIVED_AT].integer = 1700000000123456789;
     machine.slots[SOURCE] = (struct value){.bytes = (const uint8_t *)"a board", .size = 7};
     if (!machine_read(&machine, node, data, size)) return LOSS_MAPPING_ERROR;
-    int outcome = EVALUATED;
-    if (chosen->condition.count) outcome = evaluate_condition(&machine, &chosen->condition, &is_true, &at);
-    demand_order(outcome, at, chosen->condition.count);
-    if (outcome != EVALUATED) return outcome;
-    outcome = evaluate_message(&machine, &chosen->message, &at);
-    demand_order(outcome, at, chosen->message.count);
-    return outcome;
+    return chosen->list.count ? make_for_each(chosen) : make(chosen);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {

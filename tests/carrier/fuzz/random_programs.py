@@ -10,7 +10,20 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from tests.carrier.evaluating import CDR_HEADER, NONE, C, Layout, Node, NodeField, Operation, Step, integer, load, real, text
+from tests.carrier.evaluating import (
+    CDR_HEADER,
+    NONE,
+    C,
+    Layout,
+    Node,
+    NodeField,
+    Operation,
+    Step,
+    integer,
+    load,
+    real,
+    text,
+)
 
 INTEGER, REAL, TRUTH, TEXT = "integer", "real", "truth", "text"
 IN_CELLS = C["IN_CELLS"]
@@ -50,10 +63,23 @@ class Fields:
 
 
 @dataclass(frozen=True)
+class ForEach:
+    """A program that leaves a list, how this is stored, and where an element goes: NONE for the other one."""
+
+    code: Code
+    stored: int
+    node: int
+    item: int
+
+
+@dataclass(frozen=True)
 class Program:
     layout: Layout
     condition: Code
     message: Code
+    for_each: ForEach | None = None
+    has_envelope: bool = False
+    """The second node is the envelope around the message."""
 
 
 class _Layouts:
@@ -214,7 +240,9 @@ class _Expressions:
 
     def __init__(self, layouts: _Layouts) -> None:
         self.noise, self.layouts = layouts.noise, layouts
-        self.fields = Fields([(RECEIVED_AT, INTEGER), (SOURCE, TEXT), *layouts.fields[0].values], [*layouts.fields[0].lists])
+        self.fields = Fields(
+            [(RECEIVED_AT, INTEGER), (SOURCE, TEXT), *layouts.fields[0].values], [*layouts.fields[0].lists]
+        )
         self.loops = 0
         self.boldness = self.noise.choice([0.05, 0.05, 0.5, 1.0])  # how many of the operations that may refuse stay
 
@@ -271,7 +299,10 @@ class _Expressions:
                 name = noise.choice(["NEGATE", "CHECKED_NEGATE", "ABSOLUTE"])
                 return [*self.of(INTEGER, depth - 1), Operation(f"OP_{name}", flag=flag)]
             case "three":
-                return [*self._many(INTEGER, 3, depth), Operation(f"OP_{noise.choice(['CLAMP', 'FIT', 'WRAP'])}", flag=flag)]
+                return [
+                    *self._many(INTEGER, 3, depth),
+                    Operation(f"OP_{noise.choice(['CLAMP', 'FIT', 'WRAP'])}", flag=flag),
+                ]
             case "rounded":
                 name = noise.choice(["ROUND", "TRUNCATE", "FLOOR", "CEIL"])
                 return [*self.of(REAL, depth - 1), Operation(f"OP_{name}")]
@@ -435,7 +466,11 @@ class _Messages:
         if self.is_cdr:
             return self._fields(depth)
         tag = self._number() << 3 | 2
-        return [Operation("OP_OPEN", flag=self.noise.randrange(2), size=tag), *self._fields(depth), Operation("OP_CLOSE")]
+        return [
+            Operation("OP_OPEN", flag=self.noise.randrange(2), size=tag),
+            *self._fields(depth),
+            Operation("OP_CLOSE"),
+        ]
 
     def _number(self) -> int:
         return self.noise.choice([1, 2, 15, 16, 2047, 2048, (1 << 29) - 1])
@@ -455,7 +490,9 @@ class _Messages:
 
     def _write(self, name: str, number: int) -> Operation:
         wire_type = {"VARINT": 0, "ZIGZAG": 0, "FIXED32": 5, "FLOAT": 5, "BYTES": 2}.get(name, 1)
-        return Operation(f"OP_WRITE_{name}", flag=self.noise.randrange(2), size=number << 3 | wire_type if number else 0)
+        return Operation(
+            f"OP_WRITE_{name}", flag=self.noise.randrange(2), size=number << 3 | wire_type if number else 0
+        )
 
     def _value(self) -> Code:
         noise, of = self.noise, self.expressions.of
