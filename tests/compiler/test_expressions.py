@@ -343,7 +343,8 @@ WORDS = MessageType(
 @pytest.mark.parametrize(
     "text",
     ["from + class", "message.from", "message.in + message.is * message.not", "message . None + message.True", "as.if",
-     "has(as.if)", "has(message.as.if)", "from if with in [class] else message.in", "5. in [1]", "'in is' == 'with from'"],
+     "has(as.if)", "has(message.as.if)", "from if with in [class] else message.in", "5. in [1]",
+     "'in is' == 'with from'"],
 )  # fmt: skip
 def test_words_of_python_are_names_where_they_mean_nothing_else(text: str) -> None:
     check(written(text), scope_of(WORDS))
