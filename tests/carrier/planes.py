@@ -29,7 +29,7 @@ from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, written
 from tests.compiler.payloads import Wire
 
 TOPIC = "topic"
-MAPPING_ERROR, NON_FINITE, TOO_LARGE = "mapping_error", "non_finite", "too_large"
+MAPPING_ERROR, NON_FINITE = "mapping_error", "non_finite"
 
 Made = list["bytes | str"]
 """Of each message what is made of it, or why nothing is: one, but for `for_each`."""
@@ -122,15 +122,7 @@ def from_ros(
                     out.line("yield error", SPAN)
     make = _function(out)
 
-    def in_python(message: bytes) -> Made:
-        made = _outcomes(lambda: make(message, SOURCE, RECEIVED_AT))
-        return [TOO_LARGE if isinstance(each, bytes) and len(each) > _MOST_SENT else each for each in made]
-
-    return in_python, by_carrier
-
-
-_MOST_SENT = 65507
-"""Bytes of a datagram."""
+    return lambda message: _outcomes(lambda: make(message, SOURCE, RECEIVED_AT)), by_carrier
 
 
 def _plan(fields: FieldMap, target: MessageType, scope: Scope, whole: Node | None = None) -> Record:
