@@ -30,8 +30,8 @@ from tests.ros.peers import Subscriber
 
 FLOAT = "std_msgs/msg/Float32"
 _FLOAT = f"type: {FLOAT}, fields: {{{{data: accel_x}}}}"
-IMU_IN_PYTHON, GPS_IN_PYTHON = 'when: str(accel_y) != "x"', 'when: str(hdop) != "x"'
-"""True, and nothing that the carrier evaluates."""
+IN_PYTHON = "max_rate: 1000000 Hz, on_limit: latest"
+"""Holds nothing back, and needs Python."""
 
 
 def imu(number: float) -> bytes:
@@ -112,13 +112,13 @@ routes:
     source: any
     topics:
       - {{{{topic: beside_a, {_FLOAT}}}}}
-      - {{{{topic: beside_b, {_FLOAT}, {IMU_IN_PYTHON}}}}}
+      - {{{{topic: beside_b, {_FLOAT}, {IN_PYTHON}}}}}
       - {{{{topic: beside_latest, {_FLOAT}, on_limit: latest, max_rate: 1000 Hz}}}}
       - {{{{topic: beside_shared, {_FLOAT}}}}}
       - {{{{topic: beside_kept, {_FLOAT}, qos: {{{{durability: transient_local, depth: 5}}}}}}}}
   gps_info:
     source: any
-    topics: [{{{{topic: beside_shared, type: {FLOAT}, fields: {{{{data: hdop}}}}, {GPS_IN_PYTHON}}}}}]
+    topics: [{{{{topic: beside_shared, type: {FLOAT}, fields: {{{{data: hdop}}}}, {IN_PYTHON}}}}}]
 gateways:
   dashboard:
     transport: {{{{websocket: 127.0.0.5:DASHBOARD}}}}
@@ -230,7 +230,7 @@ routes:
   imu_info:
     source: any
     destinations: [basestation]
-    topics: [{{{{topic: killed_a, {_FLOAT}, queue_depth: 1000}}}}, {{{{topic: killed_b, {_FLOAT}, {IMU_IN_PYTHON}}}}}]
+    topics: [{{{{topic: killed_a, {_FLOAT}, queue_depth: 1000}}}}, {{{{topic: killed_b, {_FLOAT}, {IN_PYTHON}}}}}]
 """
     with running(tmp_path, routes) as (place, router), hearing("killed_a") as (stays,):
         with sending(place, imu) as sent:
@@ -265,7 +265,7 @@ routes:
     source: any
     topics: [{{{{topic: moved_a, {_FLOAT}, FIRST}}}}, {{{{topic: moved_b, {_FLOAT}, SECOND}}}}]
 """
-    when = "when: accel_y < 5", IMU_IN_PYTHON
+    when = "when: accel_y < 5", IN_PYTHON
     tables = [routes.replace("FIRST", first).replace("SECOND", second) for first, second in (when, when[::-1])]
     with running(tmp_path, tables[0]) as (place, router), hearing("moved_a", "moved_b") as (first, second):
         with sending(place, imu) as sent:
