@@ -249,16 +249,18 @@ class Machine:
         return _Layout(self._keep(nodes), self._keep(defaults), self._keep(closed), ctypes.addressof(literals),
                        layout.slot_count, layout.is_cdr)  # fmt: skip
 
-    def _default(self, value: float | bytes) -> bytes:
-        if isinstance(value, bytes):
-            return struct.pack("<QII", self._keep(value), len(value), 0)
-        if isinstance(value, float):
-            return struct.pack("<dII", value, 0, 0)
-        return struct.pack("<QII", value % (1 << 64), 0, 0)
+    def _default(self, value: int | float | bytes) -> bytes:  # noqa: PYI041 - not the same here
+        match value:
+            case bytes():
+                return struct.pack("<QII", self._keep(value), len(value), 0)
+            case float():
+                return struct.pack("<dII", value, 0, 0)
+            case _:
+                return struct.pack("<QII", value % (1 << 64), 0, 0)
 
     def _code(self, operations: Sequence[Operation]) -> _Code:
         packed = b"".join(each.packed(self._literals) for each in operations)
-        self._room[: len(self._literals)] = bytes(self._literals)
+        ctypes.memmove(self._room, bytes(self._literals), len(self._literals))
         made = ctypes.create_string_buffer(packed, max(1, len(packed)))
         self._running = made
         return _Code(ctypes.addressof(made), len(operations), 0)

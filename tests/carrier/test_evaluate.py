@@ -459,8 +459,9 @@ def test_a_list_made_element_by_element(machine: Machine, values: list[int]) -> 
 
 def test_loops_in_loops_and_what_they_take(machine: Machine) -> None:
     keep = [Operation("OP_KEEP", 1), Operation("OP_DROP")]
-    inner = [*_listed(10, 20), Operation("OP_KEEP", 2), Operation("OP_DROP"),
-             *_each(2, load(3), Operation("OP_MULTIPLY"), load(4), Operation("OP_ADD"), Operation("OP_KEEP", 4), Operation("OP_DROP"))]  # fmt: skip
+    add = [load(4), Operation("OP_ADD"), Operation("OP_KEEP", 4), Operation("OP_DROP")]
+    body = [load(3), Operation("OP_MULTIPLY"), *add]
+    inner = [*_listed(10, 20), Operation("OP_KEEP", 2), Operation("OP_DROP"), *_each(2, *body)]
     outer = _each(1, Operation("OP_KEEP", 3), Operation("OP_DROP"), *inner)
     start = [integer(0), Operation("OP_KEEP", 4), Operation("OP_DROP")]
     many = list(range(100))

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router.types.wire import delimited, varint
-from tests.carrier.evaluating import NONE, TEXT, C, Layout, Machine, Node, NodeField, Operation, load
+from tests.carrier.evaluating import TEXT, C, Layout, Machine, Node, NodeField, Operation, load
 from tests.carrier.messages import some_payloads
 from tests.compiler.payloads import wire_of
 from tests.engine.wire import VARINT, tag
@@ -120,8 +120,8 @@ def test_what_is_cut_is_refused(machine: Machine, payload: bytes) -> None:
 
 def test_elements_of_lists_are_entered_with_their_own_defaults(evaluating: CDLL) -> None:
     points, x, is_x, numbers = 0, 1, 2, 3
-    inner = Node((NodeField(1, "TYPE_SINT32", x, presence=is_x), NodeField(2, "TYPE_FIXED32", numbers, is_repeated=True)),
-                 first_slot=x, slot_count=3)  # fmt: skip
+    fields = NodeField(1, "TYPE_SINT32", x, presence=is_x), NodeField(2, "TYPE_FIXED32", numbers, is_repeated=True)
+    inner = Node(fields, first_slot=x, slot_count=3)
     node = Node((NodeField(7, "TYPE_MESSAGE", points, is_repeated=True),))
     machine = Machine(evaluating, Layout(nodes=(node, inner), defaults={x: 42}))
     elements = [b"\x08\x03", b"", delimited(2, bytes([1, 0, 0, 0, 2, 0, 0, 0])) + b"\x15\x03\0\0\0"]
@@ -134,4 +134,3 @@ def test_elements_of_lists_are_entered_with_their_own_defaults(evaluating: CDLL)
     assert [element(index, x) for index in range(3)] == [-2, 42, 42]
     assert [element(index, is_x) for index in range(3)] == [1, 0, 0]
     assert [element(index, numbers, Operation("OP_SIZE")) for index in range(3)] == [0, 0, 3]
-    assert machine.slot(NONE - 1) == 0

@@ -135,7 +135,7 @@ def _zero(declared: Type) -> object:
 
 
 _SIZES = {Op.PUT_FLOAT: 4, Op.PUT_DOUBLE: 8}
-_LOSE = frozenset({Op.PUT_TEXT, Op.PUT_BYTES, Op.AGAIN})
+_LOSE = frozenset({Op.PUT_TEXT, Op.PUT_BYTES, Op.REPEAT, Op.AGAIN})
 """Behind these the offset is not known."""
 
 

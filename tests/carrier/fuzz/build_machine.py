@@ -112,7 +112,9 @@ def _row(index: int, program: Program) -> str:
     codes = {"condition": program.condition, "message": program.message, "list": each.code}
     code = ", ".join(_code(f"{name}_{index}", code) for name, code in codes.items())
     of_each = f"{int(each.stored)}, {each.node}, {each.item}"
-    return f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}, {int(program.has_envelope)}}}"
+    return (
+        f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}, {int(program.has_envelope)}}}"
+    )
 
 
 def _code(name: str, code: Sequence[Operation]) -> str:

@@ -14,8 +14,8 @@ from router.compiler.expressions import Scope, check
 from router.compiler.expressions.kinds import UINT32, ListKind
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget, lower_table
-from router.compiler.mapping import build
 from router.compiler.lowering.operations import Code
+from router.compiler.mapping import build
 from router.errors import Located
 from router.rehearsal.cdr import serialize
 from router.table.model import Destination, FieldMap, Topic
@@ -85,7 +85,8 @@ FROM_ROS: list[tuple[str, FieldMap, MessageType, str, str]] = [
     ("scalars", field_map(single="float32(last)", i32="-1"),
      _type(texts=List(String()), wide=String(wide=True), lines=List(_LINE), spans=List(_type(a=U8, b=F64)), last=F64),
      "", ""),
-    ("scalars", field_map(i32="round(clamp(100 * (item.x - item.y), -100, 100))", text="item.name + str(index)", u32="count"),
+    ("scalars", field_map(i32="round(clamp(100 * (item.x - item.y), -100, 100))", text="item.name + str(index)",
+                          u32="count"),
      _type(points=List(_type(name=String(), x=F64, y=F64))), "item.x < item.y", "points"),
     ("scalars", field_map(i64="item", u32="index"), _type(ids=List(I32)), "item not in ids", "ids"),
 ]  # fmt: skip
@@ -104,7 +105,9 @@ def lowered_programs() -> Iterator[Fuzzed]:
     for name, fields, target, when in TO_ROS:
         case = envelope.cases[name]
         scope = Scope(case.type, tuple(schema.enums.values()), ())
-        checked = CheckedTarget(Topic(Located("topic", SPAN), SPAN), None, target, _when(when, scope), _plan(fields, target, scope))
+        checked = CheckedTarget(
+            Topic(Located("topic", SPAN), SPAN), None, target, _when(when, scope), _plan(fields, target, scope)
+        )
         route = CheckedRoute(_route(), case, (checked,))
         yield from _of(_lowered(route, envelope), lambda _: _seeds_of(envelope, name, noise), noise)  # noqa: B023
     for name, fields, source, when, for_each in FROM_ROS:
@@ -141,9 +144,8 @@ def _plan(fields: FieldMap, target: MessageType, scope: Scope, whole: Node | Non
 def _names(elements: Node) -> dict[str, Node]:
     assert isinstance(elements.kind, ListKind)
     assert elements.kind.element is not None
-    return {ITEM: Variable(elements.kind.element, SPAN, ITEM)} | {
-        name: Variable(UINT32, SPAN, name) for name in (INDEX, COUNT)
-    }
+    names: dict[str, Node] = {name: Variable(UINT32, SPAN, name) for name in (INDEX, COUNT)}
+    return {ITEM: Variable(elements.kind.element, SPAN, ITEM), **names}
 
 
 def _lowered(route: CheckedRoute, envelope: Any) -> Lowered:
@@ -152,7 +154,9 @@ def _lowered(route: CheckedRoute, envelope: Any) -> Lowered:
     return lowered
 
 
-def _of(lowered: Lowered, seeds: Callable[[str], Seeds], noise: random.Random, source: MessageType | None = None) -> Iterator[Fuzzed]:
+def _of(
+    lowered: Lowered, seeds: Callable[[str], Seeds], noise: random.Random, source: MessageType | None = None
+) -> Iterator[Fuzzed]:
     for routes in (lowered.conditions, lowered.topics):
         for name, route in routes.items():
             for target in route.targets.values():
@@ -199,7 +203,9 @@ def _program(route: LoweredRoute | LoweredFeed, target: LoweredTarget) -> Progra
 
 def _code(code: Code) -> list[evaluating.Operation]:
     return [
-        evaluating.Operation(f"OP_{kind.name}", slot if isinstance(slot, int) else slot.index, flag, size, number, data or None)
+        evaluating.Operation(
+            f"OP_{kind.name}", slot if isinstance(slot, int) else slot.index, flag, size, number, data or None
+        )
         for kind, slot, flag, size, number, data in code
     ]
 
@@ -207,7 +213,8 @@ def _code(code: Code) -> list[evaluating.Operation]:
 def _layout(route: LoweredRoute | LoweredFeed) -> evaluating.Layout:
     made = route.layout
     nodes = [
-        evaluating.Node([_entry(entry) for entry in node.entries], node.first_slot, node.slot_count) for node in made.nodes
+        evaluating.Node([_entry(entry) for entry in node.entries], node.first_slot, node.slot_count)
+        for node in made.nodes
     ]
     defaults = {index: value for index, value in enumerate(made.defaults) if value is not None}
     return evaluating.Layout(nodes, len(made.defaults), made.closed, made.is_cdr, defaults)
@@ -215,7 +222,9 @@ def _layout(route: LoweredRoute | LoweredFeed) -> evaluating.Layout:
 
 def _entry(entry: Any) -> evaluating.NodeField | evaluating.Step:
     if hasattr(entry, "kind"):
-        return evaluating.Step(f"READ_{entry.kind.name}", entry.slot, entry.size, f"SCALAR_{_scalar(entry.type)}", entry.elements)
+        return evaluating.Step(
+            f"READ_{entry.kind.name}", entry.slot, entry.size, f"SCALAR_{_scalar(entry.type)}", entry.elements
+        )
     cleared = entry.cleared, entry.cleared_count
     return evaluating.NodeField(entry.number, f"TYPE_{entry.type.name}", entry.slot, entry.is_repeated, entry.presence,
                                 entry.node, entry.choice, cleared, entry.closed)  # fmt: skip

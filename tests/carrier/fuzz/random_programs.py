@@ -321,8 +321,8 @@ class _Expressions:
 
     def _real(self, depth: int) -> Code:
         noise = self.noise
-        two = ["REAL_ADD", "REAL_SUBTRACT", "REAL_MULTIPLY", "REAL_DIVIDE", "REAL_FLOOR_DIVIDE", "REAL_MODULO", "REAL_POWER",
-               "REAL_LEAST", "REAL_GREATEST", "ATAN2", "HYPOT"]  # fmt: skip
+        two = ["REAL_ADD", "REAL_SUBTRACT", "REAL_MULTIPLY", "REAL_DIVIDE", "REAL_FLOOR_DIVIDE", "REAL_MODULO",
+               "REAL_POWER", "REAL_LEAST", "REAL_GREATEST", "ATAN2", "HYPOT"]  # fmt: skip
         one = ["REAL_NEGATE", "REAL_ABSOLUTE", "SQRT", "SIN", "COS", "TAN", "FLOAT32"]
         match noise.choice(["two", "two", "one", "three", "integer", "element", "sum"]):
             case "two":
@@ -404,9 +404,9 @@ class _Expressions:
             self.fields.values.remove((element, of))
             return [Operation("OP_KEEP", element), Operation("OP_DROP"), *code, Operation("OP_APPEND", made)]
 
-        return [*start, *self._each(*self.list_of(of, depth - 1), body, keeps=True), load(made)]
+        return [*start, *self.for_each(*self.list_of(of, depth - 1), body, keeps=True), load(made)]
 
-    def _each(self, code: Code, stored: int, body: Callable[[int], Code], *, keeps: bool) -> Code:
+    def for_each(self, code: Code, stored: int, body: Callable[[int], Code], *, keeps: bool) -> Code:
         """Execute what `body` gives for each element, which is on the stack first."""
         left, element = self.layouts.slot(), self.layouts.slot()
         self.loops += 1
@@ -418,7 +418,7 @@ class _Expressions:
     def _sum(self, kind: str, start: Code, operation: Operation, depth: int) -> Code:
         if self.loops >= 4:
             return start
-        return [*start, *self._each(*self.list_of(kind, depth - 1), lambda _: [operation], keeps=False)]
+        return [*start, *self.for_each(*self.list_of(kind, depth - 1), lambda _: [operation], keeps=False)]
 
     def _element(self, kind: str, depth: int) -> Code:
         code, stored = self.list_of(kind, depth)
@@ -434,7 +434,7 @@ class _Expressions:
             self.fields = outer
             return made
 
-        return self._each([load(listed.slot)], listed.stored, entered, keeps=False)
+        return self.for_each([load(listed.slot)], listed.stored, entered, keeps=False)
 
 
 class _Messages:
@@ -482,10 +482,10 @@ class _Messages:
         if self.is_cdr:
             length = [*code, Operation("OP_SIZE"), Operation("OP_PUT", 4)]
             put = Operation("OP_PUT_DOUBLE") if is_real else Operation("OP_PUT", 8)
-            return [*length, *self.expressions._each(code, stored, lambda _: [put], keeps=False)]
+            return [*length, *self.expressions.for_each(code, stored, lambda _: [put], keeps=False)]
         is_packed = self.noise.random() < 0.5
         put = self._write("DOUBLE" if is_real else "VARINT", 0 if is_packed else self._number())
-        each = self.expressions._each(code, stored, lambda _: [put], keeps=False)
+        each = self.expressions.for_each(code, stored, lambda _: [put], keeps=False)
         return [Operation("OP_OPEN", size=self._number() << 3 | 2), *each, Operation("OP_CLOSE")] if is_packed else each
 
     def _write(self, name: str, number: int) -> Operation:
@@ -496,21 +496,19 @@ class _Messages:
 
     def _value(self) -> Code:
         noise, of = self.noise, self.expressions.of
-        if self.is_cdr:
-            return noise.choice([
-                lambda: [*of(INTEGER), Operation("OP_PUT", noise.choice([1, 2, 4, 8]))],
-                lambda: [*of(REAL), Operation("OP_PUT_DOUBLE")],
-                lambda: [*of(REAL), Operation("OP_PUT_FLOAT")],
-                lambda: [*of(TEXT), Operation("OP_PUT_TEXT")],
-                lambda: [*of(TEXT), Operation("OP_PUT_BYTES")],
-                lambda: [Operation("OP_KNOWN", noise.choice([1, 2, 4, 8]), data=noise.randbytes(9))],
-            ])()  # fmt: skip
-        return noise.choice([
-            lambda: [*of(INTEGER), self._write(noise.choice(["VARINT", "ZIGZAG", "FIXED32", "FIXED64"]), self._number())],
-            lambda: [*of(REAL), self._write(noise.choice(["FLOAT", "DOUBLE"]), self._number())],
-            lambda: [*of(TEXT), self._write("BYTES", self._number())],
-            lambda: [Operation("OP_KNOWN", 1, data=noise.randbytes(5))],
-        ])()  # fmt: skip
+        kind = noise.choice([INTEGER, REAL, TEXT, "known"])
+        if kind == "known":
+            return [Operation("OP_KNOWN", noise.choice([1, 2, 4, 8]) if self.is_cdr else 1, data=noise.randbytes(9))]
+        return [*of(kind), self._put(kind) if self.is_cdr else self._write(noise.choice(_WRITES[kind]), self._number())]
+
+    def _put(self, kind: str) -> Operation:
+        if kind == INTEGER:
+            return Operation("OP_PUT", self.noise.choice([1, 2, 4, 8]))
+        names = {REAL: ["OP_PUT_FLOAT", "OP_PUT_DOUBLE"], TEXT: ["OP_PUT_TEXT", "OP_PUT_BYTES"]}
+        return Operation(self.noise.choice(names[kind]))
+
+
+_WRITES = {INTEGER: ["VARINT", "ZIGZAG", "FIXED32", "FIXED64"], REAL: ["FLOAT", "DOUBLE"], TEXT: ["BYTES"]}
 
 
 def random_program(seed: int) -> Program:
