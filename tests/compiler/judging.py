@@ -185,12 +185,13 @@ class Verdict:
         return self.message.hex() if self.message is not None else "|".join(sorted(self.reasons))
 
     def _is_same(self, answer: bytes) -> bool:
-        """Whether it is equal but for the bits of a NaN."""
+        """Whether it is equal but for the bits of a NaN, and for the entries of a map that others replace."""
         assert self.message is not None
-        if len(answer) != len(self.message) or self.declared is None:
+        if self.declared is None:
             return False
         try:
-            return same(_tree(answer, self.declared), _tree(self.message, self.declared))
+            found, expected = _tree(answer, self.declared), _tree(self.message, self.declared)
+            return same(found, expected) and (len(answer) == len(self.message) or "pairs" in expected)
         except (*MAPPING_FAILURES, DecodeError):
             return False
 

@@ -36,7 +36,22 @@ def fill(fields: FieldMap | None, target: MessageType, context: Context) -> dict
 
     Raises Refused where a field has no value.
     """
-    return _completed(target, fill_given(fields, target, context))
+    try:
+        given = fill_given(fields, target, context)
+    except Refused as refused:
+        # A text with a NUL is found below, where nothing else is refused.
+        raise Refused(*refused.reasons, *[MAPPING_ERROR] * _has_text(target)) from None
+    return _completed(target, given)
+
+
+def _has_text(declared: Type) -> bool:
+    match declared:
+        case MessageType():
+            return any(_has_text(field.type) for field in declared.fields)
+        case List():
+            return _has_text(declared.element)
+        case _:
+            return isinstance(declared, String)
 
 
 def _completed(message: MessageType, values: Mapping[str, Value]) -> dict[str, Value]:

@@ -1,0 +1,104 @@
+"""Calls of functions: how many arguments, of what kinds, and what a call with a list is."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Sequence
+
+from router.compiler.expressions import spellings
+from router.compiler.expressions.functions import FUNCTIONS, HAS, Function, Parameter
+from router.compiler.expressions.kinds import FloatKind, IntKind, is_list
+from router.compiler.expressions.lists import as_kind, as_value, elementwise
+from router.compiler.expressions.scope import ExpressionError, Scope
+from router.compiler.expressions.syntax import Parsed
+from router.compiler.expressions.tree import Call, Constant, Node
+from router.errors import Code, SourceSpan, did_you_mean, plural
+from router.types.model import Int, List, Type
+
+
+def called_name(node: ast.Call, text: Parsed) -> str:
+    """The name in front of the brackets. Raises ExpressionError for calls of another shape than `name(a, b)`."""
+    if not isinstance(node.func, ast.Name):
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
+        hint = known or did_you_mean("", FUNCTIONS)
+        raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
+    if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
+        message = f"{node.func.id}() takes its arguments by position"
+        hint = f"write {FUNCTIONS[node.func.id].signature}" if node.func.id in FUNCTIONS else ""
+        raise ExpressionError(text.span(node), Code.WRONG_ARGUMENTS, message, hint)
+    return node.func.id
+
+
+def function_named(name: str, span: SourceSpan) -> Function:
+    function = FUNCTIONS.get(name)
+    if function is None:
+        hint = spellings.FUNCTIONS.get(name.lower()) or did_you_mean(name, [*FUNCTIONS, HAS])
+        raise ExpressionError(span, Code.UNKNOWN_FUNCTION, f"there is no function '{name}'", hint)
+    return function
+
+
+def call_of(
+    function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope, expected: Type | None
+) -> Node:
+    """The call as a checked expression; bounds that it leaves out are those of the field `expected`."""
+    if function.of_list is not None and len(arguments) == 1 and is_list(arguments[0].kind):
+        return _whole_list(function, arguments[0], span, scope)
+    if function.optional and len(arguments) == len(function.parameters) - function.optional:
+        filled = expected.element if isinstance(expected, List) and is_list(arguments[0].kind) else expected
+        arguments = [*arguments, *_bounds(function, span, filled)]
+    _want_count(function, len(arguments), span)
+    return elementwise(lambda parts: _call_of_scalars(function, parts, span, scope), arguments, span, scope)
+
+
+def _whole_list(function: Function, argument: Node, span: SourceSpan, scope: Scope) -> Call:
+    assert function.of_list is not None  # noqa: S101 - see call_of
+    kind = function.of_list(argument.kind)
+    if kind is None:
+        message = f"{function.name}() takes a list of numbers, not {argument.kind}"
+        raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message)
+    return Call(kind, span, function.name, (as_value(argument, scope),))
+
+
+def _call_of_scalars(function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope) -> Call:
+    _want_accepted(function, arguments)
+    try:
+        kind = function.result(arguments)
+    except ValueError as error:
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, f"{function.name}(): {error}") from None
+    if function.gives_an_argument and isinstance(kind, FloatKind):
+        arguments = [as_kind(argument, kind, scope) for argument in arguments]
+    becomes = [parameter.becomes for parameter in _parameters(function, len(arguments))]
+    made = [as_kind(each, kind, scope) if kind else each for each, kind in zip(arguments, becomes, strict=True)]
+    return Call(kind, span, function.name, tuple(made))
+
+
+def _parameters(function: Function, count: int) -> list[Parameter]:
+    """The parameters of a call with so many arguments."""
+    return [*function.parameters, *[function.parameters[-1]] * (count - len(function.parameters))]
+
+
+def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Node]:
+    if not isinstance(expected, Int):
+        message = f"{function.name}() needs bounds here, where no integer field is filled"
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
+    return [Constant(IntKind(bound, bound), span, bound) for bound in (expected.low, expected.high)]
+
+
+def _want_count(function: Function, count: int, span: SourceSpan) -> None:
+    takes = len(function.parameters)
+    if count < takes or (count > takes and not function.variadic):
+        wanted = plural(takes, "argument") + " or more, or one list," * function.variadic
+        message = f"{function.name}() takes {wanted}, not {count}"
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
+
+
+_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS}
+
+
+def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:
+    for parameter, argument in zip(_parameters(function, len(arguments)), arguments, strict=True):
+        if not isinstance(argument.kind, parameter.accepts):
+            message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
+            hint = _OF_FLOATS.get(function.name, "") if isinstance(argument.kind, FloatKind) else ""
+            raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message, hint)
