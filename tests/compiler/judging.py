@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.kinds import UINT32, element_of
+from router.compiler.expressions.kinds import UINT32, BoolKind, element_of
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.mapping import build
@@ -116,6 +116,8 @@ class Question:
             condition = check(self.when, scope) if self.when else None
         except ExpressionError as error:
             raise Misfit([error.diagnostic]) from None
+        if condition is not None and not isinstance(condition.kind, BoolKind):
+            raise Misfit([Diagnostic(condition.span, Code.TYPE_MISMATCH, "a condition is a bool")])
         if self.target is None:
             return Checked(for_each, condition, None)
         mapping = build(self.fields, self.target, scope, SPAN)

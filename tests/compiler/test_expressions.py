@@ -334,7 +334,7 @@ def test_a_list_literal_is_computed_item_by_item() -> None:
 WORDS = MessageType(
     "Words",
     (
-        *(Field(name, Int(32, True)) for name in ("from", "class", "in", "is", "not", "None", "with", "ä")),
+        *(Field(name, Int(32, True)) for name in ("from", "class", "in", "is", "not", "None", "True", "with", "ä")),
         Field("as", MessageType("As", (Field("if", Int(8, True), has_presence=True),))),
     ),
 )
@@ -342,8 +342,9 @@ WORDS = MessageType(
 
 @pytest.mark.parametrize(
     "text",
-    ["from + class", "message.from", "message.in + message.is * message.not", "message . None", "as.if", "has(as.if)",
-     "has(message.as.if)", "from if with in [class] else message.in", "5. in [1]", "'in is' == 'with from'"],
+    ["from + class", "message.from", "message.in + message.is * message.not", "message . None + message.True", "as.if",
+     "has(as.if)", "has(message.as.if)", "from if with in [class] else message.in", "5. in [1]",
+     "'in is' == 'with from'"],
 )  # fmt: skip
 def test_words_of_python_are_names_where_they_mean_nothing_else(text: str) -> None:
     check(written(text), scope_of(WORDS))

@@ -185,23 +185,29 @@ def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) ->
         return Meaning(kind, give)
 
     def elements(context: Context) -> list[Computation]:
-        columns = [_elements(each, context) if isinstance(each.kind, Listing) else None for each in operands]
-        lengths = {len(column) for column in columns if column is not None}
-        if len(lengths) > 1:
-            all_of([_different_lengths, *(each for column in columns if column is not None for each in column)])
-        scalars = [partial(each.give, context) for each in operands]
-        return [
-            partial(_computed, compute, kind, [column[index] if column is not None else scalar
-                                               for column, scalar in zip(columns, scalars, strict=True)])
-            for index in range(lengths.pop())
-        ]  # fmt: skip
+        columns = iter(_side_by_side([each for each in operands if isinstance(each.kind, Listing)], context))
+        cells = [next(columns) if isinstance(each.kind, Listing) else partial(each.give, context) for each in operands]
+        count = max(len(cell) for cell in cells if isinstance(cell, list))
+        rows = [[cell[index] if isinstance(cell, list) else cell for cell in cells] for index in range(count)]
+        return [partial(_computed, compute, kind, row) for row in rows]
 
     lengths = [each.length for each in lists if each.length is not None]
     return _list_of(Listing(kind, lengths[0] if lengths else None), elements)
 
 
-def _different_lengths() -> None:
-    raise Refused(MAPPING_ERROR)
+def _side_by_side(lists: Sequence[Meaning], context: Context) -> list[list[Computation]]:
+    """The elements of lists, which have to have one length. If they have not, some may have been computed before."""
+    try:
+        columns = all_of([partial(_elements, each, context) for each in lists])
+        if len({len(column) for column in columns}) > 1:
+            raise Refused(MAPPING_ERROR)
+    except Refused as refused:
+        all_of([partial(_refuse, refused), *(partial(each.give, context) for each in lists)])
+    return columns
+
+
+def _refuse(refused: Refused) -> None:
+    raise refused
 
 
 def _computed(compute: Callable[..., Any], kind: Kind, operands: Sequence[Computation]) -> Any:

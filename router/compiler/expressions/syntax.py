@@ -44,7 +44,7 @@ class Parsed:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", SyntaxWarning)
                 warnings.simplefilter("ignore", DeprecationWarning)
-                return ast.parse(text, mode="eval").body
+                return _with_words(ast.parse(text, mode="eval").body)
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
             message = f"not an expression: {reason}"
@@ -95,22 +95,35 @@ _LEXEMES = re.compile(
     """,
     re.VERBOSE,
 )
-_WIDE = {chr(letter): chr(letter + 0xFEE0) for letter in range(ord("A"), ord("z") + 1) if chr(letter).isalpha()}
+_MARKED = 0xA000
+"""Letters from here on (Yi syllables) mark a word by its first letter, and are letters for Python."""
 
 
 def _with_words_as_names(text: str) -> str:
-    """The text with Python's words made names where fields may be meant, in as many characters.
-
-    Python reads a name of wide letters as one of ordinary letters, but no word.
-    """
+    """The text with Python's words made names where fields may be meant, in as many characters."""
 
     def replaced(found: re.Match[str]) -> str:
         dot, name = found["dot"] or "", found["name"]
         if not name or not keyword.iskeyword(name) or (name in _MEANINGFUL and not dot):
             return found[0]
-        return dot + _WIDE[name[0]] + name[1:]
+        return dot + chr(_MARKED + ord(name[0])) + name[1:]
 
     return _LEXEMES.sub(replaced, text)
+
+
+def _with_words(tree: ast.expr) -> ast.expr:
+    """The syntax tree with the words that were made names."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            node.id = _word(node.id)
+        elif isinstance(node, ast.Attribute):
+            node.attr = _word(node.attr)
+    return tree
+
+
+def _word(name: str) -> str:
+    is_marked = _MARKED <= ord(name[0]) < _MARKED + 128
+    return chr(ord(name[0]) - _MARKED) + name[1:] if is_marked else name
 
 
 def _comment(text: str) -> int | None:

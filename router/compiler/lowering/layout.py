@@ -15,16 +15,13 @@ from typing import NamedTuple, Union
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.compiler.lowering.offsets import HIGHEST, Offset
-from router.compiler.lowering.operations import NONE, Counted, Scalar, Slot
+from router.compiler.lowering.operations import MOST_LOOPS, NONE, Counted, Scalar, Slot
 from router.types.descriptors import enum_of, message_of
 from router.types.model import Bool, Bytes, Float, Int, List, MessageType, String, Type
 from router.types.model import Field as Member
 
 MOST_NODES_DEEP = 32
-"""As in `native/read_protobuf.h`: messages in messages."""
-
-MOST_READ_LOOPS = 8
-"""As in `native/read_cdr.h`: lists in lists of messages."""
+"""As in `native/read_protobuf.h`: messages in messages, of which the envelope is one."""
 
 
 # ---- what is wanted
@@ -458,8 +455,8 @@ class _Steps:
             self._loop(each, slot, lambda steps: steps._field(element, None))
 
     def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
-        if self.loops == MOST_READ_LOOPS:
-            message = f"a message of this type has more than {MOST_READ_LOOPS} lists of messages within each other"
+        if self.loops == MOST_LOOPS:
+            message = f"a message of this type has more than {MOST_LOOPS} lists of messages within each other"
             raise TooManyListsError(message)
         self._add(each, slot)
         inside = _Steps(self.layout, Offset(), self.loops + 1)

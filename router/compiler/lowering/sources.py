@@ -117,8 +117,8 @@ class Datagram(_Source):
     def layout(self, span: SourceSpan) -> Layout:
         """Of all programs that have been made. Raises TooLargeError for one that is too large."""
         for node in (self.root, *self.elements):
-            if (depth := node.depth()) > MOST_NODES_DEEP - 2:
-                message = f"what is read here is {depth} messages deep, and at most {MOST_NODES_DEEP - 2} are gone into"
+            if (depth := node.depth()) >= MOST_NODES_DEEP:
+                message = f"this reads a field that is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
                 raise TooLargeError(span, message, "read what is less deep")
         made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
         _want_room(made, span)

@@ -1,0 +1,356 @@
+"""Programs: what is made of expressions and mappings, operation by operation, and what is too large for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from pathlib import Path
+
+import pytest
+
+from router.compiler.expressions import check
+from router.compiler.lowering import layout, operations
+from router.compiler.lowering.cdr import cdr_message
+from router.compiler.lowering.layout import MOST_NODES_DEEP, ReadKind, ReadOperation
+from router.compiler.lowering.names import TooLargeError
+from router.compiler.lowering.operations import MOST_OPEN, Code, Op, Operation, Scalar, Sign, depths, most_executed
+from router.compiler.lowering.protobuf import protobuf_message
+from router.compiler.lowering.sources import MOST_CONDITION_OPERATIONS, Datagram, RosMessage
+from router.compiler.mapping import build
+from router.errors import Code as FindingCode
+from router.types.model import Field, Float, Int, List, MessageType, String, Type
+from tests.carrier.evaluating import C
+from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
+from tests.compiler.payloads import made_wire, wire_of
+
+HARD = Path(__file__).parents[1] / "carrier" / "protos"
+F32, F64, U8, I32, U32, I64, U64 = (
+    Float(32), Float(64), Int(8, False), Int(32, True), Int(32, False), Int(64, True), Int(64, False)
+)  # fmt: skip
+POINT = MessageType("made/msg/Point", (Field("x", F64), Field("y", F64)))
+SOURCE = MessageType("made/msg/Source", (
+    Field("u8", U8), Field("i32", I32), Field("i64", I64), Field("u64", U64), Field("f64", F64),
+    Field("text", String()), Field("list", List(I32)), Field("other", List(F32)), Field("points", List(POINT)),
+    Field("texts", List(String())),
+))  # fmt: skip
+
+
+def listed(code: Sequence[Operation]) -> str:
+    """The names of operations, with the fields that they load and the numbers in them."""
+    return " ".join(_shown(each) for each in code)
+
+
+def _shown(operation: Operation) -> str:
+    name = operation.kind.name.lower()
+    slot = operation.slot
+    if isinstance(slot, operations.Slot):
+        return f"{name}:{slot.name or 't'}"
+    if operation.kind in (Op.INTEGER, Op.REAL):
+        return f"{operation.number}"
+    if operation.kind in (Op.KNOWN, Op.TEXT):
+        return f"{name}:{operation.data.hex()}"
+    return f"{name}:{operation.size}" if operation.kind in (Op.JUMP, Op.UNLESS, Op.AND, Op.OR, Op.REPEAT) else name
+
+
+def lowered(text: str) -> Code:
+    return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE)))
+
+
+# ---- the format
+
+
+@pytest.mark.parametrize(
+    ("declared", "prefix"),
+    [
+        (Op, "OP_"), (operations.Relation, ""), (operations.Compared, ""), (layout.FieldType, "TYPE_"),
+        (layout.ReadKind, "READ_"), (Scalar, "SCALAR_"),
+    ],
+)  # fmt: skip
+def test_enums_are_those_of_the_header(declared: type[IntEnum], prefix: str) -> None:
+    in_c = {name: number for name, number in C.items() if prefix and name.startswith(prefix)}
+    ours = {f"{prefix}{each.name}".replace("SCALAR_IN_CELLS", "IN_CELLS"): int(each) for each in declared}
+    assert {name: C[name] for name in ours} == ours
+    assert in_c.keys() <= ours.keys()
+
+
+def test_limits_are_those_of_the_header() -> None:
+    names = ("MOST_LOOPS", "MOST_OPEN")
+    assert [C[name] for name in names] == [getattr(operations, name) for name in names]
+    assert C["MOST_STACKED"] == operations.MOST_STACKED + 1
+    assert {f"{each.name}_UNSIGNED": int(each) for each in Sign} == {
+        name: number for name, number in C.items() if name.endswith("_UNSIGNED") and not name.startswith("SIGNED")
+    }
+
+
+# ---- expressions
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("i32 + 1", "load:i32 1 add"),
+        ("i64 + 1", "load:i64 1 checked_add"),
+        ("f64 * 2", "load:f64 2.0 real_multiply"),
+        ("i32 / 2", "load:i32 integer_to_real 2.0 real_divide"),
+        ("i32 ** 3", "load:i32 keep:t load:t checked_multiply load:t checked_multiply"),
+        ("u8 ** 2", "load:u8 keep:t load:t multiply"),
+        ("clamp(round(f64), 0, 9)", "load:f64 round 0 9 clamp"),
+        ("i32 if f64 > 1 else 2", "1 load:f64 compare unless:2 load:i32 jump:1 2"),
+        ("0 < i32 < 9 and u8 == 1", "0 load:i32 keep:t compare and:3 load:t 9 compare and:3 load:u8 1 compare"),
+        ("text + 'a'", "load:text utf8 text:61 join"),
+        ("points[2].x", "load:points element enter load:points[].x"),
+        ("len(list)", "load:list size"),
+    ],
+)  # fmt: skip
+def test_expressions_become_operations(text: str, expected: str) -> None:
+    assert listed(lowered(text)) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "flag"),
+    [
+        ("i64 + u64", Sign.SECOND),
+        ("u64 + 1", Sign.FIRST | Sign.RESULT),
+        ("u64 - u64", Sign.FIRST | Sign.SECOND),
+        ("i64 * i64", 0),
+        ("abs(i64) + 1", Sign.FIRST | Sign.RESULT),
+    ],
+)
+def test_signs_follow_from_ranges(text: str, flag: int) -> None:
+    assert lowered(text)[-1].flag == flag
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("sum(list)", "0 load:list keep:t size repeat:3 next:t checked_add again"),
+        (
+            "sum(list * 2)",
+            "0 load:list keep:t size repeat:5 next:t 2 multiply checked_add again",
+        ),
+        (
+            "1 in list",
+            "1 keep:t drop 0 load:list keep:t size repeat:5 next:t load:t compare either again",
+        ),
+        (
+            "max(list)",
+            "load:list keep:t element load:t keep:t size repeat:3 next:t greatest again",
+        ),
+        ("len(texts)", "load:texts keep:t size repeat:4 next:t utf8 drop again load:texts size"),
+    ],
+)
+def test_lists_are_gone_through_in_loops(text: str, expected: str) -> None:
+    assert listed(lowered(text)) == expected
+
+
+def test_lists_side_by_side_have_one_length() -> None:
+    made = listed(lowered("len(list + other)"))
+    both = "load:list keep:t size load:other keep:t size compare want load:t size"
+    assert made.startswith(f"list keep:t drop {both} repeat:")
+    assert made.endswith("real_add append:t again load:t size")
+
+
+# ---- messages in CDR
+
+
+Fields = dict[str, tuple[Type, str]]
+
+
+def to_ros(**fields: tuple[Type, str]) -> str:
+    target = MessageType("made/msg/Target", tuple(Field(name, declared) for name, (declared, _) in fields.items()))
+    mapped = field_map(**{name: text for name, (_, text) in fields.items() if text})
+    plan = build(mapped, target, scope_of(SOURCE), SPAN).plan
+    placed = cdr_message(RosMessage(SOURCE, "topic").lowering(), plan)
+    return listed([operation for operation, _ in placed])
+
+
+def test_what_is_known_is_written_at_once() -> None:
+    fields: Fields = {"a": (U8, "1"), "b": (F64, ""), "c": (I32, "i32"), "d": (U8, "2"), "e": (String(), "'x'")}
+    first = "known:0001000001" + "00" * 7 + "00" * 8
+    assert to_ros(**fields) == f"{first} load:i32 put known:02000000" + "02000000" + "7800"
+
+
+def test_behind_a_text_padding_is_left_to_the_machine() -> None:
+    fields: Fields = {"a": (String(), "text"), "b": (I32, "1"), "c": (F64, "2"), "d": (U8, "3")}
+    known = "known:01000000 known:0000000000000040" + "03"
+    assert to_ros(**fields) == f"known:00010000 load:text utf8 put_text {known}"
+
+
+def test_an_element_goes_from_a_list_to_the_message() -> None:
+    assert to_ros(a=(List(F64), "list")) == (
+        "known:00010000 load:list keep:t size keep:t put load:t repeat:4 next:t integer_to_real put_double again"
+    )
+    assert to_ros(a=(List(I32, None, 3), "list")).startswith(
+        "known:00010000 load:list keep:t size keep:t 3 compare want load:t keep:t put"
+    )
+
+
+# ---- payloads
+
+
+def to_payload(case: str, fields: dict[str, str]) -> str:
+    _, envelope = made_wire()
+    declared = envelope.cases[case]
+    plan = build(field_map(**fields), declared.type, scope_of(SOURCE, made_wire()[0].enums.values()), SPAN).plan
+    return listed([each for each, _ in protobuf_message(RosMessage(SOURCE, "topic").lowering(), plan, declared)])
+
+
+def test_fields_stand_by_their_numbers_and_known_ones_together() -> None:
+    made = to_payload("scalars", {"flag": "true", "u32": "7", "i32": "i32", "single": "1.5", "text": "text"})
+    known = "known:2007" + "5d0000c03f" + "6801"
+    assert made == f"open load:i32 write_varint {known} load:text utf8 write_bytes close"
+
+
+def test_a_payload_without_fields_of_the_message_is_known() -> None:
+    assert to_payload("scalars", {"i32": "-1"}) == "known:0a0b08" + "ff" * 9 + "01"
+    assert to_payload("many", {"numbers": "[1, 2]"}) == "known:8201040a020102"
+    assert to_payload("scalars", {"u32": "0"}) == "known:0a00"
+    assert to_payload("optional", {"number": "0"}) == "known:7a020800"
+
+
+def test_elements_are_packed() -> None:
+    assert to_payload("many", {"numbers": "list"}) == (
+        "open open load:list keep:t size repeat:3 next:t write_varint again close close"
+    )
+
+
+# ---- what is read
+
+
+def steps(declared: MessageType, *wanted: str) -> tuple[ReadOperation, ...]:
+    source = RosMessage(declared, "topic")
+    for text in wanted:
+        source.lowering().value(check(written(text), scope_of(declared)))
+    return source.layout(SPAN).nodes[0].entries  # type: ignore[return-value]
+
+
+def test_what_is_not_wanted_is_skipped_in_one_step() -> None:
+    inner = MessageType("made/msg/Inner", (Field("a", U8), Field("b", F64), Field("c", List(U8, 3))))
+    declared = MessageType(
+        "made/msg/Outer", (Field("one", inner), Field("two", inner), Field("x", F64), Field("y", F64))
+    )
+    assert steps(declared, "x") == (
+        ReadOperation(ReadKind.SKIP, 1, elements=35),
+        ReadOperation(ReadKind.SCALAR, type=Scalar.FLOAT64, slot=2),
+    )
+
+
+def test_behind_a_text_what_is_skipped_is_aligned_first() -> None:
+    declared = MessageType(
+        "made/msg/Outer", (Field("text", String()), Field("a", U8), Field("b", F64), Field("c", U8), Field("x", I32))
+    )
+    assert steps(declared, "x") == (
+        ReadOperation(ReadKind.SEQUENCE, 1),
+        ReadOperation(ReadKind.SKIP, 1, elements=1),
+        ReadOperation(ReadKind.SKIP, 8, elements=1),
+        ReadOperation(ReadKind.SKIP, 1, elements=1),
+        ReadOperation(ReadKind.SCALAR, type=Scalar.INT32, slot=2),
+    )
+
+
+def test_elements_of_lists_are_read_as_far_as_they_are_wanted() -> None:
+    source = RosMessage(SOURCE, "topic")
+    source.lowering().value(check(written("points[0].x + points[1].y"), scope_of(SOURCE)))
+    made = source.layout(SPAN)
+    assert [len(node.entries) for node in made.nodes[1:]] == [1, 2]
+    assert made.names[made.nodes[2].first_slot] == "points[].y"
+
+
+def test_nothing_is_read_for_nothing() -> None:
+    assert steps(SOURCE, "1 + 1") == ()
+
+
+# ---- limits
+
+
+def test_the_depth_of_branches_is_that_of_the_deeper_one() -> None:
+    assert max(depths(lowered(" if f64 > 1 else ".join(["i32"] * 50)))) == 2
+    assert max(depths(lowered("min(" + ", ".join(["i32"] * 300) + ")"))) == 2
+    assert max(depths(lowered("[" + ", ".join(["i32"] * 300) + "] if f64 > 1 else list"))) == 2
+
+
+def test_a_loop_counts_with_all_elements_that_a_datagram_can_have() -> None:
+    assert most_executed(lowered("i32 + 1 > 2")) == 5
+    one = most_executed(lowered("sum(list) > 2"))
+    assert 3 * 16_384 < one < 4 * 16_384
+    assert most_executed(lowered("sum(list + sum(list)) > 2")) > 16_384 * one // 2
+
+
+@pytest.mark.parametrize("when", ["min(singles) > 0.5", "3 in numbers", "sum(numbers) % 2 == 0", "len(points) > 1"])
+def test_a_condition_of_the_receive_thread_may_look_into_a_list(when: str) -> None:
+    assert 0 < most_executed(of_many(when)) <= MOST_CONDITION_OPERATIONS
+
+
+@pytest.mark.parametrize("when", ["3 in numbers and 4 in numbers and 5 in numbers", "sum(numbers + sum(numbers)) > 1"])
+def test_a_condition_of_the_receive_thread_is_bounded(when: str) -> None:
+    with pytest.raises(TooLargeError) as caught:
+        of_many(when)
+    found = caught.value.diagnostic
+    assert found.message.startswith("this condition may take ")
+    assert (found.code, found.span.line) == (FindingCode.TOO_LARGE, 7)
+    assert of_many(when, is_bounded=False)  # that of a topic
+
+
+def of_many(when: str, *, is_bounded: bool = True) -> Code:
+    _, envelope = made_wire()
+    case = envelope.cases["many"]
+    source = Datagram(case, envelope)
+    node = check(written(when), scope_of(case.type))
+    return source.condition(source.lowering(), [node], is_bounded=is_bounded).code
+
+
+def test_lists_in_lists_are_bounded() -> None:
+    declared = MessageType("made/msg/Leaf", (Field("numbers", List(I32)),))
+    for _ in range(2, 9):
+        declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
+        assert findings("many", declared) == []
+    declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
+    assert findings("many", declared) == ["this goes through 9 lists within each other, and at most 8 are"]
+
+
+def test_messages_in_messages_are_bounded() -> None:
+    """The payload is the first one of those that are written."""
+    _, envelope = wire_of(HARD, "PBEnvelope")
+    case = envelope.cases["tree"]
+
+    def written_as_deep(depth: int) -> None:
+        plan = build(field_map(**{"__".join(seeds(depth)): "text"}), case.type, scope_of(SOURCE), SPAN).plan
+        source = RosMessage(SOURCE, "topic")
+        source.sent(source.lowering(), plan, case)
+
+    written_as_deep(MOST_OPEN - 1)
+    with pytest.raises(TooLargeError, match="this writes 34 messages within each other, and at most 32 are"):
+        written_as_deep(MOST_OPEN + 1)
+
+
+def test_what_is_read_is_bounded() -> None:
+    """A field of the payload is one message deep."""
+    _, envelope = wire_of(HARD, "PBEnvelope")
+    case = envelope.cases["tree"]
+
+    def read_as_deep(depth: int) -> None:
+        source = Datagram(case, envelope)
+        source.lowering().value(check(written(".".join(seeds(depth))), scope_of(case.type)))
+        source.layout(SPAN)
+
+    read_as_deep(MOST_NODES_DEEP - 3)
+    with pytest.raises(TooLargeError, match="this reads a field that is 32 messages deep, and at most 31 are read"):
+        read_as_deep(MOST_NODES_DEEP - 1)
+
+
+def seeds(depth: int) -> list[str]:
+    """The path of a text that is so many messages deep in the payload, an odd number."""
+    return [*(["seed", "tree"] * depth)[:depth], "name"]
+
+
+def findings(name: str, target: MessageType) -> list[str]:
+    _, envelope = made_wire()
+    case = envelope.cases[name]
+    plan = build(AUTO, target, scope_of(case.type), SPAN).plan
+    source = Datagram(case, envelope)
+    try:
+        source.published(source.lowering(), plan)
+        source.layout(SPAN)
+    except TooLargeError as error:
+        return [error.diagnostic.message]
+    return []
