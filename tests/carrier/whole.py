@@ -64,7 +64,10 @@ WHOLE = f"""\
         - {{topic: unwanted, {_FLOAT}accel_z}}}}
       ttl: 200ms
     - source: [left_tool, right_tool, picky]
-      destinations: [recorder, {{endpoint: paced, when: accel_x > 1}}, {{endpoint: driving_board, when: source == "left_tool"}}]
+      destinations:
+        - recorder
+        - {{endpoint: paced, when: accel_x > 1}}
+        - {{endpoint: driving_board, when: source == "left_tool"}}
       topics: [{{topic: of_tools, {_FLOAT}accel_x}}}}]
   gps_info:
     source: any
