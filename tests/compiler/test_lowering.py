@@ -22,6 +22,7 @@ from router.types.model import Field, Float, Int, List, MessageType, String, Typ
 from tests.carrier.evaluating import C
 from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
 from tests.compiler.payloads import made_wire, wire_of
+from tests.compiler.test_expressions import MODE
 
 HARD = Path(__file__).parents[1] / "carrier" / "protos"
 F32, F64, U8, I32, U32, I64, U64 = (
@@ -53,7 +54,7 @@ def _shown(operation: Operation) -> str:
 
 
 def lowered(text: str) -> Code:
-    return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE)))
+    return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE, [MODE])))
 
 
 # ---- the format
@@ -91,6 +92,7 @@ def test_limits_are_those_of_the_header() -> None:
         ("i32 + 1", "load:i32 1 add"),
         ("i64 + 1", "load:i64 1 checked_add"),
         ("f64 * 2", "load:f64 2.0 real_multiply"),
+        ("f64 * Mode.LESS", "load:f64 -7.0 real_multiply"),
         ("i32 / 2", "load:i32 integer_to_real 2.0 real_divide"),
         ("i32 ** 3", "load:i32 keep:t load:t checked_multiply load:t checked_multiply"),
         ("u8 ** 2", "load:u8 keep:t load:t multiply"),

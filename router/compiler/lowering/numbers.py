@@ -50,7 +50,7 @@ def to_real(made: Code, kind: Kind) -> Code:
     if isinstance(kind, FloatKind):
         return made
     if len(made) == 1 and made[0].kind is Op.INTEGER:
-        return (real(bounds(kind)[0]),)
+        return (real(made[0].number % (1 << 64) if is_unsigned(kind) else made[0].number),)
     return code(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 
