@@ -15,7 +15,7 @@ from router.compiler.expressions.kinds import (
     StringKind,
 )
 from router.compiler.expressions.tree import Relation as TreeRelation
-from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer, real
+from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer
 
 INT64 = -(1 << 63), (1 << 63) - 1
 
@@ -49,8 +49,6 @@ def to_real(made: Code, kind: Kind) -> Code:
     """A number as a real one."""
     if isinstance(kind, FloatKind):
         return made
-    if len(made) == 1 and made[0].kind is Op.INTEGER:
-        return (real(bounds(kind)[0]),)
     return code(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 

@@ -44,8 +44,8 @@ from router.errors import SourceSpan
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
-MOST_CONDITION_OPERATIONS = 1 << 17
-"""Of all that a destination's `when` may execute for a datagram: less than a millisecond of the receive thread."""
+MOST_CONDITION_OPERATIONS = 1 << 18
+"""Operations that a destination's `when` may execute for a datagram, about a millisecond of the receive thread."""
 
 _MOST_SLOTS = NONE
 
@@ -93,11 +93,10 @@ class _Source:
         code = chained(Op.AND, [lowering.value(each) for each in given])
         _want_small([(operation, given[-1].span) for operation in code])
         if is_bounded and (most := most_executed(code)) > MOST_CONDITION_OPERATIONS:
-            message = (
-                f"this condition may take {most} operations for a message, and a destination's `when` at most "
-                f"{MOST_CONDITION_OPERATIONS}: a list counts with {MAX_DATAGRAM} elements"
-            )
-            raise TooLargeError(given[-1].span, message, "look into fewer lists, or into one only")
+            limit = f"and a destination's `when` takes at most {MOST_CONDITION_OPERATIONS:,}"
+            message = f"this could take {most:,} operations on the longest datagram, {limit}"
+            hint = f"a list counts with {MAX_DATAGRAM:,} elements: look into fewer lists, or fewer times"
+            raise TooLargeError(given[-1].span, message, hint)
         return Condition(code, ", or ".join(f"{each.span}: when" for each in given))
 
 
@@ -118,7 +117,7 @@ class Datagram(_Source):
         """Of all programs that have been made. Raises TooLargeError for one that is too large."""
         for node in (self.root, *self.elements):
             if (depth := node.depth()) >= MOST_NODES_DEEP:
-                message = f"this reads a field that is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
+                message = f"a field that is read is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
                 raise TooLargeError(span, message, "read what is less deep")
         made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
         _want_room(made, span)
