@@ -318,7 +318,13 @@ def test_lists_in_lists_are_bounded() -> None:
         declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
         assert findings("many", declared) == []
     declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
-    assert findings("many", declared) == ["this goes through 9 lists within each other, and at most 8 are"]
+    assert findings("many", declared) == ["more than 8 lists are gone through within each other here"]
+
+
+def test_text_that_is_put_together_is_bounded() -> None:
+    assert lowered(" + ".join(["text"] * 10))
+    with pytest.raises(TooLargeError, match="may have 1064960 bytes, and at most 1048576 fit"):
+        lowered(" + ".join(["text"] * 11))
 
 
 def test_messages_in_messages_are_bounded() -> None:
@@ -332,7 +338,7 @@ def test_messages_in_messages_are_bounded() -> None:
         source.sent(source.lowering(), plan, case)
 
     written_as_deep(MOST_OPEN - 1)
-    with pytest.raises(TooLargeError, match="this writes 34 messages within each other, and at most 32 are"):
+    with pytest.raises(TooLargeError, match="more than 32 messages are written within each other here"):
         written_as_deep(MOST_OPEN + 1)
 
 
