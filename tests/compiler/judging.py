@@ -159,7 +159,7 @@ def question(noise: random.Random, language: Language) -> Question:
 def messages(noise: random.Random, language: Language) -> Iterator[tuple[bytes, View]]:
     if language.is_ros:
         for _ in range(10):
-            value = ros_message(noise)
+            value = ros_message(noise, language.source)
             yield cdr(language.source, as_written(value)), View(value, language.source)
         return
     case = language_wire()[1].cases["source"]
