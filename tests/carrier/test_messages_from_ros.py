@@ -110,7 +110,9 @@ def read(wire: Wire, made: Made) -> list[bytes | str]:
 @given(data=st.data())
 def test_random_mappings_make_the_same_datagrams(delivering: CDLL, data: st.DataObject) -> None:
     wire = made_wire()
-    case = data.draw(st.sampled_from(["scalars", "optional", "many", "choice", "names", "bounded", "nothing"]))
+    case = data.draw(
+        st.sampled_from(["scalars", "optional", "many", "choice", "names", "bounded", "nothing", "closed", "maps"])
+    )
     source = as_ros(data.draw(payload_sources(wire[1].cases[case].type)))
     assume(source.fields)
     try:

@@ -22,6 +22,7 @@ from router.types.model import Field, Float, Int, List, MessageType, String, Typ
 from tests.carrier.evaluating import C
 from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
 from tests.compiler.payloads import made_wire, wire_of
+from tests.compiler.test_expressions import MODE
 
 HARD = Path(__file__).parents[1] / "carrier" / "protos"
 F32, F64, U8, I32, U32, I64, U64 = (
@@ -53,7 +54,7 @@ def _shown(operation: Operation) -> str:
 
 
 def lowered(text: str) -> Code:
-    return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE)))
+    return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE, [MODE])))
 
 
 # ---- the format
@@ -91,6 +92,7 @@ def test_limits_are_those_of_the_header() -> None:
         ("i32 + 1", "load:i32 1 add"),
         ("i64 + 1", "load:i64 1 checked_add"),
         ("f64 * 2", "load:f64 2.0 real_multiply"),
+        ("f64 * Mode.LESS", "load:f64 -7.0 real_multiply"),
         ("i32 / 2", "load:i32 integer_to_real 2.0 real_divide"),
         ("i32 ** 3", "load:i32 keep:t load:t checked_multiply load:t checked_multiply"),
         ("u8 ** 2", "load:u8 keep:t load:t multiply"),
@@ -276,17 +278,28 @@ def test_a_loop_counts_with_all_elements_that_a_datagram_can_have() -> None:
     assert most_executed(lowered("sum(list + sum(list)) > 2")) > 16_384 * one // 2
 
 
-@pytest.mark.parametrize("when", ["min(singles) > 0.5", "3 in numbers", "sum(numbers) % 2 == 0", "len(points) > 1"])
+@pytest.mark.parametrize(
+    "when",
+    [
+        "min(singles) > 0.5",
+        "3 in numbers and 4 in numbers",
+        "min(singles / 100) < 0.5",
+        "sum(numbers) % 2 == 0",
+        "len(points) > 1",
+    ],
+)
 def test_a_condition_of_the_receive_thread_may_look_into_a_list(when: str) -> None:
     assert 0 < most_executed(of_many(when)) <= MOST_CONDITION_OPERATIONS
 
 
-@pytest.mark.parametrize("when", ["3 in numbers and 4 in numbers and 5 in numbers", "sum(numbers + sum(numbers)) > 1"])
+@pytest.mark.parametrize(
+    "when", ["3 in numbers and 4 in numbers and 5 in numbers and 6 in numbers", "sum(numbers + sum(numbers)) > 1"]
+)
 def test_a_condition_of_the_receive_thread_is_bounded(when: str) -> None:
     with pytest.raises(TooLargeError) as caught:
         of_many(when)
     found = caught.value.diagnostic
-    assert found.message.startswith("this condition may take ")
+    assert found.message.startswith("this could take ")
     assert (found.code, found.span.line) == (FindingCode.TOO_LARGE, 7)
     assert of_many(when, is_bounded=False)  # that of a topic
 
@@ -305,7 +318,13 @@ def test_lists_in_lists_are_bounded() -> None:
         declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
         assert findings("many", declared) == []
     declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
-    assert findings("many", declared) == ["this goes through 9 lists within each other, and at most 8 are"]
+    assert findings("many", declared) == ["more than 8 lists are gone through within each other here"]
+
+
+def test_text_that_is_put_together_is_bounded() -> None:
+    assert lowered(" + ".join(["text"] * 10))
+    with pytest.raises(TooLargeError, match="may have 1064960 bytes, and at most 1048576 fit"):
+        lowered(" + ".join(["text"] * 11))
 
 
 def test_messages_in_messages_are_bounded() -> None:
@@ -319,7 +338,7 @@ def test_messages_in_messages_are_bounded() -> None:
         source.sent(source.lowering(), plan, case)
 
     written_as_deep(MOST_OPEN - 1)
-    with pytest.raises(TooLargeError, match="this writes 34 messages within each other, and at most 32 are"):
+    with pytest.raises(TooLargeError, match="more than 32 messages are written within each other here"):
         written_as_deep(MOST_OPEN + 1)
 
 
@@ -334,7 +353,7 @@ def test_what_is_read_is_bounded() -> None:
         source.layout(SPAN)
 
     read_as_deep(MOST_NODES_DEEP - 3)
-    with pytest.raises(TooLargeError, match="this reads a field that is 32 messages deep, and at most 31 are read"):
+    with pytest.raises(TooLargeError, match="a field that is read is 32 messages deep, and at most 31 are read"):
         read_as_deep(MOST_NODES_DEEP - 1)
 
 

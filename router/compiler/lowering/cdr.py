@@ -24,7 +24,7 @@ _EMPTY = b"\0"
 
 
 def cdr_message(lowering: Lowering, plan: Record) -> list[Placed]:
-    """The operations that write a message, each with its place."""
+    """Return the operations that write a message, each with its place."""
     header = known(HEADER), Place(plan.span, "")
     return list(_merged([header, *_Writer(lowering).plan(plan, "")], Offset(HIGHEST, -len(HEADER) % HIGHEST)))
 

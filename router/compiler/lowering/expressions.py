@@ -1,13 +1,13 @@
 """From a checked expression to the operations that compute it.
 
-The tree says all there is to know: which kind each value has, the range of each integer, and which results have to be
-checked. A value on the stack is an integer, a real number, text or bytes, or a list, as its kind says; a time is its
-nanoseconds. A message is never on the stack but as the element of a list: its fields are read from a Node.
+The tree has the kind of each value, the range of each integer, and which results have to be checked. A value on the
+stack is an integer, a real number, text, bytes or a list, according to its kind; a time is its nanoseconds. A message
+is on the stack only as an element of a list: its fields are read from a Node.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -49,6 +49,8 @@ from router.compiler.lowering.operations import (
     Operation,
     Scalar,
     Slot,
+    chained,
+    choice,
     code,
     integer,
     keep,
@@ -84,7 +86,7 @@ class Lowering:
     names: Names
 
     def value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
-        """What puts the value of a node on the stack."""
+        """Return the operations that put the value of a node on the stack."""
         if isinstance(node.kind, ListKind):
             return lists.stored(self, node).code
         match node:
@@ -118,13 +120,13 @@ class Lowering:
                 raise AssertionError(f"{node.kind} is no list")
 
     def real(self, node: Tree) -> Code:
-        """The value of a number as a real one."""
+        """Return those that put a number there as a real one."""
         return to_real(self.value(node), node.kind)
 
     # messages and their fields
 
     def message(self, node: Tree) -> tuple[Code, Node]:
-        """Where the fields of a message are read, and what has to be done before they are there."""
+        """Return the node that has the fields of a message, and the operations that read them into it."""
         match node:
             case Variable():
                 meaning = self.names.variables[node.name]
@@ -148,7 +150,7 @@ class Lowering:
         return code(made, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else made
 
     def time(self, before: Code, moment: Node) -> Code:
-        """Nanoseconds, of a message with seconds and nanoseconds: they always fit."""
+        """Return the nanoseconds of a message with seconds and nanoseconds. They always fit."""
         seconds, nanoseconds = moment.type.fields
         whole = code(load(moment.value(seconds)), integer(NS_PER_SECOND), Operation(Op.MULTIPLY))
         return code(before, whole, load(moment.value(nanoseconds)), Operation(Op.ADD))
@@ -186,7 +188,7 @@ class Lowering:
         return code(self.value(node.left), self.value(node.right), Operation(operator, flag=flag))
 
     def _power(self, node: Binary) -> Code:
-        """Of integers, by multiplication. What is between base and result fits wherever the result does."""
+        """A power of an integer, by multiplication. A lower power fits wherever the result does."""
         assert isinstance(node.right, Constant)  # noqa: S101 - exponents are literals
         exponent = int(node.right.value)
         base = self.value(node.left)
@@ -224,16 +226,3 @@ def _constant(node: Constant) -> Code:
     if isinstance(value, str):
         return (text(value.encode()),)
     return (real(value) if isinstance(node.kind, FloatKind) else integer(int(value)),)
-
-
-def chained(op: Op, codes: Sequence[Code]) -> Code:
-    """Several truths, of which those behind a decision are not evaluated."""
-    left, made = sum(map(len, codes)) + len(codes) - 1, list[Operation]()
-    for each in codes[:-1]:
-        left -= len(each) + 1
-        made += *each, Operation(op, size=left)
-    return (*made, *codes[-1])
-
-
-def choice(test: Code, body: Code, orelse: Code) -> Code:
-    return code(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)

@@ -55,7 +55,7 @@ _LONGEST_DECIMAL, _LONGEST_DIGITS = 20, 1 + 309 + 1 + 17
 
 
 def called(lowering: Lowering, node: Call) -> Code:
-    """What puts the result of a call on the stack."""
+    """Return the operations that put the result of a call on the stack."""
     name, first = node.function, node.arguments[0]
     if name in EXTREMES:
         return _extreme(lowering, node)
@@ -111,7 +111,7 @@ def _fit(lowering: Lowering, node: Call) -> Code:
 
 
 def _time(lowering: Lowering, node: Tree, factor: int) -> Code:
-    """Nanoseconds; what has more than 64 bits is no time."""
+    """A time in nanoseconds. It is refused if it does not fit 64 bits."""
     if isinstance(node.kind, FloatKind):
         return code(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
     flag = signs(IntKind(*INT64), node.kind)
@@ -156,7 +156,7 @@ def _member(lowering: Lowering, node: Call) -> Code:
 
 
 def longest(node: Tree) -> int:
-    """Bytes of a text, at the most. That of a ROS message may have more: then it is refused where it does not fit."""
+    """Return the bytes that a text has at the most. One of a ROS message can be longer: the machine refuses it then."""
     match node:
         case Constant(value=str(value)):
             return len(value.encode())

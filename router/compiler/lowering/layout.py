@@ -1,7 +1,7 @@
-"""What is read of a message, and into which slots: the fields that programs use, and nothing else.
+"""Layouts: which fields of a message are read, and into which slots. Only those that programs use are read.
 
-Expressions ask a Node for the fields of a message at one place. Once all of them have, `protobuf_layout` or
-`cdr_layout` numbers what they have asked for.
+Expressions ask a Node for fields of the message at one place. Then `protobuf_layout` or `cdr_layout` numbers all slots
+and nodes.
 """
 
 from __future__ import annotations

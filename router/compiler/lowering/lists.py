@@ -1,7 +1,7 @@
-"""Lists: how they are gone through, computed element by element, and looked into.
+"""Lists: loops over them, computation element by element, and functions of a whole list.
 
-A list on the stack is either as it stands in the message, scalars in a row, or in cells. A loop takes the elements off
-copies of its lists, which it has in slots of its own.
+A list on the stack is stored as scalars in a row, as the message has them, or in cells. A loop copies its lists to
+slots of its own, and takes the elements off the copies.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from router.compiler.lowering.operations import (
     Operation,
     Scalar,
     Slot,
+    choice,
     code,
     integer,
     keep,
@@ -53,10 +54,10 @@ _MOST_STACKED = 32
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A list, which `code` puts on the stack, and how it is stored.
+    """A list that `code` puts on the stack. `scalar` says how it is stored.
 
-    `element` is the kind of its elements. If they are messages, as times of ROS are, they are read into nodes like
-    `message`. `is_unchecked` text may be something else than UTF-8.
+    `element` is the kind of its elements. Those that are messages, as times of ROS are, are read into nodes like
+    `message`. With `is_unchecked` they are texts that may not be UTF-8.
     """
 
     code: Code
@@ -71,7 +72,7 @@ class Stored:
 
 
 def stored(lowering: Lowering, node: Tree) -> Stored:
-    """A list or bytes as a value."""
+    """Lower a list, or bytes."""
     match node:
         case Read() if isinstance(node.kind, ListKind):
             return _read(lowering, node)
@@ -87,7 +88,7 @@ def stored(lowering: Lowering, node: Tree) -> Stored:
 
 
 def are_messages(node: Tree) -> bool:
-    """Whether the elements of a list are read from messages, as those of a field with times are."""
+    """Whether the elements of a list are messages that have to be read. Times in a field are, computed ones are not."""
     match node:
         case Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
@@ -142,9 +143,7 @@ def _computed(lowering: Lowering, node: Each) -> Stored:
 
 
 def _chosen(lowering: Lowering, node: Choice) -> Stored:
-    """One of two lists: stored in the same way, with elements of the same kind."""
-    from router.compiler.lowering.expressions import choice
-
+    """Choose between two lists, which are made alike: stored in the same way, with elements of the same kind."""
     body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
@@ -162,7 +161,7 @@ def _in_cells(values: Stored) -> Stored:
 
 
 def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
-    """A list with its elements as values of `element`."""
+    """Convert the elements of a list to the kind `element`."""
     kind = values.element
     is_moment = isinstance(element, TimeKind) and values.message is not None
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
@@ -181,17 +180,20 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
 def looped(
     lowering: Lowering, lists: Sequence[tuple[str, Tree]], body: Callable[[], Code], *, keeps: bool = False
 ) -> Code:
-    """`body`, for the elements of `lists` side by side, each of which is a variable. It leaves the stack as it was."""
+    """Repeat `body`, which uses the variables of `lists`, for their elements side by side.
+
+    On the stack, it changes the value on top at the most.
+    """
     counted, each = gone_through(lowering, lists)
     return code(counted, repeat(code_of_each(lowering, each, body), keeps=keeps))
 
 
 Taken = tuple[str, Stored, Slot]
-"""A variable, its list, and the slot with what is left of it."""
+"""A variable, its list, and the slot with the elements that are left."""
 
 
 def gone_through(lowering: Lowering, lists: Sequence[tuple[str, Tree]]) -> tuple[Code, list[Taken]]:
-    """What leaves the number of elements on the stack, once for all lists; those of different length are refused."""
+    """Copy lists to slots, and put their number of elements on the stack. Lists of different length are refused."""
     made: Code = ()
     taken: list[Taken] = []
     for variable, values in lists:
@@ -205,7 +207,7 @@ def gone_through(lowering: Lowering, lists: Sequence[tuple[str, Tree]]) -> tuple
 
 
 def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Code]) -> Code:
-    """What is done for the elements at one place of all lists."""
+    """Lower one turn of a loop: take an element off each list, and do `body`."""
     before: Code = ()
     for variable, of, slot in taken:
         one, node = _taken(lowering, of, slot)
@@ -216,7 +218,7 @@ def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], 
 
 
 def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Code, Node | None]:
-    """What takes an element off a list: it is on the stack, or if it is a message, in a node."""
+    """Take an element off a list. It is on the stack then, or if it is a message, in a node."""
     taken = Operation(Op.NEXT, slot, flag=of.scalar)
     if of.message is not None:
         node = lowering.names.element(of.message)
@@ -225,7 +227,7 @@ def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Code, Node | Non
 
 
 def _without_a_detour(made: Code) -> Code:
-    """An element that is loaded once, at once, need not be kept."""
+    """Leave an element on the stack that would be kept, dropped and loaded again, and is used nowhere else."""
     for index, operation in enumerate(made[:-2]):
         if operation.kind is Op.KEEP:
             slot = operation.slot
@@ -241,31 +243,21 @@ def _without_a_detour(made: Code) -> Code:
 
 
 def element(lowering: Lowering, node: Element) -> Code:
-    """A scalar, a text or bytes in a list; a message as an element of another list."""
+    """Lower an element: a scalar, text or bytes, or a message that becomes an element of another list."""
     of = _checked(lowering, stored(lowering, node.values))
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
 
 
 def entered(lowering: Lowering, node: Element) -> tuple[Code, Node]:
-    """A message in a list, with its fields read."""
-    if isinstance(node.values, Listed):
-        return _entered_item(lowering, node.values, node.index)
+    """Read a message in a list into a node."""
     of = stored(lowering, node.values)
     assert of.message is not None  # noqa: S101 - said by the caller
     made = lowering.names.element(of.message)
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)), made
 
 
-def _entered_item(lowering: Lowering, values: Listed, index: int) -> tuple[Code, Node]:
-    """A message of a literal: others have to be there as well."""
-    reached = [lowering.message(item) for item in values.items]
-    others = [before for place, (before, _) in enumerate(reached) if place != index]
-    before, node = reached[index]
-    return code(*others, before), node
-
-
 def _checked(lowering: Lowering, of: Stored) -> Stored:
-    """A list whose texts are UTF-8, all of them."""
+    """Check that all texts of a list are UTF-8."""
     if not of.is_unchecked:
         return of
     slot = lowering.names.temporary()
@@ -277,18 +269,19 @@ def _checked(lowering: Lowering, of: Stored) -> Stored:
 
 
 def length(lowering: Lowering, node: Tree) -> Code:
+    """Lower len() of a list. A message of a literal is no value, but it has to be there."""
     if isinstance(node, Listed) and are_messages(node):
         return code(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
     return code(_checked(lowering, stored(lowering, node)).code, SIZE)
 
 
 def checked_list(lowering: Lowering, node: Tree) -> Stored:
-    """The list of `for_each`."""
+    """Lower the list of `for_each`, whose texts are checked at once."""
     return _checked(lowering, stored(lowering, node))
 
 
 def contains(lowering: Lowering, node: Contains) -> Code:
-    """Whether an element equals a value. All of them are evaluated."""
+    """Lower `in`. All elements are evaluated."""
     sought = lowering.names.temporary()
     found = code(lowering.value(node.sought), keep(sought), DROP, integer(0))
     again = (load(sought),)
@@ -305,7 +298,7 @@ def contains(lowering: Lowering, node: Contains) -> Code:
 
 
 def total(lowering: Lowering, node: Call) -> Code:
-    """The sum, in order. Each partial sum of integers is checked."""
+    """Lower sum(). Each partial sum of integers is checked."""
     (values,) = node.arguments
     is_real = isinstance(node.kind, FloatKind)
 
@@ -318,7 +311,7 @@ def total(lowering: Lowering, node: Call) -> Code:
 
 
 def extreme(lowering: Lowering, node: Call, of_integers: Op, of_reals: Op) -> Code:
-    """min() or max() of a list: it begins with the first element, and is refused if there is none."""
+    """Lower min() or max() of a list. It begins with the first element, and is refused if there is none."""
     of = stored(lowering, node.arguments[0])
     kind = of.element
     assert kind is not None  # noqa: S101 - a number
@@ -331,7 +324,7 @@ def extreme(lowering: Lowering, node: Call, of_integers: Op, of_reals: Op) -> Co
 
 
 def _folded(lowering: Lowering, values: Tree, step: Callable[[Code, Kind], Code]) -> Code:
-    """Add each element to what is on the stack. A computed list is not made for that."""
+    """Combine each element with the value on the stack. A computed list is not stored for that."""
     if isinstance(values, Each):
         each = values
     else:

@@ -44,7 +44,7 @@ def at(place: Place, *parts: Operation | Code) -> list[Placed]:
 
 
 def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:
-    """What leaves the number of elements on the stack: as many as the field takes."""
+    """Copy the lists to slots, and put their number of elements on the stack. It is checked against the field's type."""
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
@@ -56,14 +56,14 @@ def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:
 
 
 def _wanted(lowering: Lowering, limit: int, relation: Relation) -> Code:
-    """Refuse a number on the stack that is no such one."""
+    """Check the number on the stack."""
     slot = lowering.names.temporary()
     compared = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=relation)
     return code(keep(slot), integer(limit), compared, WANT, load(slot))
 
 
 def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
-    """A loop, as often as the number on the stack says. What takes the elements off their lists has its `place`."""
+    """Repeat `body` as often as the number on the stack says. `place` is that of the loop itself."""
     placed: list[Placed] = []
 
     def lowered() -> Code:

@@ -15,7 +15,7 @@ from router.compiler.expressions.kinds import (
     StringKind,
 )
 from router.compiler.expressions.tree import Relation as TreeRelation
-from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer, real
+from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer
 
 INT64 = -(1 << 63), (1 << 63) - 1
 
@@ -34,7 +34,7 @@ def bounds(kind: Kind) -> tuple[int, int]:
 
 
 def is_unsigned(kind: Kind) -> bool:
-    """Whether 64 bits are an unsigned integer: those beyond int64."""
+    """Whether the 64 bits of an integer are unsigned: those of a kind that goes beyond int64."""
     return bounds(kind)[1] > INT64[1]
 
 
@@ -46,16 +46,14 @@ def signs(result: Kind, *operands: Kind) -> int:
 
 
 def to_real(made: Code, kind: Kind) -> Code:
-    """A number as a real one."""
+    """Convert a number to a real one."""
     if isinstance(kind, FloatKind):
         return made
-    if len(made) == 1 and made[0].kind is Op.INTEGER:
-        return (real(bounds(kind)[0]),)
     return code(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 
 def coerced(made: Code, kind: Kind, to: Kind) -> Code:
-    """A value of one kind as one of another kind, which holds both it and others."""
+    """Convert a value to a kind that other values have as well."""
     if isinstance(to, FloatKind):
         return to_real(made, kind)
     if isinstance(to, IntKind) and not isinstance(kind, BoolKind):
@@ -64,7 +62,7 @@ def coerced(made: Code, kind: Kind, to: Kind) -> Code:
 
 
 def fitted(made: Code, kind: Kind, to: Kind) -> Code:
-    """An integer that is refused outside of the range of another kind."""
+    """Refuse an integer outside of the range of another kind."""
     (low, high), (least, most) = bounds(kind), bounds(to)
     if least <= low and high <= most:
         return made

@@ -247,6 +247,20 @@ def repeat(body: Code, *, keeps: bool = False) -> Code:
     return (Operation(Op.REPEAT, flag=keeps, size=len(body) + 1), *body, Operation(Op.AGAIN))
 
 
+def chained(op: Op, codes: Sequence[Code]) -> Code:
+    """Several truths, of which those behind a decision are not evaluated."""
+    left, made = sum(map(len, codes)) + len(codes) - 1, list[Operation]()
+    for each in codes[:-1]:
+        left -= len(each) + 1
+        made += *each, Operation(op, size=left)
+    return (*made, *codes[-1])
+
+
+def choice(test: Code, body: Code, orelse: Code) -> Code:
+    """One of two values; the other one is not evaluated."""
+    return code(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
+
+
 # ---- what is known of a program
 
 _GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
@@ -287,13 +301,12 @@ def depths(operations: Sequence[Operation]) -> Iterator[int]:
         yield depth
 
 
-def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> int:
-    """How deep loops, or messages that are written, nest."""
-    depth = deepest = 0
+def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> Iterator[int]:
+    """How many loops, or messages that are written, are open behind each operation."""
+    depth = 0
     for operation in operations:
         depth += (operation.kind is opens) - (operation.kind is closes)
-        deepest = max(deepest, depth)
-    return deepest
+        yield depth
 
 
 _BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.DIGITS})

@@ -38,7 +38,7 @@ _CLOSE = Operation(Op.CLOSE)
 
 
 def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase) -> list[Placed]:
-    """The operations that write the envelope of a payload, each with its place."""
+    """Return the operations that write the envelope of a payload, each with its place."""
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
     place = Place(plan.span, "")
     inside = _Writer(lowering).record(plan, descriptor, "")
@@ -156,7 +156,7 @@ def _packed(to: FieldDescriptor, inside: Iterable[Placed], place: Place) -> Iter
 
 
 def _lengthened(tag: int, inside: list[Placed], place: Place, *, is_always: bool) -> Iterator[Placed]:
-    """What has a length in front, which is known if all of it is."""
+    """Write tag and length in front. If all bytes behind them are known, these are known as well."""
     data = b"".join(operation.data for operation, _ in inside)
     if any(operation.kind is not Op.KNOWN for operation, _ in inside):
         yield Operation(Op.OPEN, flag=is_always, size=tag), place

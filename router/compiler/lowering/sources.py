@@ -1,4 +1,4 @@
-"""What the programs of one layout have in common: the message that they read, its slots and nodes, and their limits."""
+"""The programs that read one message: its slots and nodes, which they share, and how large they may be."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from router.compiler.expressions.tree import COUNT, INDEX, ITEM, MESSAGE, RECEIV
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
-from router.compiler.lowering.expressions import Lowering, chained
+from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.layout import (
     MOST_NODES_DEEP,
     Layout,
@@ -34,6 +34,7 @@ from router.compiler.lowering.operations import (
     Operation,
     Scalar,
     Slot,
+    chained,
     depths,
     most_executed,
     nesting,
@@ -44,8 +45,8 @@ from router.errors import SourceSpan
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
-MOST_CONDITION_OPERATIONS = 1 << 17
-"""Of all that a destination's `when` may execute for a datagram: less than a millisecond of the receive thread."""
+MOST_CONDITION_OPERATIONS = 1 << 18
+"""Operations that a destination's `when` may execute for a datagram, about a millisecond of the receive thread."""
 
 _MOST_SLOTS = NONE
 
@@ -66,7 +67,7 @@ class Message(NamedTuple):
 
 @dataclass
 class _Source:
-    """A message that programs read. `root` is its node."""
+    """A message that programs read into `root`. `topic` is where it comes from, empty if it is from UDP."""
 
     root: Node
     topic: str = ""
@@ -80,24 +81,23 @@ class _Source:
         self.variables |= {MESSAGE: self.root, RECEIVED_AT: given[0], SOURCE: given[1]}
 
     def lowering(self) -> Lowering:
-        """That of one target: what it names itself is its own."""
+        """Return the lowering of one target, which can have variables of its own."""
         return Lowering(Names(dict(self.variables), self.temporaries, self.elements))
 
     def condition(
         self, lowering: Lowering, conditions: Sequence[Tree | None], *, is_bounded: bool = False
     ) -> Condition:
-        """All of several conditions. `is_bounded`: it is evaluated in the receive thread."""
+        """Lower the conjunction of conditions. One that the receive thread evaluates `is_bounded`."""
         given = [each for each in conditions if each is not None]
         if not given:
             return Condition((), "")
         code = chained(Op.AND, [lowering.value(each) for each in given])
         _want_small([(operation, given[-1].span) for operation in code])
         if is_bounded and (most := most_executed(code)) > MOST_CONDITION_OPERATIONS:
-            message = (
-                f"this condition may take {most} operations for a message, and a destination's `when` at most "
-                f"{MOST_CONDITION_OPERATIONS}: a list counts with {MAX_DATAGRAM} elements"
-            )
-            raise TooLargeError(given[-1].span, message, "look into fewer lists, or into one only")
+            limit = f"and a destination's `when` takes at most {MOST_CONDITION_OPERATIONS:,}"
+            message = f"this could take {most:,} operations on the longest datagram, {limit}"
+            hint = f"a list counts with {MAX_DATAGRAM:,} elements: look into fewer lists, or fewer times"
+            raise TooLargeError(given[-1].span, message, hint)
         return Condition(code, ", or ".join(f"{each.span}: when" for each in given))
 
 
@@ -111,14 +111,14 @@ class Datagram(_Source):
         self._case, self._envelope = case.name, around
 
     def published(self, lowering: Lowering, plan: Record) -> Message:
-        """The ROS message of a topic."""
+        """Lower the ROS message of a topic."""
         return _message(cdr_message(lowering, plan))
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Of all programs that have been made. Raises TooLargeError for one that is too large."""
+        """Return the layout of all programs that have been made. Raises TooLargeError."""
         for node in (self.root, *self.elements):
             if (depth := node.depth()) >= MOST_NODES_DEEP:
-                message = f"this reads a field that is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
+                message = f"a field that is read is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
                 raise TooLargeError(span, message, "read what is less deep")
         made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
         _want_room(made, span)
@@ -132,18 +132,18 @@ class RosMessage(_Source):
         super().__init__(Node(declared, None), topic)
 
     def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> Message:
-        """The envelope for a destination."""
+        """Lower the envelope for a destination."""
         return _message(protobuf_message(lowering, plan, case))
 
     def stamp(self, node: Tree) -> tuple[Slot, Slot]:
-        """The slots of the seconds and nanoseconds of a field with a time."""
+        """Return the slots of the seconds and nanoseconds of a field with a time."""
         assert isinstance(node, Read)  # noqa: S101 - it is a field of the message
         _, moment = self.lowering().message(node)
         seconds, nanoseconds = moment.type.fields
         return moment.value(seconds), moment.value(nanoseconds)
 
     def for_each(self, node: Tree) -> Elements:
-        """The list of `for_each`. From now on, expressions can name `item`, `index` and `count`."""
+        """Lower the list of `for_each`. Expressions can use `item`, `index` and `count` from now on."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
         _want_small([(operation, node.span) for operation in of.code])
@@ -156,7 +156,7 @@ class RosMessage(_Source):
         return Elements(of.code, of.scalar, item, index, count)
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Of all programs that have been made. Raises TooLargeError for one that is too large."""
+        """Return the layout of all programs that have been made. Raises TooLargeError."""
         try:
             made = cdr_layout(self.temporaries, self.root, self.elements)
         except TooManyListsError as error:
@@ -167,7 +167,7 @@ class RosMessage(_Source):
 
 @dataclass(frozen=True)
 class Elements:
-    """A list on the stack, how it is stored, and what becomes of each element."""
+    """A list that `code` puts on the stack, stored as `scalar` says, and where each element goes."""
 
     code: Code
     scalar: Scalar
@@ -185,19 +185,18 @@ def _message(placed: Sequence[Placed]) -> Message:
 
 
 def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
-    """Raise TooLargeError for what is deeper than a program can be."""
+    """Raise TooLargeError for what nests deeper than a program can."""
     operations = [operation for operation, _ in placed]
-    for (_, span), depth in zip(placed, depths(operations), strict=True):
-        if depth > MOST_STACKED:
-            message = f"this holds more than {MOST_STACKED} values at a time"
-            raise TooLargeError(span, message, "write it with fewer brackets in brackets")
-    loops = nesting(operations, Op.REPEAT, Op.AGAIN)
-    if loops > MOST_LOOPS:
-        message = f"this goes through {loops} lists within each other, and at most {MOST_LOOPS} are"
-        raise TooLargeError(placed[0][1], message, "fill a message with fewer lists in lists")
-    if (opened := nesting(operations, Op.OPEN, Op.CLOSE)) > MOST_OPEN:
-        message = f"this writes {opened} messages within each other, and at most {MOST_OPEN} are"
-        raise TooLargeError(placed[0][1], message, "fill a message with fewer messages in messages")
+    loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
+    limits = (
+        (depths(operations), MOST_STACKED, "values are held here at a time", "use fewer brackets in brackets"),
+        (loops, MOST_LOOPS, "lists are gone through within each other here", "fill fewer lists in lists"),
+        (opened, MOST_OPEN, "messages are written within each other here", "fill fewer messages in messages"),
+    )
+    for counts, most, what, hint in limits:
+        for (_, span), count in zip(placed, counts, strict=True):
+            if count > most:
+                raise TooLargeError(span, f"more than {most} {what}", hint)
 
 
 def _want_room(layout: Layout, span: SourceSpan) -> None:
