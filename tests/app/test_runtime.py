@@ -358,6 +358,20 @@ def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program
     assert [(line["reason"], line["detail"]) for line in lines] == [("mapping_error", place)]
 
 
+def test_the_place_of_a_condition_of_a_destination_is_told(site: Site) -> None:
+    table = ROUTE.replace(
+        "destinations: [basestation]", "destinations: [{endpoint: basestation, when: 1 / temperature > 0}]"
+    )
+    with capture_logs() as logged, Router(site.program(table)) as router:
+        if not isinstance(router._runtime.datapath, NativeDatapath):
+            pytest.skip("of the carrier")
+        site.send(NAN_PH)
+        wait_until(lambda: router.totals()["messages_dropped"] == 1)
+    (line,) = [entry for entry in logged if entry["event"] == "message dropped"]
+    assert (line["reason"], line["target"]) == ("mapping_error", "basestation")
+    assert str(line["detail"]).endswith(": when")
+
+
 def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) -> None:
     with capture_logs() as logged, Router(site.program(ROUTE)):
         pass

@@ -21,4 +21,6 @@ def test_the_same_datagrams_have_the_same_outcome(count: int, publishes: bool, t
     assert fates["datagrams_sent", "manual_drive", "driving_board"]
     assert fates["datagrams_sent", "gps_info", "paced"]
     assert fates["messages_published", "imu_info_from_sensor_board", "accel"]
+    assert fates["messages_filtered", "imu_info_from_sensor_board", "basestation"]
+    assert fates["messages_dropped", "imu_info_from_sensor_board", "basestation", "mapping_error"]
     assert fates["deadman_trips", "manual_drive"]

@@ -54,14 +54,20 @@ _BRAKE = "timeout: 300ms, send: {manual_brake: {brake: true}}"
 WHOLE = f"""\
   imu_info:
     - source: sensor_board
-      destinations: [basestation, {{endpoint: refused, max_rate: 20 Hz}}, arm_board]
+      destinations:
+        - {{endpoint: basestation, when: 1 / accel_y > accel_x or accel_z > 1}}
+        - {{endpoint: refused, max_rate: 20 Hz, when: source == "sensor_board"}}
+        - arm_board
       topics:
         - {{topic: accel, {_FLOAT}accel_x}}, max_rate: 15 Hz}}
         - {{topic: inverse, {_FLOAT}"1 / accel_y"}}, when: accel_x < 5}}
         - {{topic: unwanted, {_FLOAT}accel_z}}}}
       ttl: 200ms
     - source: [left_tool, right_tool, picky]
-      destinations: [recorder, {{endpoint: paced, when: accel_x > 1}}, driving_board]
+      destinations:
+        - recorder
+        - {{endpoint: paced, when: accel_x > 1}}
+        - {{endpoint: driving_board, when: source == "left_tool"}}
       topics: [{{topic: of_tools, {_FLOAT}accel_x}}}}]
   gps_info:
     source: any
@@ -76,7 +82,7 @@ WHOLE = f"""\
   arm_diag: {{ignore: nobody wants it}}
   manual_drive:
     source: [basestation, left_tool]
-    destinations: [driving_board, recorder]
+    destinations: [{{endpoint: driving_board, when: turn != 0 or forward_backward > -5}}, recorder]
     ttl: 200ms
     deadman: {{{_BRAKE}, to: [driving_board, recorder], repeat: 70ms, disarmed_by: [manual_arm]}}
   manual_arm:

@@ -15,7 +15,7 @@
 /* Holds every integer of either sign, and their sums and differences. */
 __extension__ typedef __int128 wide;
 
-/* An operand; `sign` is its flag. Where no flag is set, all operands are int64, and most operations have a shorter way. */
+/* An operand; `sign` is its flag. Without any flag all operands are int64, for which most operations have a fast path. */
 static inline wide widened(const struct value *operand, unsigned flags, enum sign sign) {
     return flags & sign ? (wide)operand->bits : (wide)operand->integer;
 }
@@ -74,7 +74,7 @@ static inline bool modulo(struct value *a, const struct value *b, unsigned flags
     return divisor && narrow(a, remainder_of(dividend, divisor), flags);
 }
 
-/* Of two or three, the result is one that is there already: its bits are right for either sign. */
+/* For the operations whose result is one of their operands: its bits need no conversion. */
 static inline bool is_less(const struct value *a, const struct value *b, unsigned flags) {
     if (!flags) return a->integer < b->integer;
     return widened(a, flags, FIRST_UNSIGNED) < widened(b, flags, SECOND_UNSIGNED);

@@ -22,28 +22,27 @@ struct delivery {
 
 static void count(const struct delivery *of, uint32_t which) { counter_add(of->stage->counters, which, 1); }
 
-/* Count and report a loss, with an errno or a text that says more. Returns false. */
-static bool lose_because(const struct delivery *of, enum loss reason, int error, const char *text) {
-    struct lost_event lost = {.route = of->to->route, .topic = of->to->topic, .target = of->target->id, .reason = reason,
-                              .error = error, .counter = of->target->dropped[reason]};
+/* Count and report a loss, of which `lost` says the reason and what else is known. Returns false. */
+static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
+    lost.route = of->to->route;
+    lost.topic = of->to->topic;
+    lost.target = of->target->id;
+    lost.counter = of->target->dropped[lost.reason];
     count(of, lost.counter);
     report_loss(&of->stage->reporter, of->message->now, &lost, text);
     return false;
 }
 
-/* Count a message that is older than `ttl`. Of commands, a stall brings many at once: they are not reported. */
-static bool lose_stale(const struct delivery *of) {
-    if (of->target->topic) return lose_because(of, LOSS_STALE, 0, "");
-    count(of, of->target->dropped[LOSS_STALE]);
-    return false;
+/* A place in the table refuses the message. */
+static bool refuse(const struct delivery *of, int reason, uint32_t place) {
+    uint32_t generation = of->to->generation;
+    return lose(of, (struct lost_event){.reason = (uint32_t)reason, .generation = generation, .place = place}, "");
 }
 
-/* As `lose_because`, for a message that a place in the table refuses. */
-static bool refuse(const struct delivery *of, enum loss reason, uint32_t place) {
-    struct lost_event lost = {.route = of->to->route, .topic = of->to->topic, .target = of->target->id, .reason = reason,
-                              .counter = of->target->dropped[reason], .generation = of->to->generation, .place = place};
-    count(of, lost.counter);
-    report_loss(&of->stage->reporter, of->message->now, &lost, "");
+/* The message is older than `ttl`. Of commands, a stall brings many at once: they are counted, and not reported. */
+static bool lose_stale(const struct delivery *of) {
+    if (of->target->topic) return lose(of, (struct lost_event){.reason = LOSS_STALE}, "");
+    count(of, of->target->dropped[LOSS_STALE]);
     return false;
 }
 
@@ -66,7 +65,7 @@ static bool is_readable(const struct delivery *of) {
         message->outcome = is_well_formed ? EVALUATED : LOSS_MAPPING_ERROR;
         message->is_read = true;
     }
-    return message->outcome == EVALUATED || refuse(of, (enum loss)message->outcome, message->place);
+    return message->outcome == EVALUATED || refuse(of, message->outcome, message->place);
 }
 
 /* ---- the steps: each returns whether the message goes on; else it is counted ---- */
@@ -82,7 +81,7 @@ static bool meets_condition(const struct delivery *of) {
     bool is_true;
     uint32_t at;
     int outcome = evaluate_condition(&of->stage->machine, &of->target->condition, &is_true, &at);
-    if (outcome != EVALUATED) return refuse(of, (enum loss)outcome, PLACE_CONDITION);
+    if (outcome != EVALUATED) return refuse(of, outcome, PLACE_CONDITION);
     if (!is_true) count(of, of->target->filtered);
     return is_true;
 }
@@ -106,7 +105,7 @@ static bool keeps_rate(const struct delivery *of) {
 static bool is_written(struct delivery *of) {
     uint32_t at;
     int outcome = evaluate_message(&of->stage->machine, &of->target->message, &at);
-    if (outcome != EVALUATED) return refuse(of, (enum loss)outcome, PLACE_OPERATIONS + at);
+    if (outcome != EVALUATED) return refuse(of, outcome, PLACE_OPERATIONS + at);
     of->data = of->stage->machine.output.data;
     of->size = of->stage->machine.output.size;
     return true;
@@ -115,7 +114,7 @@ static bool is_written(struct delivery *of) {
 static bool fits_board(const struct delivery *of) {
     struct board_refusal refusal;
     if (!of->target->board || board_takes(of->target->board, of->data, of->size, &refusal)) return true;
-    return lose_because(of, refusal.reason, 0, refusal.text);
+    return lose(of, (struct lost_event){.reason = refusal.reason}, refusal.text);
 }
 
 /* ---- the last step ---- */
@@ -139,7 +138,7 @@ static void send_it(const struct delivery *of) {
     if (error == COMMAND_STALE) {
         lose_stale(of);
     } else if (error) {
-        lose_because(of, loss_of(error), error, "");
+        lose(of, (struct lost_event){.reason = loss_of(error), .error = error}, "");
     } else {
         count(of, target->delivered);
         counter_add(of->stage->counters, target->delivered_bytes, (int64_t)size);
@@ -151,7 +150,7 @@ static bool publish_it(const struct delivery *of) {
     const char *why;
     switch (of->stage->publish(of->stage, of->target, &why)) {
     case PUBLISHED: count(of, of->target->delivered); return true;
-    case PUBLISH_FAILED: lose_because(of, LOSS_PUBLISH_ERROR, 0, why); return true;
+    case PUBLISH_FAILED: lose(of, (struct lost_event){.reason = LOSS_PUBLISH_ERROR}, why); return true;
     default: return false;
     }
 }

@@ -1,5 +1,5 @@
-/* Lists: either as many scalars in a row as CDR has them, which stay where they are in the message, or cells, each of
- * which knows the next. What is read of protobuf and what programs compute is in cells. */
+/* A list is stored in one of two ways: as scalars in a row, as CDR has them, which stay in the message; or as a chain of
+ * cells. What is read from protobuf, and what programs compute, is in cells. */
 #ifndef LISTS_H
 #define LISTS_H
 
@@ -42,7 +42,7 @@ static inline bool has_cell(struct machine *machine) {
     return true;
 }
 
-/* Add an element to a list in cells. Return false if there are too many. */
+/* Add an element to a list in cells. Return false if the cells are used up. */
 static inline bool list_add(struct machine *machine, struct value *list, struct value element) {
     if (!has_cell(machine)) return false;
     uint32_t index = machine->cell_count++;

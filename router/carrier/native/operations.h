@@ -1,9 +1,10 @@
-/* The one program format, for all directions: a layout says what a reader puts into slots (read_protobuf.h, read_cdr.h),
- * operations compute with them on a stack (evaluate.h), and the last ones write a message (write_cdr.h, write_protobuf.h).
- * router/compiler/lowering makes programs of checked expressions.
+/* The program format, the same for every direction. A layout says which fields a reader puts into which slots
+ * (read_protobuf.h, read_cdr.h). Operations compute with slots on a stack (evaluate.h); some of them write a message
+ * (write_cdr.h, write_protobuf.h). router/compiler/lowering makes programs of checked expressions.
  *
- * The compiler knows the type of each value and the range of each integer. An integer has 64 bits, signed or unsigned;
- * where a result may not fit, an operation checks it. An operation that has no result refuses the message. */
+ * Values carry no type: the compiler knows the type of each one, and the range of each integer. Integers have 64 bits,
+ * signed or unsigned. Where a result may not fit, an operation checks it. An operation without a result refuses the
+ * message. */
 #ifndef OPERATIONS_H
 #define OPERATIONS_H
 
@@ -60,16 +61,17 @@ enum scalar {
 
 /* ---- operations ---- */
 
+/* Operands come from the stack, and the result replaces them there. "Refuses" means that the message is dropped. */
 enum operation_kind {
     /* Values: */
-    OP_INTEGER, /* `integer` */
-    OP_REAL,    /* `real` */
-    OP_TEXT,    /* `size` bytes of the literals, from `integer` */
-    OP_LOAD,    /* of `slot` */
-    OP_KEEP,    /* to `slot`; it stays on the stack */
-    OP_DROP,
-    /* Integers. `flag`: enum sign, of the operands and of the result. The plain ones are exact modulo 2^64 and for
-     * results that fit; the CHECKED ones refuse a result that does not: */
+    OP_INTEGER, /* pushes `integer` */
+    OP_REAL,    /* pushes `real` */
+    OP_TEXT,    /* pushes `size` bytes of the literals, from `integer` */
+    OP_LOAD,    /* pushes the value in `slot` */
+    OP_KEEP,    /* copies the top value to `slot` */
+    OP_DROP,    /* pops a value */
+    /* Integers. `flag` (enum sign) says which operands are unsigned, and whether the result is. The plain operations wrap
+     * around at 2^64, and are for results that always fit. The CHECKED ones, and division, refuse a result that does not: */
     OP_ADD,
     OP_SUBTRACT,
     OP_MULTIPLY,
@@ -78,88 +80,88 @@ enum operation_kind {
     OP_CHECKED_MULTIPLY,
     OP_CHECKED_NEGATE,
     OP_NEGATE,
-    OP_ABSOLUTE, /* of a signed one: at most 2^63, as unsigned */
-    OP_DIVIDE,   /* downwards; by zero, or a result that does not fit: refused */
-    OP_MODULO,   /* with the divisor's sign; likewise */
-    OP_LEAST,    /* of two */
-    OP_GREATEST,
-    OP_CLAMP, /* the first of three between the others */
-    OP_FIT,   /* likewise, but refuses what is outside */
-    OP_WRAP,  /* likewise, but counts on from the low bound; refused if that is above the high one */
+    OP_ABSOLUTE, /* of a signed integer; the result may be 2^63, and is unsigned then */
+    OP_DIVIDE,   /* rounds down; refuses the divisor 0 */
+    OP_MODULO,   /* has the sign of the divisor; refuses the divisor 0 */
+    OP_LEAST,    /* the smaller one of two */
+    OP_GREATEST, /* the larger one of two */
+    OP_CLAMP,    /* x, low, high: the bound that x is beyond, else x */
+    OP_FIT,      /* x, low, high: refuses an x beyond the bounds */
+    OP_WRAP,     /* x, low, high: x, moved between the bounds by multiples of their distance; refuses low > high */
     /* Real numbers: */
     OP_REAL_ADD,
     OP_REAL_SUBTRACT,
     OP_REAL_MULTIPLY,
-    OP_REAL_DIVIDE, /* by zero: refused, as the next two */
-    OP_REAL_FLOOR_DIVIDE,
-    OP_REAL_MODULO,
-    OP_REAL_POWER,
+    OP_REAL_DIVIDE,       /* refuses the divisor 0 */
+    OP_REAL_FLOOR_DIVIDE, /* likewise */
+    OP_REAL_MODULO,       /* likewise */
+    OP_REAL_POWER,        /* refuses, as the functions below, if there is no result or finite operands give infinity */
     OP_REAL_NEGATE,
     OP_REAL_ABSOLUTE,
     OP_REAL_LEAST,
     OP_REAL_GREATEST,
     OP_REAL_CLAMP,
-    OP_SQRT, /* these refuse numbers without a result, and what is finite but for its result */
+    OP_SQRT,
     OP_SIN,
     OP_COS,
     OP_TAN,
     OP_ATAN2,
     OP_HYPOT,
-    OP_FLOAT32, /* refuses a finite number that is infinite as a float32 */
+    OP_FLOAT32, /* refuses a finite number that is infinite as a float32; the number stays a double */
     /* From one to the other: */
-    OP_INTEGER_TO_REAL, /* `flag`: of an unsigned one */
-    OP_ROUND, /* to the even one of two; these four give a signed integer, and refuse a number that has none: as
-                 LOSS_NON_FINITE if it is NaN or infinite */
+    OP_INTEGER_TO_REAL, /* `flag` 1: the integer is unsigned */
+    OP_ROUND,           /* a tie goes to the even integer. These four give a signed integer. They refuse NaN and infinity as
+                           LOSS_NON_FINITE, and what is beyond 64 bits as LOSS_MAPPING_ERROR */
     OP_TRUNCATE,
     OP_FLOOR,
     OP_CEIL,
-    /* Truth: */
-    OP_COMPARE, /* by `flag`, an enum relation, and `slot`, an enum compared */
+    /* Truth is the integer 0 or 1: */
+    OP_COMPARE, /* `flag` is the enum relation, `slot` the enum compared */
     OP_NOT,
-    OP_JUMP,   /* over `size` operations */
-    OP_UNLESS, /* likewise, if it is false */
-    OP_AND,    /* likewise, and leave it there; else drop it */
-    OP_OR,     /* if it is true */
-    OP_EITHER, /* of two, both evaluated */
-    OP_WANT,   /* take it off, and refuse what is false */
+    OP_JUMP,   /* skips the next `size` operations */
+    OP_UNLESS, /* pops a truth, and skips `size` operations if it is false */
+    OP_AND,    /* skips `size` operations if the top is false, else pops it */
+    OP_OR,     /* skips `size` operations if the top is true, else pops it */
+    OP_EITHER, /* `or` of two that are both evaluated */
+    OP_WANT,   /* pops a truth, and refuses if it is false */
     /* Text and bytes: */
     OP_JOIN,
-    OP_DECIMAL,    /* an integer as text; `flag`: an unsigned one */
-    OP_DIGITS,     /* a real number as text with `slot` decimals: "nan", "inf" and "-inf" where it is not finite */
-    OP_CHARACTERS, /* how many there are in UTF-8 */
-    OP_SIZE,       /* in bytes; of a list its elements */
+    OP_DECIMAL,    /* an integer as text; `flag` 1: it is unsigned */
+    OP_DIGITS,     /* a real number as text with `slot` decimals, or as "nan", "inf" or "-inf" */
+    OP_CHARACTERS, /* the number of characters in UTF-8 */
+    OP_SIZE,       /* the number of bytes; of a list, its elements */
     OP_FIT_SIZE,   /* refuses more than `integer` bytes */
-    OP_UTF8,       /* refuses what is none */
-    OP_OCTETS,     /* a list (`flag`: how it is stored) of integers as bytes; refuses those outside of 0 to 255 */
-    OP_MEMBER,     /* refuses an integer that is none of `size` int32 of the literals, from `integer`, ascending */
-    /* Lists. `flag`: how they are stored, an enum scalar: */
-    OP_ELEMENT, /* element `integer` of a list; refused if there is none */
-    OP_ENTER,   /* read the message on the stack into node `slot` */
-    OP_REPEAT,  /* the next `size` operations, the last of which is its OP_AGAIN, as often as the integer on the stack
-                   says. `flag`: cells and text that they take are kept; else they are free again behind each time */
+    OP_UTF8,       /* refuses what is not UTF-8 */
+    OP_OCTETS,     /* a list of integers, stored as `flag` says, as bytes; refuses integers beyond 0 to 255 */
+    OP_MEMBER,     /* refuses an integer that is none of `size` int32 in the literals, which ascend from `integer` on */
+    /* Lists. `flag` (enum scalar) says how a list is stored: */
+    OP_ELEMENT, /* the element with the index `integer`; refuses a list that has none */
+    OP_ENTER,   /* pops a message, and reads it into node `slot` */
+    OP_REPEAT,  /* pops an integer, and repeats the next `size` operations so many times; the last of them is its OP_AGAIN.
+                   `flag` 1: cells and text that they take are kept, else each turn frees what it has taken */
     OP_AGAIN,
-    OP_NEXT,   /* take the first element off the list in `slot` */
-    OP_LIST,   /* the `size` values on the stack as a list in cells */
-    OP_UNPACK, /* a list that is stored otherwise, in cells */
-    OP_APPEND, /* to the list in cells in `slot` */
-    /* A message, from its first byte on; of CDR that is its header, the first of its known bytes: */
-    OP_KNOWN, /* `size` bytes of the literals, from `integer`, aligned to `slot`; in protobuf, 1 */
-    /* A message in CDR. Alignment counts from behind the header: */
-    OP_PUT,   /* the lowest `slot` bytes of an integer, aligned to their number */
-    OP_PUT_FLOAT, /* refuses what is too large */
+    OP_NEXT,   /* removes the first element from the list in `slot`, and pushes it */
+    OP_LIST,   /* pops `size` values, and pushes a list of them in cells */
+    OP_UNPACK, /* a list that is stored as scalars, in cells */
+    OP_APPEND, /* pops a value, and adds it to the list in cells in `slot` */
+    /* A message, from its first byte on. In CDR the known bytes begin with the header: */
+    OP_KNOWN, /* writes `size` bytes of the literals, from `integer`, aligned to `slot`, which is 1 in protobuf */
+    /* A message in CDR. Alignment counts from behind the header. Each pops a value: */
+    OP_PUT,        /* writes the lowest `slot` bytes of an integer, aligned to their number */
+    OP_PUT_FLOAT,  /* refuses a finite number that is infinite as a float32 */
     OP_PUT_DOUBLE,
-    OP_PUT_TEXT,  /* refuses a NUL in it */
-    OP_PUT_BYTES, /* without their number */
-    /* A message in protobuf. `size`: the tag, field number << 3 | wire type, or 0 for none, as of a packed element. Zero
-     * and the empty string are written if `flag` is 1: */
-    OP_OPEN, /* a message, or packed elements: what follows up to its OP_CLOSE has tag and length in front. `flag` 0: left
-                out if it is empty, as packed elements are */
+    OP_PUT_TEXT,   /* refuses text with a NUL */
+    OP_PUT_BYTES,  /* without their number in front */
+    /* A message in protobuf. `size` is the tag, field number << 3 | wire type, or 0 for none, as of packed elements. Each
+     * OP_WRITE pops a value, and writes zero and the empty string only if `flag` is 1: */
+    OP_OPEN, /* what follows, up to its OP_CLOSE, gets tag and length in front: a message, or packed elements. `flag` 0: it
+                is left out if it is empty */
     OP_CLOSE,
     OP_WRITE_VARINT,
     OP_WRITE_ZIGZAG,
     OP_WRITE_FIXED32,
     OP_WRITE_FIXED64,
-    OP_WRITE_FLOAT, /* refuses what is too large */
+    OP_WRITE_FLOAT, /* refuses a finite number that is infinite as a float32 */
     OP_WRITE_DOUBLE,
     OP_WRITE_BYTES /* and text */
 };
@@ -237,16 +239,16 @@ struct closed_enum {
 };
 
 enum read_kind {
-    READ_SCALAR,   /* `type`, into `slot` */
-    READ_SKIP,     /* `count` scalars of `size` bytes, which is also their alignment */
-    READ_ARRAY,    /* `count` scalars of `size` bytes: a list of them, into `slot`, which is never NONE */
-    READ_SEQUENCE, /* likewise, but a length says how many; NONE: skipped */
-    READ_TEXT,     /* a length, which counts the final NUL, and the bytes; into `slot` without the NUL, or NONE */
-    READ_EACH,     /* what follows, up to its READ_AGAIN, `count` times. `slot`: a list in cells that gets each beginning,
-                      with all bytes up to the end of the message, or NONE */
-    READ_EACH_SEQUENCE, /* likewise, but a length says how often */
+    READ_SCALAR,        /* of `type`, into `slot` */
+    READ_SKIP,          /* steps over `count` scalars of `size` bytes, which is also their alignment */
+    READ_ARRAY,         /* `count` scalars of `size` bytes: a list of them into `slot`, which is never NONE */
+    READ_SEQUENCE,      /* likewise, but the number of scalars comes first; NONE: steps over them */
+    READ_TEXT,          /* the number of bytes with the final NUL, then the bytes; into `slot` without the NUL, or NONE */
+    READ_EACH,          /* repeats the next steps, up to its READ_AGAIN, `count` times. `slot`: a list in cells that gets the
+                           place where each element begins, or NONE */
+    READ_EACH_SEQUENCE, /* likewise, but the number of elements comes first */
     READ_AGAIN,
-    READ_TEXTS /* as READ_TEXT, but the text is added to the list in cells in `slot`, which is never NONE */
+    READ_TEXTS /* as READ_TEXT, but adds the text to the list in cells in `slot`, which is never NONE */
 };
 
 /* A step through a message in CDR. */

@@ -1,4 +1,4 @@
-/* A message that is being written: it grows as its bytes come. */
+/* A buffer for the message that is being written, which grows as needed. */
 #ifndef OUTPUT_H
 #define OUTPUT_H
 

@@ -6,7 +6,7 @@
 
 enum { HEADER = 4 };
 
-/* The message that is read. `at` is at most `size`, unless alignment led behind the end; nothing is read there. */
+/* The message that is read, and the offset of what comes next. */
 struct reader {
     const uint8_t *message;
     size_t size, at;
@@ -19,7 +19,8 @@ struct repetition {
     uint16_t list;                      /* slot that gets the beginning of each element, or NONE */
 };
 
-/* Step over `count` scalars of `size` bytes, the first of which is at `start`. Return false if the message ends before. */
+/* Step over `count` scalars of `size` bytes; `start` gets the place of the first one. Return false if the message ends
+ * before. */
 static bool skip_scalars(struct reader *reader, uint32_t count, unsigned size, const uint8_t **start) {
     if (count) reader->at += (HEADER - reader->at) & (size - 1); /* sizes are powers of two */
     if (reader->at > reader->size || count > (reader->size - reader->at) / size) return false;

@@ -1,5 +1,5 @@
-/* Text that programs put together. It is in the machine's text buffer, where it stays until its program ends, or the
- * turn of a loop that has taken it. Functions return false where there is no room. */
+/* Text that programs make. It is in the machine's text buffer until the program ends, or the turn of the loop that made
+ * it. Functions return false if the buffer is full. */
 #ifndef TEXTS_H
 #define TEXTS_H
 
@@ -46,8 +46,8 @@ static inline bool to_decimal(struct machine *machine, struct value *number, boo
     return join(machine, number, &text);
 }
 
-/* glibc's printf rounds correctly, and takes no memory for a double. The decimal point is that of the process's locale:
- * what stands in front of it and behind it is taken, and joined with a point. */
+/* printf of glibc rounds correctly, and allocates nothing for a double. But its decimal point is that of the process's
+ * locale: the digits on both sides are moved together, with a point between them. */
 static inline bool to_digits(struct machine *machine, struct value *number, uint16_t decimals) {
     char printed[384]; /* -, 309 digits, a point of at most 16 bytes, 17 decimals */
     if (!isfinite(number->real)) {

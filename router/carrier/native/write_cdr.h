@@ -1,5 +1,6 @@
-/* Writes a serialized ROS message, in plain CDR (read_cdr.h has the format). Each returns false for lack of memory, or for
- * a value that CDR cannot hold. Small, and inline in what runs programs. */
+/* Writes a serialized ROS message in plain CDR (read_cdr.h describes the format). Functions return false for lack of
+ * memory, or for a value that CDR cannot hold. They are inline because the machine calls them for each field
+ * (evaluate.c). */
 #ifndef WRITE_CDR_H
 #define WRITE_CDR_H
 

@@ -1,6 +1,6 @@
-/* Writes a protobuf message, from its first byte to its last. The length of a message within it is known only at its end:
- * one byte is left for it, and what follows is moved on where the length takes more. Each function returns false for lack
- * of memory. Small, and inline in what runs programs. */
+/* Writes a protobuf message from its first byte to its last. The length of an inner message is known only at its end: one
+ * byte is reserved for it, and the inner message is moved if its length needs more. Functions return false for lack of
+ * memory. They are inline because the machine calls them for each field (evaluate.c). */
 #ifndef WRITE_PROTOBUF_H
 #define WRITE_PROTOBUF_H
 
@@ -53,10 +53,10 @@ static inline bool write_bytes(struct output *output, uint32_t tag, const struct
     return true;
 }
 
-/* A message within, or packed elements, from its tag on. */
+/* An inner message or packed elements, while they are written. */
 struct opened {
-    size_t tag, content; /* where these begin */
-    bool is_kept;        /* also if it is empty */
+    size_t tag, content; /* where these begin in the output */
+    bool is_kept;        /* written even if it is empty */
 };
 
 static inline bool write_open(struct output *output, uint32_t tag, bool is_kept, struct opened *opened) {
@@ -74,7 +74,7 @@ static inline bool write_close(struct output *output, const struct opened *opene
         return true;
     }
     uint8_t length[LONGEST_VARINT];
-    size_t more = (size_t)(store_varint(length, size) - length) - 1; /* bytes of the length than were left for it */
+    size_t more = (size_t)(store_varint(length, size) - length) - 1; /* bytes of the length than were reserved */
     if (!has_room(output, more)) return false;
     uint8_t *content = output->data + opened->content;
     if (more) memmove(content + more, content, size);
