@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from enum import IntFlag
 
 from router.carrier import structures as c
-from router.carrier.schema import KINDS, CannotCarry, WireKind
+from router.carrier.schema import CannotCarry, WireKind, wire_kind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 
 _MOST_COUNTERS = 4096
@@ -86,7 +86,7 @@ class _Tree:
             flags |= _Flag.HAS_FIXED_COUNT
         return c.BoardField(
             number=number,
-            kind=WireKind.BYTES if field.longest is not None else KINDS[field.descriptor.type],
+            kind=WireKind.BYTES if field.longest is not None else wire_kind(field.descriptor),
             flags=flags,
             message=self._add(field.message) if field.message is not None else 0,
             longest=field.longest or 0,

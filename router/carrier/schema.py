@@ -12,7 +12,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router.carrier.structures import Schema, WireField, WireType
 from router.types.descriptors import container, message_of
 from router.types.protobuf import Envelope
-from router.types.wire import delimited, parses, validates_text
+from router.types.wire import I32, I64, VARINT, delimited, parses, validates_text, wire_type_of
 
 _MOST_TYPES = 65536
 
@@ -54,26 +54,18 @@ class WireSchema:
         return ctypes.addressof(self.schema)
 
 
-KINDS: Mapping[int, WireKind] = {
-    FieldDescriptor.TYPE_BOOL: WireKind.VARINT,
-    FieldDescriptor.TYPE_ENUM: WireKind.VARINT,
-    FieldDescriptor.TYPE_INT32: WireKind.VARINT,
-    FieldDescriptor.TYPE_INT64: WireKind.VARINT,
-    FieldDescriptor.TYPE_SINT32: WireKind.VARINT,
-    FieldDescriptor.TYPE_SINT64: WireKind.VARINT,
-    FieldDescriptor.TYPE_UINT32: WireKind.VARINT,
-    FieldDescriptor.TYPE_UINT64: WireKind.VARINT,
-    FieldDescriptor.TYPE_DOUBLE: WireKind.I64,
-    FieldDescriptor.TYPE_FIXED64: WireKind.I64,
-    FieldDescriptor.TYPE_SFIXED64: WireKind.I64,
-    FieldDescriptor.TYPE_FLOAT: WireKind.I32,
-    FieldDescriptor.TYPE_FIXED32: WireKind.I32,
-    FieldDescriptor.TYPE_SFIXED32: WireKind.I32,
+def wire_kind(field: FieldDescriptor) -> WireKind:
+    """How a field is encoded, of a repeated one an element by itself."""
+    return _BY_TYPE.get(field.type) or _BY_WIRE_TYPE[wire_type_of(field)]
+
+
+_BY_TYPE: Mapping[int, WireKind] = {
     FieldDescriptor.TYPE_BYTES: WireKind.BYTES,
     FieldDescriptor.TYPE_STRING: WireKind.STRING,
     FieldDescriptor.TYPE_MESSAGE: WireKind.MESSAGE,
     FieldDescriptor.TYPE_GROUP: WireKind.GROUP,
 }
+_BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.I64, I32: WireKind.I32}
 
 
 def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
@@ -157,4 +149,4 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
 def _kind(field: FieldDescriptor) -> WireKind:
     if field.type == FieldDescriptor.TYPE_STRING and not validates_text(field):
         return WireKind.BYTES  # what is no UTF-8 is accepted; that depends on syntax and features
-    return KINDS[field.type]
+    return wire_kind(field)

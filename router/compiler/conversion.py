@@ -16,6 +16,7 @@ from router.compiler.expressions.kinds import (
     INT32,
     INT64,
     OCTET,
+    STAMP_TYPES,
     BoolKind,
     BytesKind,
     EnumKind,
@@ -26,7 +27,8 @@ from router.compiler.expressions.kinds import (
     MessageKind,
     StringKind,
     TimeKind,
-    kind_of,
+    element_of,
+    length_of,
 )
 from router.compiler.expressions.lists import fitted
 from router.compiler.expressions.scope import field_of, want_readable
@@ -35,9 +37,6 @@ from router.compiler.expressions.tree import Each as Computed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-
-_TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
-"""Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
 
 _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 """Up to this many bits every integer is exactly a float of that width."""
@@ -71,14 +70,14 @@ def unset(member: Field, span: SourceSpan) -> Unset:
 
 
 def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
-    if isinstance(value.kind, TimeKind) and target.name in _TIMES:
+    if isinstance(value.kind, TimeKind) and target.name in STAMP_TYPES:
         return _to_time(value, target)
     if isinstance(value.kind, MessageKind):
         return _to_same_named(value, value.kind.type, target, scope)
     if len(target.fields) == 1:
         (only,) = target.fields
         return Record(target, ((only, convert(value, only.type, scope)),), value.span)
-    if isinstance(value.kind, (IntKind, FloatKind)) and target.name in _TIMES:
+    if isinstance(value.kind, (IntKind, FloatKind)) and target.name in STAMP_TYPES:
         raise mismatch(value, target, "time_from_milliseconds(x) and time_from_seconds(x) make a time of a number")
     raise mismatch(value, target, "map its fields one by one")
 
@@ -114,7 +113,7 @@ def _to_list(value: Node, target: List, scope: Scope) -> Plan:
     if isinstance(value, Listed):
         _want_length(value, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
-    element_kind, length = _elements(value.kind)
+    element_kind, length = element_of(value.kind), length_of(value.kind)
     if element_kind is None:
         raise mismatch(value, target, "write a list, [a, b]")
     if length is not None:
@@ -123,13 +122,6 @@ def _to_list(value: Node, target: List, scope: Scope) -> Plan:
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
     element = Variable(element_kind, value.span, scope.element_variable())
     return Each(target, ((element.name, value),), convert(element, target.element, scope), value.span)
-
-
-def _elements(kind: Kind) -> tuple[Kind | None, int | None]:
-    """The kind and number of a list's elements, each None where there is none or it is not known."""
-    if isinstance(kind, BytesKind):
-        return kind_of(OCTET), None
-    return (kind.element, kind.length) if isinstance(kind, ListKind) else (None, None)
 
 
 def _want_length(value: Node, target: List, length: int) -> None:

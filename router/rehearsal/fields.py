@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Union
 from google.protobuf.message import Message
 
 from router.compiler.expressions.functions import NS_PER_SECOND
+from router.compiler.expressions.kinds import STAMP_TYPES
 from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
@@ -25,7 +26,6 @@ from router.values import parse, scalar_text
 
 ANY = "any"
 RECEIVED_AT = "received_at"
-TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
 
 Path = tuple[Union[str, int], ...]
 
@@ -76,7 +76,7 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """A time, a message of one of TIMES: `offset` ns after the test's start, or None for when the message came in."""
+    """A message of STAMP_TYPES: `offset` ns after the test's start, or None for when the message came in."""
 
     type: MessageType
     offset: int | None
@@ -184,7 +184,7 @@ class FieldReader:
         if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.place.is_whole_line:
             return AnyValue(node.span)
         match kind, node:
-            case MessageType(), ScalarNode() if kind.name in TIMES:
+            case MessageType(), ScalarNode() if kind.name in STAMP_TYPES:
                 return Time(kind, _offset(node), node.span)
             case MessageType(fields=(only,)), ScalarNode():  # as a table fills it
                 return Fields(kind, {only.name: self._value(only.type, node, kind)}, node.span)
@@ -366,7 +366,7 @@ def _elements(kind: List, value: Any) -> Sequence[Any]:
 
 
 def _time_of(kind: MessageType, value: Any) -> int:
-    """A message of TIMES in ns of the wall clock."""
+    """A message of STAMP_TYPES in ns of the wall clock."""
     seconds, nanoseconds = (getattr(value, field.name) for field in kind.fields)
     return int(seconds * NS_PER_SECOND + nanoseconds)
 
@@ -377,7 +377,7 @@ def _time_of(kind: MessageType, value: Any) -> int:
 def shown(kind: Type, value: Any) -> str:
     """A value as a test would write it, on one line; of messages the fields that are not at their default."""
     match kind:
-        case MessageType() if kind.name in TIMES:
+        case MessageType() if kind.name in STAMP_TYPES:
             return offset(_time_of(kind, value) - START)
         case MessageType():
             members = ((field, getattr(value, field.name)) for field in kind.fields)

@@ -16,6 +16,9 @@ from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType,
 TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"})
 """ROS messages that expressions see as one value: a time or a duration, in nanoseconds."""
 
+STAMP_TYPES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
+"""Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
+
 INT32 = Int(32, signed=True)
 """The values of an enum."""
 

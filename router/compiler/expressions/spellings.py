@@ -10,8 +10,6 @@ ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
 DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
-
-SQUARE = "write x ** 2; there is no power of bits"
 BITS = "there are no operations on bits; `{}` is for bools"
 FLOAT = "write float64(x), or float32(x)"
 

@@ -14,14 +14,14 @@ from router.compiler.expressions.kinds import (
     FloatKind,
     IntKind,
     StringKind,
+    TimeKind,
 )
 from router.compiler.expressions.tree import Binary, Call, Choice, Constant, Listed
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
-from router.compiler.lowering.numbers import INT64, bounds, fitted, is_unsigned, signs, to_real
+from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
-    MAX_DATAGRAM,
     WANT,
     Code,
     Compared,
@@ -35,6 +35,7 @@ from router.compiler.lowering.operations import (
     real,
     text,
 )
+from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:
     from router.compiler.lowering.expressions import Lowering
@@ -114,7 +115,7 @@ def _time(lowering: Lowering, node: Tree, factor: int) -> Code:
     """A time in nanoseconds. It is refused if it does not fit 64 bits."""
     if isinstance(node.kind, FloatKind):
         return code(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
-    flag = signs(IntKind(*INT64), node.kind)
+    flag = signs(TimeKind(), node.kind)
     return code(lowering.value(node), integer(factor), Operation(Op.CHECKED_MULTIPLY, flag=flag))
 
 

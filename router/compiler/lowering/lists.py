@@ -19,6 +19,7 @@ from router.compiler.expressions.kinds import (
     MessageKind,
     StringKind,
     TimeKind,
+    element_of,
     kind_of,
 )
 from router.compiler.expressions.tree import Call, Choice, Contains, Each, Element, Listed, Read, Relation, Variable
@@ -328,8 +329,7 @@ def _folded(lowering: Lowering, values: Tree, step: Callable[[Code, Kind], Code]
     if isinstance(values, Each):
         each = values
     else:
-        assert isinstance(values.kind, (ListKind, BytesKind))  # noqa: S101 - the checker has seen to it
-        kind = values.kind.element if isinstance(values.kind, ListKind) else kind_of(OCTET)
+        kind = element_of(values.kind)
         assert kind is not None  # noqa: S101 - it is compared or added
         name = f"element {len(lowering.names.temporaries)}"
         listed = values.kind if isinstance(values.kind, ListKind) else ListKind(kind)

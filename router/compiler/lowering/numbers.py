@@ -5,37 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from router.compiler.expressions.kinds import (
-    INT32,
+    INT64,
     BoolKind,
     BytesKind,
-    EnumKind,
     FloatKind,
     IntKind,
     Kind,
     StringKind,
+    as_int,
 )
 from router.compiler.expressions.tree import Relation as TreeRelation
 from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer
 
-INT64 = -(1 << 63), (1 << 63) - 1
-
 
 def bounds(kind: Kind) -> tuple[int, int]:
     """The range of an integer, which may stand for a bool, an enum's value or a time."""
-    match kind:
-        case IntKind(low=int(low), high=int(high)):
-            return low, high
-        case EnumKind():
-            return INT32.low, INT32.high
-        case BoolKind():
-            return 0, 1
-        case _:
-            return INT64
+    if isinstance(kind, BoolKind):
+        return 0, 1
+    number = as_int(kind) or INT64
+    return number.low, number.high
 
 
 def is_unsigned(kind: Kind) -> bool:
     """Whether the 64 bits of an integer are unsigned: those of a kind that goes beyond int64."""
-    return bounds(kind)[1] > INT64[1]
+    return bounds(kind)[1] > INT64.high
 
 
 def signs(result: Kind, *operands: Kind) -> int:

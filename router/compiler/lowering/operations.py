@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from enum import IntEnum, IntFlag, auto
 from typing import TYPE_CHECKING, NamedTuple, Union
 
+from router.types.framing import MAX_DATAGRAM
+
 if TYPE_CHECKING:
     from router.compiler.lowering.nodes import Node
 
 MOST_STACKED, MOST_LOOPS, MOST_OPEN, MOST_TEXT = 255, 8, 32, 1 << 20
 """As in `native/operations.h`; one place of the stack is not used."""
-
-MAX_DATAGRAM = 16 * 1024
-"""As in `native/envelope.h`: no field of a datagram is longer, and no list has more elements."""
 
 NONE = 0xFFFF
 """No such slot, node or enum."""

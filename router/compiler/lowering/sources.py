@@ -18,7 +18,6 @@ from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
 from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.operations import (
-    MAX_DATAGRAM,
     MOST_LOOPS,
     MOST_OPEN,
     MOST_STACKED,
@@ -37,6 +36,7 @@ from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.lowering.steps import TooManyListsError, cdr_layout
 from router.compiler.plan import Record
 from router.errors import SourceSpan
+from router.types.framing import MAX_DATAGRAM
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
