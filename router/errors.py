@@ -130,7 +130,7 @@ class Code(enum.Enum):
     )
     LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could lose something without saying so.")
     OUT_OF_RANGE = ("out-of-range", "A value that can never fit.")
-    TOO_LARGE = ("too-large", "An expression or a mapping that is larger than the router can execute.")
+    TOO_LARGE = ("too-large", "An expression or mapping that is too large for the router.")
 
     @property
     def severity(self) -> Severity:

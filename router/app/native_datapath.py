@@ -2,8 +2,8 @@
 
 What the receive thread does not send itself comes by rings to others: a native one publishes (`publishing`), `topics`
 and `destinations` serve what needs Python (`parts`). Each of those two has its own engine with its own state, and
-changes to another program when it has served all that the earlier one received. Messages from ROS have two native
-threads, one of them for commands (`from_ros`); those that need Python have the one in `ros`.
+changes to another program when it has served all that the earlier one received. Two native threads take messages from
+ROS, one of them urgent ones (`from_ros`); the thread in `ros` takes those that need Python.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Subscription(Protocol):
 class NativeFromRos:
     """The routes of each topic, an array of `struct ros_route`, with all that they refer to.
 
-    `urgent` are the topics of which one route is.
+    `urgent` are the topics that an urgent route takes messages from.
     """
 
     topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from router.compiler.checked import CheckedRoute
+from router.compiler.expressions import tree
 from router.compiler.lowering import Lowered, LoweredElements, LoweredTarget
 from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
 from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
@@ -145,16 +146,6 @@ def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:
         depth += operation.kind is Op.REPEAT
 
 
-_RELATIONS = {
-    Relation.EQUAL: "==",
-    Relation.UNEQUAL: "!=",
-    Relation.LESS: "<",
-    Relation.LESS_OR_EQUAL: "<=",
-    Relation.MORE: ">",
-    Relation.MORE_OR_EQUAL: ">=",
-}
-
-
 @dataclass(frozen=True, slots=True)
 class _Line:
     """An operation and its number in the code."""
@@ -198,7 +189,8 @@ def _repeat(line: _Line) -> str:
 
 
 def _compare(line: _Line) -> str:
-    return f"{_RELATIONS[Relation(line.operation.flag)]}  {_word(Compared(line.index))}"
+    spelling = tree.Relation[Relation(line.operation.flag).name].value
+    return f"{spelling}  {_word(Compared(line.index))}"
 
 
 def _member(line: _Line) -> str:

@@ -318,12 +318,12 @@ def test_lists_in_lists_are_bounded() -> None:
         declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
         assert findings("many", declared) == []
     declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
-    assert findings("many", declared) == ["more than 8 lists are gone through within each other here"]
+    assert findings("many", declared) == ["more than 8 lists are nested here"]
 
 
 def test_text_that_is_put_together_is_bounded() -> None:
     assert lowered(" + ".join(["text"] * 10))
-    with pytest.raises(TooLargeError, match="may have 1064960 bytes, and at most 1048576 fit"):
+    with pytest.raises(TooLargeError, match="may have 1064960 bytes, and at most 1048576 are possible"):
         lowered(" + ".join(["text"] * 11))
 
 
@@ -338,7 +338,7 @@ def test_messages_in_messages_are_bounded() -> None:
         source.sent(source.lowering(), plan, case)
 
     written_as_deep(MOST_OPEN - 1)
-    with pytest.raises(TooLargeError, match="more than 32 messages are written within each other here"):
+    with pytest.raises(TooLargeError, match="more than 32 messages are nested here"):
         written_as_deep(MOST_OPEN + 1)
 
 
@@ -353,7 +353,7 @@ def test_what_is_read_is_bounded() -> None:
         source.layout(SPAN)
 
     read_as_deep(MOST_NODES_DEEP - 3)
-    with pytest.raises(TooLargeError, match="a field that is read is 32 messages deep, and at most 31 are read"):
+    with pytest.raises(TooLargeError, match="this reads a field 32 messages deep, and at most 31 are possible"):
         read_as_deep(MOST_NODES_DEEP - 1)
 
 

@@ -73,8 +73,8 @@ def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False)
     found = [*extremes]
     kind, is_checked = within_64_bits(found, is_rounded)
     if kind is None or (is_checked and min(found) == max(found)):
-        message = "an integer has 64 bits, and this one never fits"
-        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"they hold {INT64.low} to {UINT64.high}")
+        message = "this integer never fits 64 bits"
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"integers are {INT64.low} to {UINT64.high}")
     return kind, is_checked
 
 

@@ -46,5 +46,5 @@ class Names:
         """Raise TooLargeError if there is no room for so many bytes of text more."""
         self.joined += most
         if self.joined > MOST_TEXT:
-            message = f"the text that is put together here may have {self.joined} bytes, and at most {MOST_TEXT} fit"
+            message = f"the text joined here may have {self.joined} bytes, and at most {MOST_TEXT} are possible"
             raise TooLargeError(span, message, "join fewer fields")

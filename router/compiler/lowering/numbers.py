@@ -63,28 +63,26 @@ def fitted(made: Code, kind: Kind, to: Kind) -> Code:
     return code(made, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
 
 
-_RELATIONS: Mapping[TreeRelation, tuple[Relation, Relation]] = {
-    TreeRelation.EQUAL: (Relation.EQUAL, Relation.EQUAL),
-    TreeRelation.UNEQUAL: (Relation.UNEQUAL, Relation.UNEQUAL),
-    TreeRelation.LESS: (Relation.LESS, Relation.MORE),
-    TreeRelation.LESS_OR_EQUAL: (Relation.LESS_OR_EQUAL, Relation.MORE_OR_EQUAL),
-    TreeRelation.MORE: (Relation.MORE, Relation.LESS),
-    TreeRelation.MORE_OR_EQUAL: (Relation.MORE_OR_EQUAL, Relation.LESS_OR_EQUAL),
+_SWAPPED: Mapping[Relation, Relation] = {
+    Relation.LESS: Relation.MORE,
+    Relation.LESS_OR_EQUAL: Relation.MORE_OR_EQUAL,
+    Relation.MORE: Relation.LESS,
+    Relation.MORE_OR_EQUAL: Relation.LESS_OR_EQUAL,
 }
-"""Of two values, and of the same two in the other order."""
+"""Relations of the same two values in the other order, where that is another one."""
 
 
 def compare(relation: TreeRelation, left: Code, right: Code, left_kind: Kind, right_kind: Kind) -> Code:
     """Whether a relation holds, exactly. The operation wants an integer in front of a real number, and a signed one
     in front of an unsigned one: so the right operand may be evaluated first.
     """
-    straight, swapped = _RELATIONS[relation]
+    straight = Relation[relation.name]
     how = _compared(left_kind, right_kind)
     if how is not None:
         return code(left, right, Operation(Op.COMPARE, int(how), flag=straight))
     how = _compared(right_kind, left_kind)
     assert how is not None  # noqa: S101 - one of two orders is right
-    return code(right, left, Operation(Op.COMPARE, int(how), flag=swapped))
+    return code(right, left, Operation(Op.COMPARE, int(how), flag=_SWAPPED.get(straight, straight)))
 
 
 def _compared(left: Kind, right: Kind) -> Compared | None:

@@ -113,8 +113,8 @@ class Datagram(_Source):
         """Return the layout of all programs that have been made. Raises TooLargeError."""
         for node in (self.root, *self.elements):
             if (depth := node.depth()) >= MOST_NODES_DEEP:
-                message = f"a field that is read is {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are read"
-                raise TooLargeError(span, message, "read what is less deep")
+                message = f"this reads a field {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are possible"
+                raise TooLargeError(span, message, "read fields that are less deep")
         made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
         _want_room(made, span)
         return made
@@ -184,9 +184,9 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
     operations = [operation for operation, _ in placed]
     loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
     limits = (
-        (depths(operations), MOST_STACKED, "values are held here at a time", "use fewer brackets in brackets"),
-        (loops, MOST_LOOPS, "lists are gone through within each other here", "fill fewer lists in lists"),
-        (opened, MOST_OPEN, "messages are written within each other here", "fill fewer messages in messages"),
+        (depths(operations), MOST_STACKED, "intermediate values are needed here", "use fewer brackets in brackets"),
+        (loops, MOST_LOOPS, "lists are nested here", "fill fewer lists in lists"),
+        (opened, MOST_OPEN, "messages are nested here", "fill fewer messages in messages"),
     )
     for counts, most, what, hint in limits:
         for (_, span), count in zip(placed, counts, strict=True):
@@ -197,5 +197,5 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
 def _want_room(layout: Layout, span: SourceSpan) -> None:
     most = max(len(layout.defaults), len(layout.nodes))
     if most > _MOST_SLOTS:
-        message = f"these mappings use {most} values, and at most {_MOST_SLOTS} have room"
+        message = f"these mappings use {most} values, and at most {_MOST_SLOTS} are possible"
         raise TooLargeError(span, message, "make several routes of it, or map less")

@@ -12,7 +12,7 @@ from router.types.model import List, MessageType, String, Type
 
 
 class TooManyListsError(Exception):
-    """A ROS message has more lists of messages within each other than are gone through."""
+    """A ROS message nests more lists of messages than a program can read."""
 
 
 def cdr_layout(slots: Sequence[Slot], message: Node, elements: Sequence[Node]) -> Layout:
@@ -111,7 +111,7 @@ class _Steps:
 
     def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
         if self.loops == MOST_LOOPS:
-            message = f"a message of this type has more than {MOST_LOOPS} lists of messages within each other"
+            message = f"this type nests more than {MOST_LOOPS} lists of messages"
             raise TooManyListsError(message)
         self._add(each, slot)
         inside = _Steps(self.layout, Offset(), self.loops + 1)
