@@ -1,9 +1,9 @@
 """From a checked value to the plan of the field that it fills.
 
-Messages are converted field by field, lists element by element, scalars by syntax that converts them. Nothing is lost
-without being asked for: ranges that are known now are checked now, a range that only the value has (a rounded float)
-is checked at run time and drops the target. An enum saturates into a narrower integer, as the boards' firmware does.
-Every function raises ExpressionError where the value does not fit.
+Messages are converted field by field, lists element by element, scalars by a node that converts or checks them. No
+value loses anything unless the table says so: known ranges are checked here, and a rounded float at run time, where a
+value that does not fit drops the target. An enum saturates into a narrower integer, as the boards' firmware does. Every
+function raises ExpressionError where the value does not fit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a checked route to the Python function that serves it, about one screen long.
+"""From a checked route to the Python function that serves it, which is about one screen long.
 
 The function takes a message and calls what the engine binds for each target NAME: `send_NAME` or `publish_NAME`
 and `wanted_NAME`, or `deliver_NAME` where that may be later; `limit_NAME` for a `max_rate`, and `lost_NAME` for

@@ -47,9 +47,10 @@ class Items:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list made of one or more lists (or bytes), side by side: `element` fills one element from the variables.
+    """A list that is filled from one or more lists (or bytes) side by side: `element` fills one element.
 
-    `lists` have the variable that an element of each is bound to. Lists of different length are refused at run time.
+    `lists` are pairs of a variable and the list whose elements it takes. Lists of different length are refused at run
+    time.
     """
 
     type: List

@@ -1,4 +1,4 @@
-"""Calls of functions: how many arguments, of what kinds, and what a call with a list is."""
+"""Calls of functions: the number and kinds of arguments, and calls with lists."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def function_named(name: str, span: SourceSpan) -> Function:
 def call_of(
     function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope, expected: Type | None
 ) -> Node:
-    """The call as a checked expression; bounds that it leaves out are those of the field `expected`."""
+    """The call as a checked expression. Bounds that it leaves out are taken from the field `expected`."""
     if function.of_list is not None and len(arguments) == 1 and is_list(arguments[0].kind):
         return _whole_list(function, arguments[0], span, scope)
     if function.optional and len(arguments) == len(function.parameters) - function.optional:

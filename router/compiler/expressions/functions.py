@@ -125,7 +125,7 @@ def fixed(x: float, digits: int) -> str:
 # kinds of results
 
 Rule = Callable[[Sequence[Node]], Kind]
-"""Gives the kind of a call from its arguments. Raises ValueError for arguments with which no call works."""
+"""Returns the kind of a call with these arguments. Raises ValueError if the call can never succeed."""
 
 
 def _always(kind: Kind) -> Rule:
@@ -143,7 +143,7 @@ def _double(nodes: Sequence[Node]) -> FloatKind:
 
 
 def _rounded(compute: Callable[[float], int]) -> Rule:
-    """The same integer, or one of 64 bits for a float; the range that clamp() leaves is kept."""
+    """The same integer, or for a float one of 64 bits, within the range that clamp() has given the float."""
 
     def result(nodes: Sequence[Node]) -> Kind:
         kind = nodes[0].kind
@@ -256,7 +256,10 @@ def _written(nodes: Sequence[Node]) -> Kind:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """`accepts` are the kinds that may be passed, `wanted` how a finding calls them; `becomes` what they turn into."""
+    """`accepts` are the kinds that may be passed, and `wanted` names them in findings.
+
+    An integer is converted where the parameter `becomes` a float.
+    """
 
     name: str
     accepts: tuple[type, ...]
@@ -266,12 +269,12 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One function of scalars. `result` tells the kind of a call from its arguments.
+    """One function of scalars. `result` returns the kind of a call with these arguments.
 
     The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
-    A function with optional bounds takes them from the integer field that it fills (see expressions). One that
-    `gives_an_argument` gives a float if one of them may be one. `of_list` tells the kind of a call with one list, which
-    is taken as a whole; it is None for a list that the function does not take.
+    A function with optional bounds takes them from the integer field that it fills (see expressions). If it
+    `gives_an_argument` and one of them is a float, all are converted to floats. `of_list` returns the kind of a call
+    with one whole list, or None for a list that the function does not take.
     """
 
     name: str

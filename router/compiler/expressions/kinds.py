@@ -26,7 +26,7 @@ OCTET = Int(8, signed=False)
 """An element of bytes."""
 
 INT64, UINT64 = Int(64, signed=True), Int(64, signed=False)
-"""The integers that a value can be: the first ones where its range begins below zero."""
+"""The integers that a value can be: signed ones if its range begins below zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class BoolKind:
 class IntKind:
     """An integer between `low` and `high`.
 
-    With `is_rounded` a rounded float went in: it may fill a narrower field, which is checked at run time.
+    With `is_rounded` a rounded float was part of it. It may fill a narrower field, which is checked at run time.
     """
 
     low: int
@@ -47,7 +47,7 @@ class IntKind:
     is_rounded: bool = False
 
     def holds(self, other: IntKind) -> bool:
-        """Whether all integers of another kind are of this one."""
+        """Whether this kind contains all integers of another one."""
         return self.low <= other.low and other.high <= self.high
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ class IntKind:
 
 @dataclass(frozen=True, slots=True)
 class FloatKind:
-    """`bits` is 64 if a double went in, so that a float32 would lose digits. What is no NaN is in the range."""
+    """`bits` is 64 if a double was part of it, so that a float32 would lose digits. A value is in the range, or NaN."""
 
     bits: int
     low: float = -math.inf
@@ -175,9 +175,9 @@ def length_of(kind: Kind) -> int | None:
 
 
 def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind | None, bool]:
-    """The integers between these, as far as 64 bits hold them, and whether others may have to be refused.
+    """Return the kind of the integers between these that fit 64 bits, and whether there are others.
 
-    Instead of a kind without integers it is None.
+    The kind is None if no integer fits.
     """
     found = [*extremes]
     low, high = min(found), max(found)
@@ -192,9 +192,9 @@ def float_bits(kind: Kind) -> int:
 
 
 def join(left: Kind, right: Kind) -> Kind | None:
-    """The kind of a value that is one or the other, None when nothing holds both.
+    """The kind of a value that is one or the other, None when no kind holds both.
 
-    Of integers it may hold less than both; what it does not hold is refused at run time.
+    A joined integer kind may be narrower than both together. Values outside of it are refused at run time.
     """
     if left == right:
         return left

@@ -1,4 +1,4 @@
-"""Lists in expressions: literals, elements, and what is computed element by element."""
+"""Lists in expressions: literals, elements, and computation element by element."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Make = Callable[[Sequence[Node]], Node]
 
 
 def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
-    """A list literal, whose elements have one kind in common; each keeps its own."""
+    """A list literal. Its elements have a common kind; each keeps its own."""
     element: Kind | None = items[0].kind if items else None
     for item in items[1:]:
         element = join(element, item.kind) if element else None
@@ -52,7 +52,7 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
 
 
 def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
-    """What `make` makes of scalars, or of the elements of lists that are taken side by side."""
+    """Apply `make` to scalars, or to the elements of lists side by side."""
     lists = [operand for operand in operands if is_list(operand.kind)]
     if not lists:
         return make(operands)
@@ -78,7 +78,7 @@ def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: S
 
 
 def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
-    """The length of all these lists, None if it is known of none."""
+    """The length of all these lists, None if none is known."""
     lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
     if len(lengths) > 1:
         message = f"lists of {' and '.join(map(str, lengths))} elements cannot go side by side"
@@ -97,7 +97,7 @@ def _want_known_lengths(lists: Sequence[Node]) -> None:
 
 
 def _pick(operand: Node, index: int) -> Node:
-    """An element of a list of known length; another operand counts for every element."""
+    """An element of a list of known length. A scalar is the same for every element."""
     if isinstance(operand, Listed):
         return operand.items[index]
     kind = element_of(operand.kind)
@@ -108,12 +108,12 @@ def _pick(operand: Node, index: int) -> Node:
 
 
 def as_value(operand: Node, scope: Scope) -> Node:
-    """A list literal that is used as one value: its elements have the kind that they have in common."""
+    """Convert the elements of a list literal that is used as one value to their common kind."""
     return as_kind(operand, operand.kind, scope) if isinstance(operand, Listed) else operand
 
 
 def as_kind(operand: Node, kind: Kind, scope: Scope) -> Node:
-    """An operand of what gives a value of `kind`: an integer where that is a float, or where it may not fit."""
+    """Convert an operand to `kind`: an integer to a float, or to a narrower integer with a check."""
     wanted = element_of(kind) if is_list(kind) else None
     if wanted is not None:
         kinds = [item.kind for item in operand.items] if isinstance(operand, Listed) else [element_of(operand.kind)]

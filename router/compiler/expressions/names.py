@@ -1,4 +1,4 @@
-"""What names stand for: variables, fields, the constants of enums and ROS types, and whether a field is there."""
+"""The meaning of names: variables, fields, constants of enums and ROS types; and has()."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def is_source(operand: Node) -> bool:
 
 
 def want_senders(operands: Sequence[Node], scope: Scope) -> None:
-    """Refuse texts that are compared with the name of the sender, and that no sender of the message has."""
+    """Refuse a comparison of the sender's name with a text that is the name of no possible sender."""
     if not scope.sources or not any(map(is_source, operands)):
         return
     for each in (
@@ -156,7 +156,7 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
 
 
 def _without_root(path: tuple[str, ...], scope: Scope) -> str:
-    """A hint for `msg.accel_x` and `math.pi`, which stand here without what they belong to elsewhere."""
+    """A hint for `msg.accel_x` and `math.pi`, which are written here without the first name."""
     if path[1] in scope.field_names():
         return f"write {'.'.join(path[1:])}: a name is a field of the message"
     return spellings.NAMES.get(path[-1].lower(), "")

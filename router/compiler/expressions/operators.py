@@ -69,7 +69,10 @@ def constant(value: object, span: SourceSpan) -> Constant:
 
 
 def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False) -> tuple[IntKind, bool]:
-    """The kind of an integer between these, and whether others may have to be refused at run time."""
+    """The kind of an integer between these, and whether a result has to be checked at run time.
+
+    Raises ExpressionError if it never fits.
+    """
     found = [*extremes]
     kind, is_checked = within_64_bits(found, is_rounded)
     if kind is None or (is_checked and min(found) == max(found)):
@@ -170,7 +173,7 @@ def _literal_as_float(operand: Node) -> Node:
 
 
 def folded(made: Binary) -> Binary | Constant:
-    """The literal that arithmetic of two literals gives, so that it is checked against the target."""
+    """Replace arithmetic of two literals by its result, so that the result is checked against the target."""
     left, right = constant_of(made.left), constant_of(made.right)
     if left is None or right is None:
         return made

@@ -72,7 +72,7 @@ def field_of(holder: Node, member: Field, span: SourceSpan) -> Read:
 
 
 def want_readable(node: Node) -> None:
-    """Raise ExpressionError for a field that expressions do not read, or that is in one."""
+    """Raise ExpressionError if expressions cannot read the field, or a field around it."""
     if not isinstance(node, Read):
         return
     want_readable(node.holder)
@@ -84,7 +84,7 @@ def want_readable(node: Node) -> None:
 
 
 def _unreadable(member: Field) -> tuple[str, str] | None:
-    """What a field is that expressions do not read, and what to do; None for all others."""
+    """For a field that expressions cannot read, its kind and what to do instead; None for all others."""
     declared = member.type.element if isinstance(member.type, List) else member.type
     if isinstance(declared, MessageType) and declared.is_map_entry:
         return "map", "destinations get it as it came; for a topic, declare a list of messages with key and value"

@@ -85,7 +85,7 @@ class Parsed:
 _MEANINGFUL = frozenset(
     {"and", "or", "not", "in", "is", "if", "else", "True", "False", "None", "lambda", "for", "await", "yield"}
 )
-"""Words of Python that are no names in an expression, but behind a dot."""
+"""Words of Python that are names only behind a dot."""
 
 _LEXEMES = re.compile(
     r"""
@@ -100,7 +100,7 @@ _MARKED = 0xA000
 
 
 def _with_words_as_names(text: str) -> str:
-    """The text with Python's words made names where fields may be meant, in as many characters."""
+    """Turn words of Python that may be fields into names that Python parses, of the same length."""
 
     def replaced(found: re.Match[str]) -> str:
         dot, name = found["dot"] or "", found["name"]
@@ -112,7 +112,7 @@ def _with_words_as_names(text: str) -> str:
 
 
 def _with_words(tree: ast.expr) -> ast.expr:
-    """The syntax tree with the words that were made names."""
+    """Turn such names in the syntax tree into the words again."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Name):
             node.id = _word(node.id)

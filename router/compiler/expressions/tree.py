@@ -1,8 +1,7 @@
-"""The typed tree of a checked expression: what it means, decided once, for whoever executes or shows it.
+"""The typed tree of a checked expression: the only representation of what an expression means.
 
-Each node has the kind of its value (`kinds`) and the place in the table that it comes from. Names are resolved: what a
-node reads is a variable, or a field of a message that is one. Lists are computed element by element: an Each says for
-which lists, and what is made of their elements.
+Each node has the kind of its value (`kinds`) and its place in the table. Names are resolved: a node reads a variable,
+or a field of a message. Computation element by element is an Each, with its lists and the expression for one element.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Relation(Enumeration):
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A literal, a name of an enum, a constant of a ROS type, or what two of them give. Times are integers (ns)."""
+    """A literal, a value of an enum, a constant of a ROS type, or arithmetic of such. Times are integers (ns)."""
 
     kind: Kind
     span: SourceSpan
@@ -108,9 +107,9 @@ class Listed:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list computed element by element: `element`, for each element of `lists`, which are taken side by side.
+    """A list computed element by element: `element`, for the elements of `lists` side by side.
 
-    `lists` have the variable that an element of each is bound to. None of them is an Each itself. Lists of different
+    `lists` are pairs of a variable and the list whose elements it takes; none is an Each itself. Lists of different
     length are refused at run time.
     """
 
@@ -122,7 +121,7 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Unary:
-    """NOT or NEGATE. `is_checked`: the result may not fit its kind, and is refused then."""
+    """NOT or NEGATE. `is_checked`: a result that does not fit its kind is refused."""
 
     kind: Kind
     span: SourceSpan
@@ -135,8 +134,8 @@ class Unary:
 class Binary:
     """Arithmetic of two numbers, or ADD of two texts.
 
-    Of two integers the result is an integer (of DIVIDE a float), else both become doubles. `is_checked`: an integer
-    that may not fit its kind, and is refused then.
+    Two integers give an integer (DIVIDE a float); otherwise both become doubles. `is_checked`: an integer result that
+    does not fit its kind is refused.
     """
 
     kind: Kind
@@ -149,7 +148,7 @@ class Binary:
 
 @dataclass(frozen=True, slots=True)
 class Compare:
-    """`a < b <= c`. Each operand is evaluated once, and none behind a comparison that is false."""
+    """`a < b <= c`. Each operand is evaluated at most once, and none after a comparison that is false."""
 
     kind: Kind
     span: SourceSpan
@@ -170,7 +169,7 @@ class Contains:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """`and` (`is_all`) or `or`: nothing behind a decision is evaluated."""
+    """`and` (`is_all`) or `or`. Evaluation stops at the operand that decides."""
 
     kind: Kind
     span: SourceSpan
@@ -180,7 +179,7 @@ class Logic:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """`body if test else orelse`: only one of both is evaluated."""
+    """`body if test else orelse`. Only one of the two is evaluated."""
 
     kind: Kind
     span: SourceSpan
@@ -191,9 +190,9 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A function of the language, or one of `conversion`'s checks. `kind` says what the call gives.
+    """A call of a function of the language, or of one of CHECKS.
 
-    `len`, and `min`, `max` and `sum` of one argument, take a whole list.
+    `len` and `sum`, and `min` and `max` with one argument, take a whole list.
     """
 
     kind: Kind

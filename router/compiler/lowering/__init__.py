@@ -1,6 +1,6 @@
 """From the routes of a table without errors to the programs that the carrier runs (`native/operations.h`).
 
-Each target is lowered once. What is more than a program can do is a finding, also of targets that Python serves: so
+Each target is lowered once. A program that would be too large is a finding, also for a target that Python serves, so
 both planes refuse the same tables.
 """
 
