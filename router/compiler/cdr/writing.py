@@ -10,18 +10,16 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import Union
 
-from router.compiler.cdr.primitives import HEADER, put_text, put_wide_text, scalar_format
+from router.compiler.cdr.constants import NO_FIELDS, known_default, known_length, known_value
+from router.compiler.cdr.primitives import HEADER, scalar_format
 from router.compiler.expressions.tree import Node, Variable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.python import NO_VALUES, Values, lists_of, render
 from router.compiler.source import Source, placed
 from router.errors import SourceSpan
-from router.types.model import Bool, Float, List, MessageType, String, Type
-
-_EMPTY = b"\0"
-"""A message without fields: IDL has none, so rosidl adds the byte `structure_needs_at_least_one_member`."""
+from router.types.model import List, String
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,67 +78,22 @@ def steps(plan: Plan) -> Iterable[Step]:  # noqa: C901 - a case a plan
             for _, member in plan.members:
                 yield from steps(member)
             if not plan.type.fields:
-                yield Blob(_EMPTY, 1)
+                yield Blob(*NO_FIELDS)
         case Unset():
-            yield from _default(plan.type, plan.default)
+            yield from (Blob(*known) for known in known_default(plan.type, plan.default))
         case Leaf() if plan.constant is not None:
-            yield _known(plan.constant, plan.type)
+            yield Blob(*known_value(plan.constant, plan.type))
         case Leaf(type=String(wide=wide)):
             yield Text(plan.node, wide, plan.span)
         case Leaf():
             yield Put(scalar_format(plan.type), plan.node, plan.span)
         case Items():
             if plan.type.length is None:
-                yield _length(len(plan.items))
+                yield Blob(*known_length(len(plan.items)))
             for item in plan.items:
                 yield from steps(item)
         case Each():
             yield Repeat(plan.type, plan.lists, tuple(steps(plan.element)), plan.span)
-
-
-def _default(declared: Type, default: Any) -> Iterable[Step]:
-    """The steps of a field that nothing fills: the same value as rclpy's constructor gives it."""
-    match declared:
-        case MessageType():
-            for member in declared.fields:
-                yield from _default(member.type, member.default)
-            if not declared.fields:
-                yield Blob(_EMPTY, 1)
-        case List():
-            values = [None] * (declared.length or 0) if default is None else default
-            if declared.length is None:
-                yield _length(len(values))
-            for value in values:
-                yield from _default(declared.element, value)
-        case _:
-            yield _known(_zero(declared) if default is None else default, declared)
-
-
-def _zero(declared: Type) -> object:
-    """The default that ROS gives a scalar field."""
-    match declared:
-        case Bool():
-            return False
-        case Float():
-            return 0.0
-        case String():
-            return ""
-        case _:
-            return 0
-
-
-def _known(value: Any, declared: Type) -> Blob:
-    """A value of a primitive type."""
-    if isinstance(declared, String):
-        data = bytearray()
-        (put_wide_text if declared.wide else put_text)(data, value)
-        return Blob(bytes(data), 4)
-    letter = scalar_format(declared)
-    return Blob(struct.pack("<" + letter, value), struct.calcsize(letter))
-
-
-def _length(length: int) -> Blob:
-    return Blob(struct.pack("<I", length), 4)
 
 
 def message_size(plan: Record) -> tuple[int, bool]:

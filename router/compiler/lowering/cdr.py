@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from itertools import starmap
 
-from router.compiler.cdr.primitives import HEADER, put_text, put_wide_text, scalar_format
+from router.compiler.cdr.constants import NO_FIELDS, known_default, known_length, known_value
+from router.compiler.cdr.primitives import HEADER
 from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
@@ -17,10 +17,7 @@ from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Op, Operation, Scalar, keep, known, load
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.types.model import Bool, Float, Int, List, MessageType, String, Type
-
-_EMPTY = b"\0"
-"""A message without fields: IDL has none, so rosidl adds the byte `structure_needs_at_least_one_member`."""
+from router.types.model import Float, Int, String
 
 
 def cdr_message(lowering: Lowering, plan: Record) -> list[Placed]:
@@ -40,14 +37,14 @@ class _Writer:
                 for member, inner in made.members:
                     yield from self.plan(inner, f"{path}.{member.name}" if path else member.name)
                 if not made.type.fields:
-                    yield from at(place, known(_EMPTY))
+                    yield from at(place, known(*NO_FIELDS))
             case Unset():
-                yield from at(place, *_default(made.type, made.default))
+                yield from at(place, *starmap(known, known_default(made.type, made.default)))
             case Leaf():
                 yield from self._leaf(made, place)
             case Items():
                 if made.type.length is None:
-                    yield from at(place, _number(len(made.items)))
+                    yield from at(place, known(*known_length(len(made.items))))
                 for item in made.items:
                     yield from self.plan(item, path)
             case Each():
@@ -55,7 +52,7 @@ class _Writer:
 
     def _leaf(self, made: Leaf, place: Place) -> list[Placed]:
         if made.constant is not None:
-            return at(place, _known(made.constant, made.type))
+            return at(place, known(*known_value(made.constant, made.type)))
         value = self.lowering.value(made.node)
         match made.type:
             case String():
@@ -89,49 +86,6 @@ def _are_copied(made: Each, taken: list[Taken]) -> bool:
 
 
 # ---- known bytes
-
-
-def _known(value: Any, declared: Type) -> Operation:
-    """A value of a primitive type."""
-    if isinstance(declared, String):
-        data = bytearray()
-        (put_wide_text if declared.wide else put_text)(data, value)
-        return known(bytes(data), 4)
-    return known(struct.pack("<" + scalar_format(declared), value), size_of(declared))
-
-
-def _number(length: int) -> Operation:
-    return known(struct.pack("<I", length), 4)
-
-
-def _default(declared: Type, default: Any) -> Iterator[Operation]:
-    """A field that nothing fills: the same value as rclpy's constructor gives it."""
-    match declared:
-        case MessageType():
-            for member in declared.fields:
-                yield from _default(member.type, member.default)
-            if not declared.fields:
-                yield known(_EMPTY)
-        case List():
-            values = [None] * (declared.length or 0) if default is None else default
-            if declared.length is None:
-                yield _number(len(values))
-            for value in values:
-                yield from _default(declared.element, value)
-        case _:
-            yield _known(_zero(declared) if default is None else default, declared)
-
-
-def _zero(declared: Type) -> object:
-    match declared:
-        case Bool():
-            return False
-        case Float():
-            return 0.0
-        case String():
-            return ""
-        case _:
-            return 0
 
 
 _SIZES = {Op.PUT_FLOAT: 4, Op.PUT_DOUBLE: 8}
