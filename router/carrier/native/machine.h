@@ -19,7 +19,10 @@
 
 enum {
     FIRST_CELLS = 16 * 1024, /* enough for a datagram: each element of a list takes at least a byte of it */
-    MOST_CELLS = 1 << 22     /* 128 MiB; a message that needs more is refused */
+    /* A message that needs more is refused: */
+    MOST_CELLS = 1 << 22, /* 96 MiB */
+    MOST_WORK = 1 << 24,  /* turns of loops in all programs together, or BYTES_PER_TURN of text */
+    BYTES_PER_TURN = 16
 };
 
 struct machine {
@@ -29,10 +32,19 @@ struct machine {
     uint32_t cell_count, cell_capacity;
     uint8_t *text; /* MOST_TEXT bytes, for text that programs put together */
     size_t text_size;
+    uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* what was read last; offsets in CDR count from its first byte */
     struct output output;                 /* the message that was written last */
     struct value stack[MOST_STACKED];
 };
+
+/* Note work that a program does, in turns of loops. Return false if the message takes too much: lists that are gone
+ * through for each element of others could hold up a thread for hours. */
+static inline bool spend(struct machine *machine, size_t work) {
+    bool is_enough = work <= machine->work_left;
+    machine->work_left = is_enough ? machine->work_left - (uint32_t)work : 0;
+    return is_enough;
+}
 
 /* Allocate what a machine needs. Return false for lack of memory. To be closed in either case. */
 bool machine_open(struct machine *machine);
