@@ -195,10 +195,12 @@ static bool has_subscription(const struct ros_set *set, const void *subscription
     return false;
 }
 
-/* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. */
+/* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. `next` may be taken back
+ * meanwhile. */
 static void serve_rest(struct from_ros *thread, const struct ros_set *set, const struct ros_set *next) {
     for (uint32_t index = 0; set && !thread->is_left && index < set->count; index++) {
         const struct ros_topic *topic = &set->topics[index];
+        if (next && thread->offered != next) return;
         if (next && has_subscription(next, topic->subscription)) continue;
         for (uint32_t left = topic->capacity; left && serve_one(thread, topic); left--) {}
     }
