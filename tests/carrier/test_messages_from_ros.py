@@ -283,6 +283,14 @@ def test_what_is_the_same_for_all_elements_is_computed_once(delivering: CDLL, na
             assert carrier(message) == python(message)
 
 
+def test_for_each_refuses_a_list_that_would_hold_up_the_thread(delivering: CDLL) -> None:
+    source, wire = source_of(xs=List(U8)), made_wire()
+    _, carrier = from_ros(delivering, wire, case_of("scalars"), field_map(u32="item"), source, for_each="xs")
+    most = 1 << 16
+    assert len(carrier(cdr(source, {"xs": [1] * most}))) == most
+    assert carrier(cdr(source, {"xs": [1] * (most + 1)})) == [MAPPING_ERROR]
+
+
 def test_long_texts_and_lists_get_long_lengths(delivering: CDLL) -> None:
     source = source_of(x=List(U8), t=String())
     fields = field_map(data="x", text="t")

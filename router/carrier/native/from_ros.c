@@ -18,6 +18,7 @@ enum {
     TOPICS_PER_WAIT = 16,
     LOOK_MS = 250, /* the longest time between two looks at the clocks */
     MOST_PUBLISHERS = 64,
+    MOST_ELEMENTS = 1 << 16, /* that `for_each` sends of one message: the lock is held meanwhile */
 };
 
 /* A publisher sends its messages in order. By the oldest readings of its last message's stamps: */
@@ -107,14 +108,15 @@ static void serve_element(struct from_ros *thread, const struct ros_route *route
     machine->cell_count = cell_count;
 }
 
-/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused counts as one
- * message. */
+/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused or too long counts as
+ * one message. */
 static int64_t serve_each(struct from_ros *thread, const struct ros_route *route, struct message *message) {
     struct machine *machine = &thread->stage.machine;
     struct value list;
     uint32_t at;
     message->place = PLACE_FOR_EACH;
     message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
+    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) message->outcome = LOSS_MAPPING_ERROR;
     if (message->outcome != EVALUATED) {
         deliver_to_all(&thread->stage, &route->targets, message);
         return 1;
