@@ -94,7 +94,7 @@ static struct born born(struct from_ros *thread, const struct ros_route *route, 
 
 /* ---- messages ---- */
 
-/* Deliver an element of a list, which is then off the list. What it takes of cells is free again behind it. */
+/* Take an element off a list, and deliver it. The cells that this takes are freed afterwards. */
 static void serve_element(struct from_ros *thread, const struct ros_route *route, struct message message,
                           struct value *list, int64_t index) {
     struct machine *machine = &thread->stage.machine;

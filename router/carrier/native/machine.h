@@ -2,11 +2,11 @@
  * the messages of targets from it. Each thread that does so has one of its own.
  *
  *     machine_begin(machine, layout);             slots have their defaults
- *     machine->slots[...] = ...;                  what is no field: the time of receipt, the sender's name
+ *     machine->slots[...] = ...;                  values other than fields: time of receipt, sender
  *     machine_read(machine, node, data, size);    fields are in slots now
  *     evaluate_condition(...), evaluate_message(...)   any number of times (evaluate.h)
  *
- * Text, bytes and lists in slots point into the message that was read, which has to stay until the next begin. */
+ * Text, bytes and lists in slots point into the message that was read: it must not change until the next begin. */
 #ifndef MACHINE_H
 #define MACHINE_H
 
@@ -46,11 +46,11 @@ static inline bool spend(struct machine *machine, size_t work) {
     return is_enough;
 }
 
-/* Allocate what a machine needs. Return false for lack of memory. To be closed in either case. */
+/* Allocate what a machine needs. Return false for lack of memory. Close the machine in either case. */
 bool machine_open(struct machine *machine);
 void machine_close(struct machine *machine);
 
-/* Begin with another message, of this layout: all slots get their defaults, cells and text are free again. */
+/* Begin with another message, of this layout: slots get their defaults, cells and text are freed. */
 void machine_begin(struct machine *machine, const struct layout *layout);
 
 /* Read a message into the slots of a node. Return false if it is malformed, or for lack of memory. */

@@ -1,5 +1,5 @@
-/* Text that programs make. It is in the machine's text buffer until the program ends, or the turn of the loop that made
- * it. Functions return false if the buffer is full, or the message takes too much work. */
+/* Text that programs make. It stays in the machine's text buffer until the program ends, or the turn of the loop that
+ * made it. Functions return false if the buffer is full, or the message takes too much work. */
 #ifndef TEXTS_H
 #define TEXTS_H
 
