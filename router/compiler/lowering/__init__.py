@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.executors import Executors, executors, is_urgent
-from router.compiler.lowering.layout import Layout, Node
+from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.names import TooLargeError
+from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
 from router.compiler.lowering.sources import Datagram, Elements, RosMessage
 from router.errors import Diagnostic

@@ -10,9 +10,9 @@ from typing import Any
 from router.compiler.cdr.primitives import HEADER, put_text, put_wide_text, scalar_format
 from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.layout import size_of
 from router.compiler.lowering.lists import Taken
 from router.compiler.lowering.messages import Place, Placed, at, counted, each
+from router.compiler.lowering.nodes import size_of
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Op, Operation, Scalar, keep, known, load

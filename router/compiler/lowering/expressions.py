@@ -39,8 +39,8 @@ from router.compiler.expressions.tree import (
     Node as Tree,
 )
 from router.compiler.lowering import functions, lists
-from router.compiler.lowering.layout import Node
 from router.compiler.lowering.names import Names
+from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,

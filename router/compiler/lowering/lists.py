@@ -23,7 +23,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.expressions.tree import Call, Choice, Contains, Each, Element, Listed, Read, Relation, Variable
 from router.compiler.expressions.tree import Node as Tree
-from router.compiler.lowering.layout import Node
+from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs
 from router.compiler.lowering.operations import (
     DROP,

@@ -44,7 +44,7 @@ def at(place: Place, *parts: Operation | Code) -> list[Placed]:
 
 
 def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:
-    """Copy the lists to slots, and put their number of elements on the stack. It is checked against the field's type."""
+    """Copy the lists to slots, and put their number of elements on the stack, if the field takes so many."""
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Union
 
-from router.compiler.lowering.layout import Node
+from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.operations import MOST_TEXT, Slot
 from router.errors import Code, Diagnostic, SourceSpan
 

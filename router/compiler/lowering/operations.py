@@ -8,7 +8,7 @@ from enum import IntEnum, IntFlag, auto
 from typing import TYPE_CHECKING, NamedTuple, Union
 
 if TYPE_CHECKING:
-    from router.compiler.lowering.layout import Node
+    from router.compiler.lowering.nodes import Node
 
 MOST_STACKED, MOST_LOOPS, MOST_OPEN, MOST_TEXT = 255, 8, 32, 1 << 20
 """As in `native/operations.h`; one place of the stack is not used."""

@@ -13,16 +13,10 @@ from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.layout import (
-    MOST_NODES_DEEP,
-    Layout,
-    Node,
-    TooManyListsError,
-    cdr_layout,
-    protobuf_layout,
-)
+from router.compiler.lowering.layout import MOST_NODES_DEEP, Layout, protobuf_layout
 from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
+from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.operations import (
     MAX_DATAGRAM,
     MOST_LOOPS,
@@ -40,6 +34,7 @@ from router.compiler.lowering.operations import (
     nesting,
 )
 from router.compiler.lowering.protobuf import protobuf_message
+from router.compiler.lowering.steps import TooManyListsError, cdr_layout
 from router.compiler.plan import Record
 from router.errors import SourceSpan
 from router.types.model import MessageType
