@@ -263,6 +263,32 @@ def test_what_is_no_little_endian_cdr_is_refused(delivering: CDLL, head: bytes) 
         assert carrier(head) == python(head)
 
 
+@pytest.mark.parametrize(
+    ("name", "expression"),
+    [
+        ("singles", "float32(xs / max(xs))"),
+        ("singles", "float32((xs - sum(xs)) / (max(xs) if len(text) > 1 else xs[0]))"),
+        ("singles", "float32(xs / (min(xs) - 1))"),
+        ("numbers", "clamp(round(xs), 0, min(len(text), 5))"),
+    ],
+)
+def test_what_is_the_same_for_all_elements_is_computed_once(delivering: CDLL, name: str, expression: str) -> None:
+    source = source_of(xs=List(F32), text=String())
+    python, carrier = from_ros(delivering, made_wire(), case_of("many"), field_map(**{name: expression}), source)
+    for size in (0, 1, 6000):  # 6000 times 6000 turns are too many for a message
+        for text in ("", "a" * size):
+            message = cdr(source, {"xs": [float(1 + place % 7) for place in range(size)], "text": text})
+            assert carrier(message) == python(message)
+
+
+def test_for_each_refuses_a_list_that_would_hold_up_the_thread(delivering: CDLL) -> None:
+    source, wire = source_of(xs=List(U8)), made_wire()
+    _, carrier = from_ros(delivering, wire, case_of("scalars"), field_map(u32="item"), source, for_each="xs")
+    most = 1 << 16
+    assert len(carrier(cdr(source, {"xs": [1] * most}))) == most
+    assert carrier(cdr(source, {"xs": [1] * (most + 1)})) == [MAPPING_ERROR]
+
+
 def test_long_texts_and_lists_get_long_lengths(delivering: CDLL) -> None:
     source = source_of(x=List(U8), t=String())
     fields = field_map(data="x", text="t")

@@ -21,6 +21,17 @@ class TooLargeError(Exception):
 
 
 @dataclass(slots=True)
+class Loop:
+    """A loop whose body is being lowered, with the variables of its elements.
+
+    `flags` are cleared in front of the loop. Each of them tells whether a value that no turn changes has been computed.
+    """
+
+    variables: frozenset[str]
+    flags: list[Slot] = field(default_factory=list)
+
+
+@dataclass(slots=True)
 class Names:
     """`variables` by name. Temporaries and elements are numbered with them in one layout.
 
@@ -32,6 +43,8 @@ class Names:
     temporaries: list[Slot] = field(default_factory=list)
     elements: list[Node] = field(default_factory=list)
     joined: int = 0
+    loops: list[Loop] = field(default_factory=list)
+    """Those around what is being lowered, from the outermost one."""
 
     def temporary(self) -> Slot:
         self.temporaries.append(Slot(0))
