@@ -41,7 +41,7 @@ from router.compiler.expressions.tree import (
     Node as Tree,
 )
 from router.compiler.lowering import functions, lists
-from router.compiler.lowering.names import Loop, Names
+from router.compiler.lowering.names import Names
 from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
@@ -58,6 +58,7 @@ from router.compiler.lowering.operations import (
     integer,
     keep,
     load,
+    once,
     real,
     text,
 )
@@ -98,7 +99,7 @@ class Lowering:
         around, self.names.loops[level:] = self.names.loops[level:], []
         made = self._value(node)
         self.names.loops += around
-        return self._once(made, around[0]) if _is_costly(made) else made
+        return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
 
     def _unchanged(self, node: Tree) -> int | None:
         """Return the outermost loop that leaves a node unchanged, as do all loops in it; None if there is none."""
@@ -109,12 +110,6 @@ class Lowering:
         while level and not read & loops[level - 1].variables:
             level -= 1
         return level if level < len(loops) else None
-
-    def _once(self, made: Code, loop: Loop) -> Code:
-        flag, kept = self.names.temporary(), self.names.temporary()
-        loop.flags.append(flag)
-        computed = code(made, keep(kept), integer(1), keep(flag), DROP)
-        return choice((load(flag),), (load(kept),), computed)
 
     def _value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
         if isinstance(node.kind, ListKind):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Union
 
 from router.compiler.lowering.nodes import Node
-from router.compiler.lowering.operations import MOST_TEXT, Slot
+from router.compiler.lowering.operations import MOST_TEXT, Flag, Slot
 from router.errors import Code, Diagnostic, SourceSpan
 
 Meaning = Union[Slot, Node]
@@ -28,7 +28,7 @@ class Loop:
     """
 
     variables: frozenset[str]
-    flags: list[Slot] = field(default_factory=list)
+    flags: list[Flag] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -49,6 +49,13 @@ class Names:
     def temporary(self) -> Slot:
         self.temporaries.append(Slot(0))
         return self.temporaries[-1]
+
+    def flag(self, loop: Loop) -> Flag:
+        """A flag that is cleared in front of a loop."""
+        made = Flag(0)
+        self.temporaries.append(made)
+        loop.flags.append(made)
+        return made
 
     def element(self, like: Node) -> Node:
         """A new node for an element of a list, of which another one is given."""
