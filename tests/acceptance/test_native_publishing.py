@@ -30,7 +30,7 @@ from tests.ros.peers import Subscriber
 
 FLOAT = "std_msgs/msg/Float32"
 _FLOAT = f"type: {FLOAT}, fields: {{{{data: accel_x}}}}"
-IN_PYTHON = "max_rate: 1000000 Hz, on_limit: latest"
+IN_PYTHON = "max_rate: 1000000000 Hz, on_limit: latest"
 """Holds nothing back, and needs Python."""
 
 

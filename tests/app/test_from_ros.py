@@ -43,7 +43,7 @@ def drive(
 """
 
 
-IN_PYTHON = drive(more=", max_rate: 1000000 Hz, on_limit: latest")
+IN_PYTHON = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
 NOBODY = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 
 

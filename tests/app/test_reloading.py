@@ -48,7 +48,7 @@ FROM_ROS = """\
   rock_measure_result:
     source: {topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}
     fields: auto
-    destinations: [{endpoint: basestation, max_rate: 1000000 Hz, on_limit: latest}]   # which needs Python
+    destinations: [{endpoint: basestation, max_rate: 1000000000 Hz, on_limit: latest}]   # which needs Python
 """
 
 

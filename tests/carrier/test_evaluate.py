@@ -501,3 +501,26 @@ def test_defaults_of_slots(evaluating: CDLL) -> None:
     assert machine.value(load(2)) == 1
     machine.read(b"")
     assert machine.value(load(2)) == 7
+
+
+def test_a_message_that_takes_too_much_work_is_refused(machine: Machine) -> None:
+    """As a list that is gone through for each element of another one."""
+    times = 1 << 13
+    joined = [text(b"a" * 4096), text(b"b" * 4096), Operation("OP_JOIN"), Operation("OP_DROP")]
+    for turn in ((), joined):
+        inner = [integer(times), Operation("OP_REPEAT", size=len(turn) + 1), *turn, Operation("OP_AGAIN")]
+        outer = [integer(times), Operation("OP_REPEAT", size=len(inner) + 1), *inner, Operation("OP_AGAIN")]
+        machine.read(b"")
+        assert machine.value(integer(5), integer(times), Operation("OP_REPEAT", size=1), Operation("OP_AGAIN")) == 5
+        assert isinstance(machine.value(*outer), Refusal)
+        assert isinstance(machine.value(*inner), Refusal)  # of another target
+        machine.read(b"")
+        assert machine.value(integer(5)) == 5
+
+
+def test_a_message_that_gets_too_long_is_refused(machine: Machine) -> None:
+    long = Operation("OP_KNOWN", slot=1, data=b"abcdefgh" * 512)
+    for times, is_refused in ((1 << 10, False), (1 << 15, True)):
+        machine.read(b"")
+        made = machine.message(integer(times), Operation("OP_REPEAT", size=2), long, Operation("OP_AGAIN"))
+        assert isinstance(made, Refusal) is is_refused

@@ -426,6 +426,10 @@ def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) ->
     run_program("from_ros", tmp_path, sanitizers=sanitizers)
 
 
+def test_a_set_that_was_taken_back_is_not_used(tmp_path: Path) -> None:
+    run_program("refused_set", tmp_path, sanitizers=MEMORY)
+
+
 # ---- who serves what
 
 

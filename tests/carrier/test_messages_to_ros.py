@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, assume, event, given, settings
+from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler import check_table
-from router.compiler.expressions import ExpressionError
 from router.compiler.lookup import Definitions
 from router.compiler.program import Handler, Program
 from router.table.model import FieldMap
@@ -28,7 +27,6 @@ from tests.compiler.comparing import same as same_value
 from tests.compiler.compiling import AUTO, RECEIVED_AT, SOURCE, Published, chosen, field_map
 from tests.compiler.generated_types import EACH_TYPE, defaults
 from tests.compiler.payloads import Wire, made_wire, wire_of
-from tests.compiler.test_expressions import filled_fields, texts
 from tests.tables import ROUTES
 
 MANY = settings(max_examples=6 * settings().max_examples, suppress_health_check=list(HealthCheck))
@@ -36,11 +34,6 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "tables"
 F32, F64, U8, I16, I32, U32, I64, U64 = (
     Float(32), Float(64), Int(8, False), Int(16, True), Int(32, True), Int(32, False), Int(64, True), Int(64, False)
 )  # fmt: skip
-
-
-@cache
-def source_wire() -> Wire:
-    return wire_of(Path(__file__).parent / "protos", "source.Envelope")
 
 
 @cache
@@ -201,31 +194,6 @@ def test_random_mappings_make_the_same_messages(
         expected = python(payload)
         event(str(*expected) if isinstance(expected[0], str) else "published")
         assert carrier(payload) == expected
-
-
-# ---- expressions
-
-
-@MANY
-@given(filled_fields(), texts("b", 2), st.data())
-def test_random_expressions_have_the_same_values(
-    delivering: CDLL, filled: tuple[Type, str], when: str, data: st.DataObject
-) -> None:
-    declared, text = filled
-    assume("hypot" not in text + when)  # see below
-    wire = source_wire()
-    case = wire[1].cases["source"]
-    try:
-        python, carrier = to_ros(
-            delivering, wire, case, field_map(it=text), target_of(before=Bool(), it=declared), when
-        )
-    except (Misfit, ExpressionError):
-        event("does not fit")
-        return
-    for payload in data.draw(payloads(case)):
-        expected = python(payload)
-        event(str(*expected) if isinstance(expected[0], str) else "published")
-        assert carrier(payload) == expected, (text, when)
 
 
 # ---- what is lowered

@@ -135,11 +135,13 @@ _SHARED: Mapping[str, Sequence[str]] = {
 }  # fmt: skip
 _PROTOBUF: Mapping[str, Sequence[str]] = {
     "i": ("mode", "grade", "Mode.LESS", "Grade.POOR", "left", "opt", "modes[0]", "inner.grade", "third.value",
+          "message.not", "with.value",
           "int(grade)", "fourth"),
-    "f": ("third.ratio",),
-    "b": ("has(inner)", "has(opt)", "has(grade)", "has(left)", "has(third.grade)", "has(fourth)", "has(message.third)",
+    "f": ("third.ratio", "message.None"),
+    "b": ("has(inner)", "has(opt)", "has(grade)", "has(left)", "has(third.grade)", "has(fourth)",
+          "has(message.third)", "has(message.not)", "has(with)", "has(with.grade)",
           "(mode == Mode.ON)", "(grade in [Grade.FAIR, Grade.GOOD])", "(Mode.LOUD in modes)"),
-    "s": ("right", "loose", "str(mode)"),
+    "s": ("right", "loose", "str(mode)", "message.with.in"),
     "t": (),
     "I": ("modes", "grades", "packed", "expanded"),
     "F": (),

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import ast
 import math
-import re
 import struct
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler import plan
@@ -21,7 +19,6 @@ from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import (
     INT64,
     UINT64,
-    BoolKind,
     FloatKind,
     IntKind,
     Kind,
@@ -48,10 +45,8 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
-from router.errors import Code
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.comparing import same
 from tests.compiler.compiling import (
     SPAN,
     compiled,
@@ -99,131 +94,6 @@ def present(declared: Type) -> st.SearchStrategy[Any]:
     if not isinstance(declared, MessageType):
         return values(declared)
     return st.builds(Present, **{field.name: present(field.type) for field in declared.fields})
-
-
-# texts by kind
-
-_SMALL = st.integers(-10, 300).map(lambda number: f"({number})" if number < 0 else str(number))
-
-
-def _calls(*templates: str) -> Any:
-    """Templates with {i}, {f}, {b} and {s} for an inner integer, float, bool and string expression."""
-    return templates
-
-
-_INTS = _calls(
-    "({i} + {i})", "({i} - {i})", "({i} * {i})", "({i} // {i})", "({i} % {i})", "(-{i})", "(+{i})", "({i} ** 2)",
-    "({i} ** 3)", "abs({i})", "min({i}, {i})", "max({i}, {i}, {i})", "clamp({i}, {i}, {i})", "clamp({i}, -100, 100)",
-    "wrap({i}, -180, 179)", "wrap({i}, 0, 255)", "round({f})", "trunc({f})", "floor({f})", "ceil({f})", "int({b})",
-    "({i} if {b} else {i})", "int(mode)", "len({s})", "len(numbers)", "numbers[1]", "round({i})", "[{i}, {i}][1]",
-    "wrap({i}, {i}, {i})",
-)  # fmt: skip
-_FLOATS = _calls(
-    "({f} + {i})", "({f} - {f})", "({f} * {f})", "({i} / {i})", "({f} / {f})", "({f} // {i})", "({f} % {f})", "(-{f})",
-    "abs({f})", "min({f}, {i})", "max({f}, {f})", "clamp({f}, -1.5, 1.5)", "clamp({f}, {f}, {f})", "radians({f})",
-    "degrees({i})", "sqrt({f})", "sin({f})", "cos({f})", "tan({f})", "atan2({f}, {f})", "hypot({f}, {i})",
-    "float32({f})", "float64({i})", "({f} if {b} else {i})", "({f} ** 2)", "seconds(received_at)",
-)  # fmt: skip
-_BOOLS = _calls(
-    "({i} < {i})", "({f} <= {i} < {f})", "({i} == {f})", "({s} == {s})", "({s} < {s})", "(not {b})", "({b} and {b})",
-    "({b} or {b} or {b})", "({i} in [{i}, {i}, {i}])", "({i} not in numbers)", "(mode == Mode.ON)",
-    "(mode in [Mode.OFF, Mode.LOUD])", "({b} if {b} else {b})", "({b} == {b})", "has(outer)", "has(outer.inner)",
-    "({i} != {i} > {i})", "(source == {s})", "(received_at == received_at)",
-)  # fmt: skip
-_STRINGS = _calls("({s} + {s})", "str({i})", "str({f})", "str({b})", "str(mode)", "({s} if {b} else {s})", "str({s})")
-_LEAVES: dict[str, st.SearchStrategy[str]] = {
-    "i": _SMALL | st.sampled_from(["i8", "u8", "i32", "u64", "mode", "Mode.LESS", "outer.b_c", "message.u8",
-                                   "outer.inner.value", "a.b_c.value", "a_b.c.value"]),
-    "f": st.sampled_from(["f32", "f64", "0.5", "1e6", "outer.inner.ratio", "2.0", "(-0.0)", "a.b_c.ratio", "nan",
-                           "inf"]),
-    "b": st.sampled_from(["flag", "True", "false"]),
-    "s": st.sampled_from(["name", "source", "'ab'", "'é'", "''"]),
-}  # fmt: skip
-_TEMPLATES = {"i": _INTS, "f": _FLOATS, "b": _BOOLS, "s": _STRINGS}
-
-
-@st.composite
-def texts(draw: st.DrawFn, letter: str, depth: int) -> str:
-    if depth == 0 or draw(st.integers(0, 3)) == 0:
-        return draw(_LEAVES[letter])
-    made: str = draw(st.sampled_from(_TEMPLATES[letter]))
-    while "{" in made:
-        start = made.index("{")
-        made = made[:start] + draw(texts(made[start + 1], depth - 1)) + made[start + 3 :]
-    return made
-
-
-expressions = st.sampled_from("ifbs").flatmap(lambda letter: texts(letter, 3))
-REFUSED = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS}
-"""Findings that depend on what literals come to: a division by zero, bounds the wrong way round."""
-
-MANY = settings(suppress_health_check=list(HealthCheck))
-
-
-@MANY
-@given(expressions, present(SOURCE))
-def test_compiled_and_reference_agree(text: str, message: Any) -> None:
-    try:
-        node, run = compiled(text, scope_of(SOURCE, [MODE]))
-    except ExpressionError as error:
-        if error.diagnostic.code not in REFUSED and "nan equals nothing" not in error.diagnostic.message:
-            raise
-        event("refused")
-        return
-    value = outcome(lambda: run(message))
-    by_reference = outcome(lambda: evaluate(written(text), context_of(message, SOURCE, [MODE])))
-    assert same(value, by_reference), (text, value, by_reference)
-    event("failed" if value is MAPPING_FAILURES else "has a value")
-    if value is not MAPPING_FAILURES:
-        assert_of_kind(value, node.kind)
-
-
-def assert_of_kind(value: object, kind: Kind) -> None:
-    match kind:
-        case IntKind(low, high):
-            assert isinstance(value, int)
-            assert low is None or low <= value
-            assert high is None or value <= high
-        case FloatKind():
-            assert isinstance(value, (int, float))
-        case BoolKind():
-            assert isinstance(value, bool)
-        case StringKind():
-            assert isinstance(value, str)
-
-
-@st.composite
-def filled_fields(draw: st.DrawFn) -> tuple[Type, str]:
-    """A field's type and an expression of a kind that may fill it."""
-    target = draw(st.sampled_from(TARGETS))
-    match target:
-        case Int():
-            around = draw(
-                st.sampled_from(["clamp({i})", "wrap({i})", "{i}", "round({f})", "mode", "clamp(round({f}))"])
-            )
-        case Float():
-            around = draw(
-                st.sampled_from([f"float{target.bits}({{f}})", f"float{target.bits}({{i}})", "{f}", "clamp({i}, 0, 9)"])
-            )
-        case Bool():
-            around = "{b}"
-        case _:
-            around = "{s}"
-    inner = draw(texts(around[around.index("{") + 1], 2)) if "{" in around else ""
-    return target, re.sub("{.}", lambda _: inner, around)
-
-
-@MANY
-@given(filled_fields(), present(SOURCE))
-def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
-    target, text = filled
-    declared = MessageType("made/msg/One", (Field("before", Bool(), default=True), Field("it", target)))
-    fields = field_map(it=text)
-    scope = scope_of(SOURCE, [MODE])
-    assume(not build(fields, declared, scope, SPAN).findings)
-    ours = outcome(lambda: serializer(fields, declared, scope)(message))
-    event("refused" if ours is MAPPING_FAILURES else "published")
-    assert ours == outcome(lambda: reference_bytes(fields, declared, context_of(message, SOURCE, [MODE]))), text
 
 
 ROUNDED = IntKind(INT64.low, INT64.high, is_rounded=True)

@@ -11,16 +11,20 @@ import random
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, event, given, settings
+from hypothesis import HealthCheck, event, given, reject, settings
 from hypothesis import strategies as st
 
+from router.compiler.expressions import ExpressionError
+from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, Kind, StringKind
+from router.engine.delivery import MAPPING_FAILURES
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
-from tests.compiler.compiling import context_of, written
+from tests.compiler.compiling import compiled, context_of, outcome, scope_of, written
 from tests.compiler.judging import (
     Answer,
     Misfit,
@@ -28,10 +32,11 @@ from tests.compiler.judging import (
     disagreement,
     is_about_values,
     judged_findings,
+    messages,
     python_plane,
     question,
 )
-from tests.compiler.language import some_language
+from tests.compiler.language import Language, language_wire, some_language
 from tests.oracles.reference_expressions import Context, evaluate
 from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused
 
@@ -221,6 +226,39 @@ def test_mappings_give_in_python_what_the_oracle_gives(noise: random.Random) -> 
 
 @MANY
 @given(noises)
+def test_values_are_in_the_range_that_the_compiler_knows(noise: random.Random) -> None:
+    language = Language(is_ros=False)
+    text = language.text(noise, noise.choice("ifbs"), 3)
+    try:
+        node, run = compiled(text, scope_of(language.source, language_wire()[0].enums.values()))
+    except ExpressionError:
+        reject()
+    for _, view in messages(noise, language):
+        value = outcome(partial(run, view.message))
+        if value is not MAPPING_FAILURES:
+            assert_of_kind(value, node.kind)
+
+
+def assert_of_kind(value: object, kind: Kind) -> None:
+    match kind:
+        case IntKind(low, high):
+            assert isinstance(value, int)
+            assert low <= value <= high
+        case FloatKind(_, low, high):
+            assert isinstance(value, (int, float))
+            assert low <= value <= high or value != value  # noqa: PLR0124 - NaN
+        case EnumKind():
+            assert isinstance(value, int)
+        case BoolKind():
+            assert isinstance(value, bool)
+        case StringKind():
+            assert isinstance(value, str)
+        case _:
+            raise TypeError(kind)
+
+
+@MANY
+@given(noises)
 def test_what_is_ill_typed_is_a_finding_and_the_rest_is_right(noise: random.Random) -> None:
     for finding in judged_findings(question(noise, some_language(noise, is_wild=True)), python_plane, noise):
         assert finding.span.line == 7
@@ -231,7 +269,10 @@ def test_a_plane_that_is_wrong_by_one_bit_is_found() -> None:
         serve = python_plane(asked)
 
         def answers(message: bytes) -> list[Answer]:
-            return [made if isinstance(made, str) else bytes([*made[:-1], made[-1] ^ 1]) for made in serve(message)]
+            return [
+                bytes([*made[:-1], made[-1] ^ 1]) if isinstance(made, bytes) and made else made
+                for made in serve(message)
+            ]
 
         return answers
 

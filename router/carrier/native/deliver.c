@@ -22,7 +22,7 @@ struct delivery {
 
 static void count(const struct delivery *of, uint32_t which) { counter_add(of->stage->counters, which, 1); }
 
-/* Count and report a loss, of which `lost` says the reason and what else is known. Returns false. */
+/* Count and report a loss. `lost` has the reason, and details if there are any. Returns false. */
 static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
     lost.route = of->to->route;
     lost.topic = of->to->topic;
@@ -39,7 +39,7 @@ static bool refuse(const struct delivery *of, int reason, uint32_t place) {
     return lose(of, (struct lost_event){.reason = (uint32_t)reason, .generation = generation, .place = place}, "");
 }
 
-/* The message is older than `ttl`. Of commands, a stall brings many at once: they are counted, and not reported. */
+/* The message is older than `ttl`. Stale commands are only counted: after a stall there are many at once. */
 static bool lose_stale(const struct delivery *of) {
     if (of->target->topic) return lose(of, (struct lost_event){.reason = LOSS_STALE}, "");
     count(of, of->target->dropped[LOSS_STALE]);
@@ -86,7 +86,7 @@ static bool meets_condition(const struct delivery *of) {
     return is_true;
 }
 
-/* Commands to boards are as old as they can be, anything else is as young. */
+/* The age of a message is uncertain: for a command to a board the oldest reading counts, for others the youngest. */
 static int64_t expiry(const struct delivery *of) {
     struct born born = of->message->born;
     return of->to->ttl ? (of->target->board ? born.oldest : born.youngest) + of->to->ttl : NEVER;
@@ -119,7 +119,7 @@ static bool fits_board(const struct delivery *of) {
 
 /* ---- the last step ---- */
 
-/* The size of an envelope without its trailing zeros, if it can be told from the rest how many there were. */
+/* The size of an envelope without its trailing zeros, if the rest tells how many there were. */
 static size_t trimmed_size(const uint8_t *data, size_t size) {
     size_t trimmed = size;
     while (trimmed && !data[trimmed - 1]) trimmed--;
@@ -145,7 +145,7 @@ static void send_it(const struct delivery *of) {
     }
 }
 
-/* Return false if the thread was left. */
+/* Return false if the thread has been given up. */
 static bool publish_it(const struct delivery *of) {
     const char *why;
     switch (of->stage->publish(of->stage, of->target, &why)) {

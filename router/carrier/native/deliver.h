@@ -1,5 +1,5 @@
-/* The one way from a message to a target, whatever feeds it: datagrams in the receive thread and in the one that publishes,
- * and messages from ROS. In this order:
+/* Delivers messages to targets. All threads use it: the receive thread and the publish thread for datagrams, others for
+ * messages from ROS. The steps, in this order:
  *
  *     wanted      a topic needs a subscriber                          else filtered
  *     condition   `when`                                              else filtered
@@ -9,10 +9,10 @@
  *     board       what the firmware can take                          else too_large or non_finite
  *     send or publish, and feed deadmen
  *
- * Every message is counted once at each target. Losses are reported, except those of `max_rate`, which the table asks for,
- * and of stale commands.
+ * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table asks for, and
+ * stale commands.
  *
- * Clock, sockets and middleware are functions of a stage, so that the same steps run without any of them. */
+ * A stage provides the clock, sockets and middleware as functions, so that tests can do without them. */
 #ifndef DELIVER_H
 #define DELIVER_H
 
@@ -31,7 +31,7 @@
 
 /* ---- what a table says ---- */
 
-/* A topic that is published on, by however many routes. */
+/* A topic that any number of routes publish on. */
 struct topic {
     const void *publisher; /* rcl_publisher_t */
     const uint8_t *wanted; /* not 0 while somebody subscribes */
@@ -93,7 +93,7 @@ struct message {
 
 enum publication { PUBLISHED, PUBLISH_FAILED, LEFT };
 
-/* What a thread delivers with. */
+/* What a thread needs to deliver messages. */
 struct stage {
     counter *counters;
     struct reporter reporter;
@@ -103,17 +103,17 @@ struct stage {
     int64_t (*now)(struct stage *stage);
     /* Send as `command_send` does. */
     int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
-    /* Publish the machine's output. `why` is set if that fails, and valid until the next call. LEFT: others went on
-     * without this thread meanwhile, and it may use nothing of theirs. */
+    /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. LEFT: the thread was
+     * stuck in the middleware and has been given up, and must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
 };
 
-/* Prepare a stage with the clock of this computer, and sockets; `publish` is left to the caller. Return false for lack of
- * memory. To be closed in either case. */
+/* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false for lack of memory.
+ * Close the stage in either case. */
 bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct deadmen *deadmen);
 void stage_close(struct stage *stage);
 
-/* Deliver a message to one of the targets. Return false if the thread was left in the middleware. */
+/* Deliver a message to one of the targets. Return false if the thread has been given up (LEFT). */
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);
 
 /* Deliver it to all of them, likewise. */

@@ -179,7 +179,7 @@ static int execute(struct machine *machine, const struct code *code, uint32_t *a
             end_turn(machine, loop);
             if (--loop->left) op = loop->repeat;
             else loop--;
-            break;
+            WANT(spend(machine, 1));
         case OP_NEXT: *++top = list_next(machine, &slots[op->slot], op->flag); break;
         case OP_LIST: top -= op->size; top++; WANT(collect(machine, top, op->size, top));
         case OP_UNPACK: WANT(unpack(machine, top, op->flag));

@@ -18,6 +18,7 @@ enum {
     TOPICS_PER_WAIT = 16,
     LOOK_MS = 250, /* the longest time between two looks at the clocks */
     MOST_PUBLISHERS = 64,
+    MOST_ELEMENTS = 1 << 16, /* that `for_each` sends of one message: the lock is held meanwhile */
 };
 
 /* A publisher sends its messages in order. By the oldest readings of its last message's stamps: */
@@ -93,7 +94,7 @@ static struct born born(struct from_ros *thread, const struct ros_route *route, 
 
 /* ---- messages ---- */
 
-/* Deliver an element of a list, which is then off the list. What it takes of cells is free again behind it. */
+/* Take an element off a list, and deliver it. The cells that this takes are freed afterwards. */
 static void serve_element(struct from_ros *thread, const struct ros_route *route, struct message message,
                           struct value *list, int64_t index) {
     struct machine *machine = &thread->stage.machine;
@@ -107,14 +108,15 @@ static void serve_element(struct from_ros *thread, const struct ros_route *route
     machine->cell_count = cell_count;
 }
 
-/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused counts as one
- * message. */
+/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused or too long counts as
+ * one message. */
 static int64_t serve_each(struct from_ros *thread, const struct ros_route *route, struct message *message) {
     struct machine *machine = &thread->stage.machine;
     struct value list;
     uint32_t at;
     message->place = PLACE_FOR_EACH;
     message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
+    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) message->outcome = LOSS_MAPPING_ERROR;
     if (message->outcome != EVALUATED) {
         deliver_to_all(&thread->stage, &route->targets, message);
         return 1;
@@ -195,10 +197,12 @@ static bool has_subscription(const struct ros_set *set, const void *subscription
     return false;
 }
 
-/* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. */
+/* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. `next` may be taken back
+ * meanwhile. */
 static void serve_rest(struct from_ros *thread, const struct ros_set *set, const struct ros_set *next) {
     for (uint32_t index = 0; set && !thread->is_left && index < set->count; index++) {
         const struct ros_topic *topic = &set->topics[index];
+        if (next && thread->offered != next) return;
         if (next && has_subscription(next, topic->subscription)) continue;
         for (uint32_t left = topic->capacity; left && serve_one(thread, topic); left--) {}
     }

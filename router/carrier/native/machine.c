@@ -30,6 +30,7 @@ void machine_begin(struct machine *machine, const struct layout *layout) {
     machine->layout = layout;
     machine->cell_count = 0;
     machine->text_size = 0;
+    machine->work_left = MOST_WORK;
     memcpy(machine->slots, layout->defaults, layout->slot_count * sizeof *machine->slots);
 }
 

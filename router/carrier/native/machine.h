@@ -2,11 +2,11 @@
  * the messages of targets from it. Each thread that does so has one of its own.
  *
  *     machine_begin(machine, layout);             slots have their defaults
- *     machine->slots[...] = ...;                  what is no field: the time of receipt, the sender's name
+ *     machine->slots[...] = ...;                  values other than fields: time of receipt, sender
  *     machine_read(machine, node, data, size);    fields are in slots now
  *     evaluate_condition(...), evaluate_message(...)   any number of times (evaluate.h)
  *
- * Text, bytes and lists in slots point into the message that was read, which has to stay until the next begin. */
+ * Text, bytes and lists in slots point into the message that was read: it must not change until the next begin. */
 #ifndef MACHINE_H
 #define MACHINE_H
 
@@ -19,7 +19,10 @@
 
 enum {
     FIRST_CELLS = 16 * 1024, /* enough for a datagram: each element of a list takes at least a byte of it */
-    MOST_CELLS = 1 << 22     /* 128 MiB; a message that needs more is refused */
+    /* A message that needs more is refused: */
+    MOST_CELLS = 1 << 22, /* 96 MiB */
+    MOST_WORK = 1 << 24,  /* turns of loops in all programs together, or BYTES_PER_TURN of text */
+    BYTES_PER_TURN = 16
 };
 
 struct machine {
@@ -29,16 +32,25 @@ struct machine {
     uint32_t cell_count, cell_capacity;
     uint8_t *text; /* MOST_TEXT bytes, for text that programs put together */
     size_t text_size;
+    uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* what was read last; offsets in CDR count from its first byte */
     struct output output;                 /* the message that was written last */
     struct value stack[MOST_STACKED];
 };
 
-/* Allocate what a machine needs. Return false for lack of memory. To be closed in either case. */
+/* Note work that a program does, in turns of loops. Return false if the message takes too much: lists that are gone
+ * through for each element of others could hold up a thread for hours. */
+static inline bool spend(struct machine *machine, size_t work) {
+    bool is_enough = work <= machine->work_left;
+    machine->work_left = is_enough ? machine->work_left - (uint32_t)work : 0;
+    return is_enough;
+}
+
+/* Allocate what a machine needs. Return false for lack of memory. Close the machine in either case. */
 bool machine_open(struct machine *machine);
 void machine_close(struct machine *machine);
 
-/* Begin with another message, of this layout: all slots get their defaults, cells and text are free again. */
+/* Begin with another message, of this layout: slots get their defaults, cells and text are freed. */
 void machine_begin(struct machine *machine, const struct layout *layout);
 
 /* Read a message into the slots of a node. Return false if it is malformed, or for lack of memory. */

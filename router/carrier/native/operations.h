@@ -11,7 +11,7 @@
 #include <stdint.h>
 
 enum {
-    MOST_STACKED = 256,  /* values at a time, and one that is not used */
+    MOST_STACKED = 256,  /* values at a time; the first one is never used */
     MOST_LOOPS = 8,      /* loops in loops */
     MOST_OPEN = 32,      /* payloads in payloads, while one is written */
     MOST_TEXT = 1 << 20  /* bytes of text that a program puts together: the compiler has added them up */
@@ -20,7 +20,7 @@ enum { NONE = UINT16_MAX }; /* no such slot, node or enum */
 
 /* ---- values ---- */
 
-/* Elements of a list in cells; of none, `first` means nothing. */
+/* A list in cells. If it is empty, `first` and `last` have no meaning. */
 struct list {
     uint32_t first, last;
 };
@@ -133,7 +133,7 @@ enum operation_kind {
     OP_FIT_SIZE,   /* refuses more than `integer` bytes */
     OP_UTF8,       /* refuses what is not UTF-8 */
     OP_OCTETS,     /* a list of integers, stored as `flag` says, as bytes; refuses integers beyond 0 to 255 */
-    OP_MEMBER,     /* refuses an integer that is none of `size` int32 in the literals, which ascend from `integer` on */
+    OP_MEMBER,     /* refuses an integer that is not among `size` ascending int32 in the literals, from `integer` */
     /* Lists. `flag` (enum scalar) says how a list is stored: */
     OP_ELEMENT, /* the element with the index `integer`; refuses a list that has none */
     OP_ENTER,   /* pops a message, and reads it into node `slot` */

@@ -8,15 +8,20 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* Bytes of a message. A list that is written for each element of another one could fill the memory. */
+enum { MOST_WRITTEN = 1 << 26 };
+
 struct output {
     uint8_t *data;
     size_t size, capacity;
 };
 
-/* Make room for `size` more bytes. Return false for lack of memory. */
+/* Make room for `size` more bytes. Return false for lack of memory, or if the message gets too long. */
 static inline bool has_room(struct output *output, size_t size) {
     if (size <= output->capacity - output->size) return true;
+    if (size > MOST_WRITTEN - output->size) return false;
     size_t capacity = output->capacity * 2 + size;
+    if (capacity > MOST_WRITTEN) capacity = MOST_WRITTEN;
     uint8_t *data = realloc(output->data, capacity);
     if (!data) return false;
     output->data = data;

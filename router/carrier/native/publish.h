@@ -1,4 +1,4 @@
-/* The thread that publishes what topics get of datagrams: it takes messages from a ring, and delivers them (deliver.h).
+/* The thread that publishes datagrams on topics: it takes messages from a ring, and delivers them (deliver.h).
  *
  * A publisher may block in the middleware: then all topics of the thread wait, and the ring drops its oldest messages.
  * Nothing else waits. The thread holds its lock while it serves a message, never while it publishes or waits. */

@@ -1,4 +1,4 @@
-/* What a thread tells of losses and rejections, as events (events.h). A flood is counted, not reported. */
+/* Reports losses and rejections as events (events.h). Their number is limited: in a flood, most are only counted. */
 #ifndef REPORT_H
 #define REPORT_H
 
@@ -8,17 +8,17 @@
 #include "events.h"
 #include "ring.h"
 
-/* Of one thread: where it reports, and how many events it may still write in this window of time. */
+/* Of one thread: the ring for its events, and how many more it may write in this window of time. */
 struct reporter {
     struct ring *events;
     int64_t window_began;
     uint32_t left;
 };
 
-/* Whether another event may be written at the time `now` (boot clock), which is then to be done. */
+/* Whether another event may be written at `now` (boot clock). If so, the caller writes one. */
 bool may_report(struct reporter *reporter, int64_t now);
 
-/* Report a loss, whose size and kind are filled in here, with a text that says more, or "". */
+/* Report a loss, with a text that gives details, or "". Fills in the size and kind of the event. */
 void report_loss(struct reporter *reporter, int64_t now, const struct lost_event *lost, const char *text);
 
 #endif

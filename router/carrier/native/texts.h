@@ -1,5 +1,5 @@
-/* Text that programs make. It is in the machine's text buffer until the program ends, or the turn of the loop that made
- * it. Functions return false if the buffer is full. */
+/* Text that programs make. It stays in the machine's text buffer until the program ends, or the turn of the loop that
+ * made it. Functions return false if the buffer is full, or the message takes too much work. */
 #ifndef TEXTS_H
 #define TEXTS_H
 
@@ -16,9 +16,9 @@ static inline struct value text_of(const void *bytes, size_t size) {
     return (struct value){.bytes = bytes, .size = (uint32_t)size};
 }
 
-/* Take `size` bytes of the buffer, or return NULL. */
+/* Take `size` bytes of the buffer. Return NULL if that is refused. */
 static inline uint8_t *take_text(struct machine *machine, size_t size) {
-    if (size > MOST_TEXT - machine->text_size) return NULL;
+    if (size > MOST_TEXT - machine->text_size || !spend(machine, size / BYTES_PER_TURN)) return NULL;
     uint8_t *taken = machine->text + machine->text_size;
     machine->text_size += size;
     return taken;

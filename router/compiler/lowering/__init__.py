@@ -22,11 +22,11 @@ from router.types.protobuf import Envelope
 
 @dataclass(frozen=True, slots=True)
 class LoweredTarget:
-    """What makes the message of a target. `condition` is its `when`, or empty; `message` is empty for a destination
-    from UDP, which gets the envelope as it was received.
+    """The programs of a target: `condition` for its `when`, and `message`, which writes what it gets.
 
-    `places` say where in the table a message may be refused, by `enum place` in `native/events.h`: "", the condition,
-    `for_each`, and what each operation of `message` fills.
+    Without a `when` the condition is empty. A destination from UDP gets the envelope as it was received: its `message`
+    is empty. `places` are the places of the table where a message may be refused, by `enum place` in `native/events.h`:
+    "", the condition, `for_each`, and what each operation of `message` fills.
     """
 
     label: str
@@ -60,7 +60,7 @@ class LoweredElements:
 
 @dataclass(frozen=True, slots=True)
 class LoweredFeed:
-    """What a route makes of the messages of one topic. It is urgent if they expire or feed or disarm a deadman.
+    """The programs of a route for the messages of one topic. They are urgent if they expire, feed or disarm a deadman.
 
     `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
     """

@@ -7,12 +7,13 @@ is on the stack only as an element of a list: its fields are read from a Node.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import (
+    BytesKind,
     FloatKind,
     Kind,
     ListKind,
@@ -34,6 +35,7 @@ from router.compiler.expressions.tree import (
     Read,
     Unary,
     Variable,
+    parts_of,
 )
 from router.compiler.expressions.tree import (
     Node as Tree,
@@ -45,6 +47,7 @@ from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
     Code,
+    Compared,
     Op,
     Operation,
     Scalar,
@@ -55,6 +58,7 @@ from router.compiler.lowering.operations import (
     integer,
     keep,
     load,
+    once,
     real,
     text,
 )
@@ -85,8 +89,29 @@ class Lowering:
 
     names: Names
 
-    def value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
-        """Return the operations that put the value of a node on the stack."""
+    def value(self, node: Tree) -> Code:
+        """Return the operations that put the value of a node on the stack.
+
+        A value that no turn of a loop changes is computed once, in the first turn that needs it.
+        """
+        if (level := self._unchanged(node)) is None:
+            return self._value(node)
+        around, self.names.loops[level:] = self.names.loops[level:], []
+        made = self._value(node)
+        self.names.loops += around
+        return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
+
+    def _unchanged(self, node: Tree) -> int | None:
+        """Return the outermost loop that leaves a node unchanged, as do all loops in it; None if there is none."""
+        loops = self.names.loops
+        if not loops or not _can_be_kept(node):
+            return None
+        read, level = set(_variables(node)), len(loops)
+        while level and not read & loops[level - 1].variables:
+            level -= 1
+        return level if level < len(loops) else None
+
+    def _value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
         if isinstance(node.kind, ListKind):
             return lists.stored(self, node).code
         match node:
@@ -215,6 +240,31 @@ class Lowering:
             for relation, first, second, both in zip(node.relations, firsts, seconds, kinds, strict=True)
         ]
         return chained(Op.AND, parts)
+
+
+_COSTLY = frozenset({
+    Op.REPEAT, Op.ENTER, Op.JOIN, Op.DIGITS, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.ELEMENT,
+})  # fmt: skip
+"""Operations whose time grows with a list, a text or a message."""
+
+
+def _is_costly(made: Code) -> bool:
+    return any(each.kind in _COSTLY or (each.kind is Op.COMPARE and each.slot == Compared.TEXTS) for each in made)
+
+
+def _can_be_kept(node: Tree) -> bool:
+    """Whether a value can stay in a slot from turn to turn: no list, and no text that the program puts together."""
+    if isinstance(node.kind, StringKind):
+        return isinstance(node, Read) or (isinstance(node, Element) and isinstance(node.values, Read))
+    return not isinstance(node, (Constant, Variable)) and not isinstance(node.kind, (ListKind, MessageKind, BytesKind))
+
+
+def _variables(node: Tree) -> Iterator[str]:
+    """The names of all variables that a node reads."""
+    if isinstance(node, Variable):
+        yield node.name
+    for part in parts_of(node):
+        yield from _variables(part)
 
 
 def _is_unchecked(holder: Node, member: Field, kind: Kind) -> bool:

@@ -24,6 +24,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.expressions.tree import Call, Choice, Contains, Each, Element, Listed, Read, Relation, Variable
 from router.compiler.expressions.tree import Node as Tree
+from router.compiler.lowering.names import Loop
 from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs
 from router.compiler.lowering.operations import (
@@ -186,7 +187,8 @@ def looped(
     On the stack, it changes the value on top at the most.
     """
     counted, each = gone_through(lowering, lists)
-    return code(counted, repeat(code_of_each(lowering, each, body), keeps=keeps))
+    before, turn = code_of_each(lowering, each, body)
+    return code(counted, before, repeat(turn, keeps=keeps))
 
 
 Taken = tuple[str, Stored, Slot]
@@ -207,15 +209,19 @@ def gone_through(lowering: Lowering, lists: Sequence[tuple[str, Tree]]) -> tuple
     return made, taken
 
 
-def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Code]) -> Code:
-    """Lower one turn of a loop: take an element off each list, and do `body`."""
+def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Code]) -> tuple[Code, Code]:
+    """Return what comes in front of a loop, and its body: what is done with the next element of each list."""
     before: Code = ()
     for variable, of, slot in taken:
         one, node = _taken(lowering, of, slot)
         meaning = node or lowering.names.temporary()
         lowering.names.variables[variable] = meaning
         before = code(before, one) if isinstance(meaning, Node) else code(before, one, keep(meaning), DROP)
-    return _without_a_detour(code(before, body()))
+    loop = Loop(frozenset(variable for variable, _, _ in taken))
+    lowering.names.loops.append(loop)
+    turn = _without_a_detour(code(before, body()))
+    lowering.names.loops.pop()
+    return code(*((integer(0), keep(flag), DROP) for flag in loop.flags)), turn
 
 
 def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Code, Node | None]:

@@ -70,8 +70,8 @@ def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[]
         placed.extend(body())
         return tuple(operation for operation, _ in placed)
 
-    made = lists.code_of_each(lowering, taken, lowered)
+    before, made = lists.code_of_each(lowering, taken, lowered)
     front = len(made) - len(placed)
     places = [place] * front + [own for _, own in placed]
     opening, *_, closing = repeat(made)
-    return [(opening, place), *zip(made, places, strict=True), (closing, place)]
+    return [*at(place, before), (opening, place), *zip(made, places, strict=True), (closing, place)]

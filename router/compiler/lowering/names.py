@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Union
 
 from router.compiler.lowering.nodes import Node
-from router.compiler.lowering.operations import MOST_TEXT, Slot
+from router.compiler.lowering.operations import MOST_TEXT, Flag, Slot
 from router.errors import Code, Diagnostic, SourceSpan
 
 Meaning = Union[Slot, Node]
@@ -21,6 +21,17 @@ class TooLargeError(Exception):
 
 
 @dataclass(slots=True)
+class Loop:
+    """A loop whose body is being lowered, with the variables of its elements.
+
+    `flags` are cleared in front of the loop. Each of them tells whether a value that no turn changes has been computed.
+    """
+
+    variables: frozenset[str]
+    flags: list[Flag] = field(default_factory=list)
+
+
+@dataclass(slots=True)
 class Names:
     """`variables` by name. Temporaries and elements are numbered with them in one layout.
 
@@ -32,10 +43,19 @@ class Names:
     temporaries: list[Slot] = field(default_factory=list)
     elements: list[Node] = field(default_factory=list)
     joined: int = 0
+    loops: list[Loop] = field(default_factory=list)
+    """Those around what is being lowered, from the outermost one."""
 
     def temporary(self) -> Slot:
         self.temporaries.append(Slot(0))
         return self.temporaries[-1]
+
+    def flag(self, loop: Loop) -> Flag:
+        """A flag that is cleared in front of a loop."""
+        made = Flag(0)
+        self.temporaries.append(made)
+        loop.flags.append(made)
+        return made
 
     def element(self, like: Node) -> Node:
         """A new node for an element of a list, of which another one is given."""

@@ -188,6 +188,12 @@ class Slot:
     index: int = -1
 
 
+class Flag(Slot):
+    """Tells whether a value has been computed in a loop: see `once`."""
+
+    __slots__ = ()
+
+
 class Operation(NamedTuple):
     """`struct operation`; `slot` may be what has an index, `data` are bytes of the literals."""
 
@@ -260,6 +266,11 @@ def choice(test: Code, body: Code, orelse: Code) -> Code:
     return code(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
 
 
+def once(made: Code, flag: Flag, kept: Slot) -> Code:
+    """`made`, in a loop: it is computed when its value is first needed, and then kept. `flag` is 0 before the loop."""
+    return choice((load(flag),), (load(kept),), code(made, keep(kept), integer(1), keep(flag), DROP))
+
+
 # ---- what is known of a program
 
 _GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
@@ -314,12 +325,22 @@ _BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op
 _BYTES_AT_A_TIME = 16
 
 
+def _flag(operation: Operation) -> Flag | None:
+    """The flag that an operation loads: it is the first one of those that `once` makes."""
+    return operation.slot if operation.kind is Op.LOAD and isinstance(operation.slot, Flag) else None
+
+
 def most_executed(operations: Sequence[Operation]) -> int:
     """How many operations a datagram can have executed, at the most: a loop has as many elements as that has bytes."""
     total, times = 0, [1]
+    flags: dict[int, int] = {}  # how often a flag is cleared
+    ends: list[int] = []  # of what is computed once
     previous: Op | None = None
-    for operation in operations:
-        cost = 1
+    for index, operation in enumerate(operations):
+        while ends and ends[-1] == index:
+            ends.pop()
+            times.pop()
+        cost, slot = 1, operation.slot
         if operation.kind in _BYTEWISE or (operation.kind is Op.ENTER and previous is not Op.NEXT):
             cost += MAX_DATAGRAM // _BYTES_AT_A_TIME
         elif operation.kind is Op.ELEMENT:
@@ -329,5 +350,10 @@ def most_executed(operations: Sequence[Operation]) -> int:
             times.append(times[-1] * MAX_DATAGRAM)
         elif operation.kind is Op.AGAIN:
             times.pop()
+        elif isinstance(slot, Flag) and operation.kind is Op.KEEP:
+            flags.setdefault(id(slot), times[-1])
+        elif operation.kind is Op.JUMP and (flag := _flag(operations[index - 3])) is not None:
+            ends.append(index + 1 + operation.size)
+            times.append(flags[id(flag)])
         previous = operation.kind
     return total
