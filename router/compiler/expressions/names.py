@@ -112,6 +112,15 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
     return path
 
 
+def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
+    """The message for the `message` of `message.name`, unless it has a submessage of that name; None for all else."""
+    member = scope.message.field(MESSAGE)
+    is_meant = (
+        isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)
+    )
+    return scope.whole_message(text.span(holder)) if is_meant else None
+
+
 def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """`holder.name`."""
     span = text.span(node)
