@@ -281,7 +281,10 @@ def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
         if not is_list(right.kind):
-            raise ExpressionError(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
+            hint = "texts are compared as a whole, with ==" if isinstance(right.kind, StringKind) else ""
+            raise ExpressionError(
+                right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}", hint
+            )
         other = element_of(right.kind)
     if other is None or isinstance(left.kind, MessageKind) or is_list(left.kind) or join(left.kind, other) is None:
         message = f"{left.kind} cannot be compared with {right.kind}"

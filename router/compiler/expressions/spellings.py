@@ -11,7 +11,8 @@ INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
 DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
 
-SQUARE = "write x ** 2; there is no power of bits"
+SQUARE = "x ** 2 is the square; of bools, write a != b"
+SHIFT = "write x * 2 ** 3 for x << 3, x // 2 ** 3 for x >> 3"
 BITS = "there are no operations on bits; `{}` is for bools"
 FLOAT = "write float64(x), or float32(x)"
 
@@ -79,6 +80,7 @@ FUNCTIONS = {
     **dict.fromkeys(("deg", "rad2deg", "to_degrees", "radtodeg"), "write degrees(x)"),
     "to_string": "write str(x), or text(x, 2) for decimals",
     **dict.fromkeys(("avg", "mean", "average"), "write sum(x) / len(x)"),
+    **dict.fromkeys(("any", "all"), "write `value in x`, or compare min(x) or max(x)"),
     "now": ARRIVAL,
     "time": ARRIVAL,
 }
