@@ -26,7 +26,6 @@ from router.compiler.expressions.kinds import (
     MessageKind,
     StringKind,
     TimeKind,
-    is_list,
     kind_of,
 )
 from router.compiler.expressions.lists import fitted
@@ -180,10 +179,13 @@ def _want_finite(value: Node, target: Type) -> None:
         )
 
 
+_OF_LIST = "; min(x), max(x), sum(x) and len(x) make a number of a list"
+
+
 def mismatch(value: Node, target: Type, hint: str = "") -> ExpressionError:
     """The error for a value whose kind cannot fill the type."""
-    if is_list(value.kind) and not isinstance(target, (List, MessageType)):
-        hint = hint or "x[0] is one element; min(x), max(x), sum(x) and len(x) make a number of a list"
+    if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
+        hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 

@@ -95,7 +95,7 @@ def _want_count(function: Function, count: int, span: SourceSpan) -> None:
 
 
 _OF_MORE = {"round": "write round(x * 100) / 100 for two decimals, text(x, 2) for text"}
-_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS}
+_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS, "wrap": spellings.WRAPPED}
 
 
 def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:

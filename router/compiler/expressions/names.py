@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE
-from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, MessageKind, StringKind, TimeKind
+from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, ListKind, MessageKind, StringKind, TimeKind
 from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
 from router.compiler.expressions.syntax import Parsed, dotted
@@ -121,11 +121,17 @@ def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
     return scope.whole_message(text.span(holder)) if is_meant else None
 
 
+_OF_OTHERS = {
+    ListKind: "only messages have fields: name an element, as in x[0].y",
+    TimeKind: "seconds(x) makes a number of a time",
+}
+
+
 def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """`holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
-        hint = "only messages have fields"
+        hint = _OF_OTHERS.get(type(holder.kind), "only messages have fields")
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:

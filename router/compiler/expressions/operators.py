@@ -257,6 +257,8 @@ def _comparison_hint(left: Node, right: Node) -> str:
     kinds = (left.kind, right.kind)
     if any(isinstance(kind, MessageKind) for kind in kinds):
         return "compare its fields"
+    if any(isinstance(kind, TimeKind) for kind in kinds):
+        return "compare seconds(x), or two times: time_from_seconds(x) makes one"
     if any(map(is_list, kinds)):
         return _OF_LISTS
     return _comparable_value(left, right) or _comparable_value(right, left)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 
 CONDITIONAL = "write `b if a else c`"
-LEFT_OUT = "a field that is left out keeps its default; `when` keeps a message from being sent"
+LEFT_OUT = (
+    "has(x) asks whether a field is set; one that is left out keeps its default; `when` keeps a message from being sent"
+)
 ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
+WRAPPED = "round(x) makes an integer of it; x % 360 wraps a float"
 DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
 
