@@ -106,7 +106,7 @@ class EventThread:
             _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
             route, target = self._name(of_route), self._name(of_target)
             detail = bytes(record[_LOSS.size :]).partition(b"\0")[0].decode(errors="replace")
-            if place:
+            if generation:  # a program of the table refused the message
                 topic = self._name(of_topic) if of_topic != NO_NAME else None
                 detail = self._place(route, topic, target, generation, place)
             lost = Report("drop", route, target, LOSSES[loss], _error(number), detail)

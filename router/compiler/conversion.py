@@ -102,7 +102,11 @@ def _to_same_named(value: Node, source: MessageType, target: MessageType, scope:
         given = same_named(value, member)
         members.append((member, convert(given, member.type, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
-        raise mismatch(value, target, "they have no field name in common")
+        is_time = {source.name, target.name} == _TIMES
+        hint = (
+            "write {sec: clamp(x.seconds), nanosec: clamp(x.nanos)}" if is_time else "they have no field name in common"
+        )
+        raise mismatch(value, target, hint)
     return Record(target, tuple(members), value.span)
 
 
@@ -167,8 +171,13 @@ def _want_finite(value: Node, target: Type) -> None:
         )
 
 
+_OF_LIST = "; min(x), max(x), sum(x) and len(x) make a number of a list"
+
+
 def mismatch(value: Node, target: Type, hint: str = "") -> ExpressionError:
     """The error for a value whose kind cannot fill the type."""
+    if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
+        hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 

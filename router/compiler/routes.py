@@ -255,7 +255,9 @@ def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
 
 def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | None:
     """The list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
-    node = lookup.value(expression, scope, (ListKind,), "'for_each' takes a list")
+    node = lookup.value(
+        expression, scope, (ListKind,), "'for_each' takes a list", 'a literal is written in quotes: "[left, right]"'
+    )
     if node is not None and isinstance(node.kind, ListKind) and node.kind.element is None:
         lookup.report(node.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
         return None

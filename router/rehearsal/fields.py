@@ -392,10 +392,15 @@ def shown(kind: Type, value: Any) -> str:
 
 
 def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]:
-    """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text."""
+    """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text.
+
+    Of a submessage that is not set there is none: it may be of the type of the message, and that without end.
+    """
     if isinstance(kind, MessageType):
         for field in kind.fields:
-            yield from leaves(field.type, getattr(value, field.name), (*path, field.name))
+            is_submessage = isinstance(value, Message) and isinstance(field.type, MessageType)
+            if not is_submessage or value.HasField(field.name):
+                yield from leaves(field.type, getattr(value, field.name), (*path, field.name))
     elif isinstance(kind, List):
         for index, element in enumerate(_elements(kind, value)):
             yield from leaves(kind.element, element, (*path, index))

@@ -213,6 +213,18 @@ def test_refusal_says_what_to_do() -> None:
         assert hint in finding.hint
 
 
+def test_what_is_said_of_a_timestamp_fills_a_time() -> None:
+    timestamp = MessageType(
+        "google.protobuf.Timestamp", (Field("seconds", Int(64, True)), Field("nanos", Int(32, True)))
+    )
+    stamped = MessageType("Stamped", (Field("x", timestamp),))
+    declared = MessageType("m/msg/It", (Field("it", TIME),))
+    (finding,) = findings_of(field_map(it="x"), declared, scope_of(stamped))
+    assert "sec: clamp(x.seconds), nanosec: clamp(x.nanos)" in finding.hint
+    filled = field_map(it__sec="clamp(x.seconds)", it__nanosec="clamp(x.nanos)")
+    assert not findings_of(filled, declared, scope_of(stamped))
+
+
 @pytest.mark.parametrize(
     ("entries", "codes"),
     [

@@ -220,6 +220,20 @@ def test_words_of_python_are_names_where_they_mean_nothing_else(text: str) -> No
     check(written(text), scope_of(WORDS))
 
 
+@pytest.mark.parametrize(("text", "path"), [
+    ("message", ("message",)), ("message.message", ("message",)), ("message.in", ("in",)),
+])  # fmt: skip
+def test_the_message_is_named_beside_a_field_called_message(text: str, path: tuple[str, ...]) -> None:
+    status = MessageType("Status", (Field("message", String()), Field("in", Bool())))
+    assert path_of(check(written(text), scope_of(status))) == path
+
+
+def test_a_submessage_called_message_is_reached_by_its_name() -> None:
+    part = MessageType("Part", (Field("in", Bool()),))
+    status = MessageType("Status", (Field("message", part), Field("in", Bool())))
+    assert path_of(check(written("message.in"), scope_of(status))) == ("message", "in")
+
+
 @pytest.mark.parametrize(
     ("text", "columns", "words"),
     [

@@ -379,6 +379,16 @@ def test_every_scalar_of_a_message_is_listed_by_its_path(tmp_path: Path) -> None
     }
 
 
+def test_a_message_in_itself_is_followed_as_far_as_it_is_set(tmp_path: Path) -> None:
+    (tmp_path / "tree.proto").write_text(
+        'syntax = "proto3"; message Tree { int32 number = 1; Tree sub = 2; }'
+        "message PBEnvelope { oneof payload { Tree tree = 1; } }"
+    )
+    case = wire_of_protos(tmp_path).case("tree")
+    message = case.message_class(number=1, sub={"number": 2})
+    assert list(leaves(case.type, message)) == [("number", "1"), ("sub.number", "2")]
+
+
 # what fails
 
 

@@ -35,7 +35,7 @@ struct lost_event {
 #define NO_NAME UINT32_MAX
 
 /* Where a program refuses a message: `places` of a LoweredTarget in compiler/lowering. */
-enum place { PLACE_UNKNOWN, PLACE_CONDITION, PLACE_FOR_EACH, PLACE_OPERATIONS /* and the index of one */ };
+enum place { PLACE_MESSAGE, PLACE_CONDITION, PLACE_FOR_EACH, PLACE_OPERATIONS /* and the index of one */ };
 
 /* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
 enum loss {

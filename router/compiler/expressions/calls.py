@@ -88,12 +88,14 @@ def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list
 def _want_count(function: Function, count: int, span: SourceSpan) -> None:
     takes = len(function.parameters)
     if count < takes or (count > takes and not function.variadic):
-        wanted = plural(takes, "argument") + " or more, or one list," * function.variadic
+        wanted = plural(takes, "argument") + " or more, or one list" * function.variadic
         message = f"{function.name}() takes {wanted}, not {count}"
-        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
+        hint = _OF_MORE.get(function.name, "") if count > takes else ""
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, hint or f"write {function.signature}")
 
 
-_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS}
+_OF_MORE = {"round": "write round(x * 100) / 100 for two decimals, text(x, 2) for text"}
+_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS, "wrap": spellings.WRAPPED}
 
 
 def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:

@@ -22,6 +22,7 @@ from router.compiler.expressions.names import (
     named,
     presence,
     want_senders,
+    whole_message,
 )
 from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope
@@ -171,7 +172,8 @@ class _Checker:
             case ast.Attribute() if path := constant_path(node, self.scope):
                 return constant_at(path, node, self.text, self.scope)
             case ast.Attribute():
-                return member_of(self.check(node.value), node, self.text)
+                holder = whole_message(node.value, self.text, self.scope) or self.check(node.value)
+                return member_of(holder, node, self.text)
             case ast.Subscript():
                 return lists.item_of(self.check(node.value), self.check(node.slice), span, self.scope)
             case ast.UnaryOp():

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE
-from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, MessageKind, StringKind, TimeKind
+from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, ListKind, MessageKind, StringKind, TimeKind
 from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
 from router.compiler.expressions.syntax import Parsed, dotted
@@ -112,11 +112,26 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
     return path
 
 
+def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
+    """The message for the `message` of `message.name`, unless it has a submessage of that name; None for all else."""
+    member = scope.message.field(MESSAGE)
+    is_meant = (
+        isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)
+    )
+    return scope.whole_message(text.span(holder)) if is_meant else None
+
+
+_OF_OTHERS = {
+    ListKind: "only messages have fields: name an element, as in x[0].y",
+    TimeKind: "seconds(x) makes a number of a time",
+}
+
+
 def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """`holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
-        hint = "only messages have fields"
+        hint = _OF_OTHERS.get(type(holder.kind), "only messages have fields")
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:

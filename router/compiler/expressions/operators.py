@@ -260,6 +260,8 @@ def _comparison_hint(left: Node, right: Node) -> str:
     kinds = (left.kind, right.kind)
     if any(isinstance(kind, MessageKind) for kind in kinds):
         return "compare its fields"
+    if any(isinstance(kind, TimeKind) for kind in kinds):
+        return "compare seconds(x), or two times: time_from_seconds(x) makes one"
     if any(map(is_list, kinds)):
         return _OF_LISTS
     return _comparable_value(left, right) or _comparable_value(right, left)
@@ -284,7 +286,10 @@ def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
         if not is_list(right.kind):
-            raise ExpressionError(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
+            hint = "texts are compared as a whole, with ==" if isinstance(right.kind, StringKind) else ""
+            raise ExpressionError(
+                right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}", hint
+            )
         other = element_of(right.kind)
     if other is None or isinstance(left.kind, MessageKind) or is_list(left.kind) or join(left.kind, other) is None:
         message = f"{left.kind} cannot be compared with {right.kind}"

@@ -5,11 +5,16 @@ from __future__ import annotations
 import re
 
 CONDITIONAL = "write `b if a else c`"
-LEFT_OUT = "a field that is left out keeps its default; `when` keeps a message from being sent"
+LEFT_OUT = (
+    "has(x) asks whether a field is set; one that is left out keeps its default; `when` keeps a message from being sent"
+)
 ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
+WRAPPED = "round(x) makes an integer of it; x % 360 wraps a float"
 DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
+SQUARE = "x ** 2 is the square; of bools, write a != b"
+SHIFT = "write x * 2 ** 3 for x << 3, x // 2 ** 3 for x >> 3"
 BITS = "there are no operations on bits; `{}` is for bools"
 FLOAT = "write float64(x), or float32(x)"
 
@@ -77,6 +82,7 @@ FUNCTIONS = {
     **dict.fromkeys(("deg", "rad2deg", "to_degrees", "radtodeg"), "write degrees(x)"),
     "to_string": "write str(x), or text(x, 2) for decimals",
     **dict.fromkeys(("avg", "mean", "average"), "write sum(x) / len(x)"),
+    **dict.fromkeys(("any", "all"), "write `value in x`, or compare min(x) or max(x)"),
     "now": ARRIVAL,
     "time": ARRIVAL,
 }

@@ -156,7 +156,9 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
 
 _HINTS: dict[type[ast.AST], str] = {
     ast.Constant: f"literals are numbers, strings, True and False; {spellings.LEFT_OUT}",
-    ast.BitXor: spellings.POWER,
+    ast.BitXor: spellings.SQUARE,
+    ast.LShift: spellings.SHIFT,
+    ast.RShift: spellings.SHIFT,
     ast.BitAnd: spellings.BITS.format("and"),
     ast.BitOr: spellings.BITS.format("or"),
     ast.Invert: spellings.BITS.format("not"),

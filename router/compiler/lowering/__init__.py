@@ -173,7 +173,7 @@ def _lowered_feed(checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFe
         condition = source.condition(lowering, [feed.when, target.when])
         assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
         message = source.sent(lowering, target.plan, checked.case)
-        places = "", condition.place, place, *message.places
+        places = f"{feed.topic.span}: a malformed message", condition.place, place, *message.places
         targets[target.label] = LoweredTarget(target.label, condition.code, message.code, places)
     layout = source.layout(feed.topic.span)
     return LoweredFeed(
