@@ -102,7 +102,7 @@ def _to_same_named(value: Node, source: MessageType, target: MessageType, scope:
         given = same_named(value, member)
         members.append((member, convert(given, member.type, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
-        is_time = {source.name, target.name} == _TIMES
+        is_time = {source.name, target.name} == STAMP_TYPES
         hint = (
             "write {sec: clamp(x.seconds), nanosec: clamp(x.nanos)}" if is_time else "they have no field name in common"
         )

@@ -239,6 +239,16 @@ def test_a_refusal_names_its_place(opened: Open) -> None:
     assert all("distance_to_go" in place for place in fields)
 
 
+def test_a_message_that_cannot_be_read_names_its_topic(opened: Open) -> None:
+    commanding = opened(CALCULATED)
+    (feed,) = commanding.program.lowered.from_ros["drive"]
+    commanding.subscriptions["drive"].put(drive(2, 2)[:7], wall_ns())
+    wait_until(lambda: commanding.ledger().total("messages_received") == 1)
+    places = [feed.targets[target].places[place] for _, target, _, _, place in commanding.refusals()]
+    assert places
+    assert all(place.endswith(": a malformed message") for place in places)
+
+
 def test_each_element_is_a_message(opened: Open) -> None:
     commanding = opened(EACH)
     compare(

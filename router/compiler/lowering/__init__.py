@@ -26,7 +26,8 @@ class LoweredTarget:
 
     Without a `when` the condition is empty. A destination from UDP gets the envelope as it was received: its `message`
     is empty. `places` are the places of the table where a message may be refused, by `enum place` in `native/events.h`:
-    "", the condition, `for_each`, and what each operation of `message` fills.
+    the topic whose message cannot be read ("" of datagrams, which are checked before), the condition, `for_each`, and
+    what each operation of `message` fills.
     """
 
     label: str
