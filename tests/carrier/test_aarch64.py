@@ -54,7 +54,7 @@ def test_compilers_have_nothing_to_warn_of(compiler: str, tmp_path: Path) -> Non
     ("name", "arguments"),
     [
         ("brakes", ["1000"]),
-        ("commands", []),
+        ("from_ros", []),
         ("publish", []),
         ("queue", ["300000", "512"]),
         ("queue", ["300000", "65536"]),

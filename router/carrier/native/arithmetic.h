@@ -129,10 +129,9 @@ static inline bool power(double *base, double exponent) {
 
 static inline double angle(double y, double x) { return isnan(x) || isnan(y) ? (double)NAN : atan2(y, x); }
 
-static inline bool length(double *x, double y) {
-    double of = *x, result = hypot(of, y);
-    *x = isnan(result) ? (double)NAN : result;
-    return !(isinf(result) && isfinite(of) && isfinite(y));
+static inline double length(double x, double y) {
+    double result = hypot(x, y);
+    return isnan(result) ? (double)NAN : result;
 }
 
 /* A whole number as an integer. */

@@ -139,7 +139,7 @@ static int execute(struct machine *machine, const struct code *code, uint32_t *a
         case OP_COS: FUNCTION(cos)
         case OP_TAN: FUNCTION(tan)
         case OP_ATAN2: top--; top->real = angle(top->real, top[1].real); break;
-        case OP_HYPOT: top--; WANT(length(&top->real, top[1].real));
+        case OP_HYPOT: top--; top->real = length(top->real, top[1].real); break;
         case OP_FLOAT32: WANT(fits_float32(top->real));
 
         case OP_INTEGER_TO_REAL: top->real = op->flag ? (double)top->bits : (double)top->integer; break;
