@@ -41,6 +41,13 @@ def test_scalars_in_cdr_are_aligned_behind_the_header(machine: Machine, values: 
     assert machine.message(*code) == CDR_HEADER + body
 
 
+def test_padding_in_cdr_is_zero(machine: Machine) -> None:
+    put = [integer(-1), Operation("OP_PUT", 1), integer(-1), Operation("OP_PUT", 8)]
+    known = [integer(-1), Operation("OP_PUT", 1), Operation("OP_KNOWN", 4, data=b"\xff" * 4)]
+    body = b"\xff" + bytes(7) + b"\xff" * 9 + bytes(3) + b"\xff" * 4
+    assert machine.message(HEADER, *put, *known) == CDR_HEADER + body
+
+
 @given(st.binary(max_size=9), st.binary(max_size=9))
 def test_text_in_cdr_ends_with_a_nul_and_has_no_other(machine: Machine, a: bytes, b: bytes) -> None:
     made = machine.message(HEADER, text(a), Operation("OP_PUT_TEXT"), text(b), Operation("OP_PUT_TEXT"))

@@ -46,12 +46,18 @@ Answer = Union[bytes, str]
 Plane = Callable[["Question"], Callable[[bytes], "list[Answer]"]]
 """Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
 
-_ABOUT_VALUES = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS, Code.LOSSY_CONVERSION, Code.UNKNOWN_ENUM_VALUE}
+_ABOUT_VALUES = {
+    Code.TOO_LARGE,
+    Code.OUT_OF_RANGE,
+    Code.WRONG_ARGUMENTS,
+    Code.LOSSY_CONVERSION,
+    Code.UNKNOWN_ENUM_VALUE,
+}
 _ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds", "does not fill float")
 
 
 def is_about_values(finding: Diagnostic) -> bool:
-    """Whether a well-typed question can have this finding: about ranges, lengths, NaN, names of an enum."""
+    """Whether a well-typed question can have this finding: about ranges, lengths, sizes, NaN, names of an enum."""
     return finding.code in _ABOUT_VALUES or any(word in finding.message for word in _ABOUT_LENGTHS)
 
 
@@ -159,7 +165,7 @@ def question(noise: random.Random, language: Language) -> Question:
 def messages(noise: random.Random, language: Language) -> Iterator[tuple[bytes, View]]:
     if language.is_ros:
         for _ in range(10):
-            value = ros_message(noise)
+            value = ros_message(noise, language.source)
             yield cdr(language.source, as_written(value)), View(value, language.source)
         return
     case = language_wire()[1].cases["source"]

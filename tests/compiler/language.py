@@ -37,19 +37,34 @@ INNER = MessageType(
     "made/msg/Inner", (Field("value", I32), Field("in", String()), Field("ratio", F64), Field("many", List(I64)))
 )
 PAIR = MessageType("made/msg/Pair", (Field("key", String()), Field("value", String())))
-ROS_SOURCE = MessageType(
-    "made/msg/Source",
-    (
-        Field("flag", Bool()), Field("i32", I32), Field("u8", U8), Field("i64", I64), Field("names", List(String())),
-        Field("u32", U32), Field("i16", I16), Field("u64", U64), Field("f32", F32), Field("name", String()),
-        Field("f64", F64), Field("raw", List(U8)), Field("i32s", List(I32)), Field("i64s", List(I64)),
-        Field("stamp", TIME), Field("span", DURATION), Field("u64s", List(U64)), Field("f32s", List(F32)),
-        Field("f64s", List(F64)), Field("flags", List(Bool())), Field("i16x3", List(I16, 3)), Field("inner", INNER),
-        Field("f64x3", List(F64, 3)), Field("u64x2", List(U64, 2)), Field("inners", List(INNER)),
-        Field("textx2", List(String(), 2)), Field("from", I32), Field("in", U64), Field("class", F64),
-        Field("is", Bool()), Field("few", List(U16, None, 4)), Field("pairs", List(PAIR)),
-    ),
+_ROS_FIELDS = (
+    Field("flag", Bool()), Field("i32", I32), Field("u8", U8), Field("i64", I64), Field("names", List(String())),
+    Field("u32", U32), Field("i16", I16), Field("u64", U64), Field("f32", F32), Field("name", String()),
+    Field("f64", F64), Field("raw", List(U8)), Field("i32s", List(I32)), Field("i64s", List(I64)),
+    Field("stamp", TIME), Field("span", DURATION), Field("u64s", List(U64)), Field("f32s", List(F32)),
+    Field("f64s", List(F64)), Field("flags", List(Bool())), Field("i16x3", List(I16, 3)), Field("inner", INNER),
+    Field("f64x3", List(F64, 3)), Field("u64x2", List(U64, 2)), Field("inners", List(INNER)),
+    Field("textx2", List(String(), 2)), Field("from", I32), Field("in", U64), Field("class", F64),
+    Field("is", Bool()), Field("few", List(U16, None, 4)), Field("pairs", List(PAIR)),
 )  # fmt: skip
+
+DEEP = MessageType("made/msg/Deep", (Field("a", U8), Field("inners", List(INNER)), Field("b", List(String()))))
+_OTHER_FIELDS = (
+    Field("wide", String(wide=True)), Field("wides", List(String(wide=True))), Field("byte", U8),
+    Field("none", MessageType("made/msg/None")), Field("deep", List(DEEP)),
+)  # fmt: skip
+"""Which no expression reads."""
+
+ORDERS = 40
+
+
+@cache
+def ros_source(order: int) -> MessageType:
+    """A ROS message with a field of each kind, and some others, in one of many orders."""
+    noise = random.Random(order)
+    fields = [*_ROS_FIELDS, *noise.sample(_OTHER_FIELDS, noise.randrange(len(_OTHER_FIELDS) + 1))]
+    return MessageType("made/msg/Source", tuple(noise.sample(fields, len(fields))))
+
 
 # ---- expressions: templates by kind, with places for expressions of other kinds
 #
@@ -160,16 +175,17 @@ _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18
 class Language:
     """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted.
 
-    `for_each` is one of ITEMS, or empty.
+    `for_each` is one of ITEMS, or empty. `order` is that of the fields of a ROS message.
     """
 
     is_ros: bool
     is_wild: bool = False
     for_each: str = ""
+    order: int = 0
 
     @property
     def source(self) -> MessageType:
-        return ROS_SOURCE if self.is_ros else language_wire()[1].cases["source"].type
+        return ros_source(self.order) if self.is_ros else language_wire()[1].cases["source"].type
 
     def text(self, noise: random.Random, kind: str, depth: int) -> str:
         """An expression of a kind."""
@@ -226,7 +242,8 @@ class Language:
 def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
     """From UDP, from ROS, or from ROS for each element of a list."""
     is_ros = noise.randrange(2) == 1
-    return Language(is_ros, is_wild, noise.choice(["", *ITEMS]) if is_ros and noise.randrange(3) == 0 else "")
+    for_each = noise.choice([*ITEMS]) if is_ros and noise.randrange(3) == 0 else ""
+    return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS))
 
 
 def _bracketed(number: int) -> str:
@@ -300,9 +317,9 @@ _EDGES = (0.0, -0.0, 0.5, 1.0, -1.5, 2.5, 90.0, 1e-45, 3.4028234663852886e38, 1e
           -1e300, 9.223372036854775e18, 2.0**63, 2.0**64, math.inf, -math.inf, math.nan)  # fmt: skip
 
 
-def ros_message(noise: random.Random) -> dict[str, Any]:
-    """A message of ROS_SOURCE. Text that is not UTF-8 is bytes."""
-    made = {field.name: ros_value(noise, field.type) for field in ROS_SOURCE.fields}
+def ros_message(noise: random.Random, declared: MessageType) -> dict[str, Any]:
+    """A message of a `ros_source`. Text that is not UTF-8 is bytes."""
+    made = {field.name: ros_value(noise, field.type) for field in declared.fields}
     if noise.randrange(4) == 0:
         made["name"] = b"\xffa"
         made["names"].insert(0, b"\xed\xa0\x80")
