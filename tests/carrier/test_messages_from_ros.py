@@ -82,7 +82,7 @@ def damaged(draw: st.DrawFn, message: bytes) -> bytes:
     for _ in range(draw(st.integers(1, 3))):
         match draw(st.sampled_from(["cut", "longer", "byte", "length"])):
             case "cut":
-                del data[draw(st.integers(0, len(data))) :]
+                del data[draw(st.integers(min(4, len(data)), len(data))) :]  # behind the header: see below
             case "longer":
                 data += draw(st.binary(max_size=9))
             case "byte" if data:
