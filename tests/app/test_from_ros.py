@@ -44,6 +44,10 @@ def drive(
 
 
 IN_PYTHON = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
+CALCULATED = drive(
+    fields='{distance_to_go: "float32(round(clamp(100 * distance_to_go, -700, 700)) // 100)"}',
+    more=", when: turning_radius > 0.5",
+)
 NOBODY = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 
 
@@ -77,10 +81,11 @@ def publisher() -> Iterator[Publisher]:
         yield made
 
 
-def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher) -> None:
+@pytest.mark.parametrize("table", [drive(), CALCULATED], ids=["copied", "calculated"])
+def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher, table: str) -> None:
     python, process = ctypes.PyDLL(None), publisher.process  # calls through PyDLL keep the interpreter lock
     buffer, at_start = ctypes.create_string_buffer(1000), len(BRAKE)
-    with site.router(drive()) as router:
+    with site.router(table) as router:
         assert is_carried(router)
         assert "ros commands" in thread_names()
         assert publisher.line() == "matched"

@@ -118,6 +118,14 @@ def test_what_is_cut_is_refused(machine: Machine, payload: bytes) -> None:
     assert not machine.read(b"\x08\x01" + payload) or payload == b"\x00\x00\x00"
 
 
+def test_a_message_has_the_cells_of_the_one_before(machine: Machine) -> None:
+    payload = _enums(*[1] * 300, alone=5)
+    assert machine.read(payload)
+    before = machine.slot(SOME)  # which cells the list has
+    assert machine.read(payload)
+    assert machine.slot(SOME) == before
+
+
 def test_elements_of_lists_are_entered_with_their_own_defaults(evaluating: CDLL) -> None:
     points, x, is_x, numbers = 0, 1, 2, 3
     fields = NodeField(1, "TYPE_SINT32", x, presence=is_x), NodeField(2, "TYPE_FIXED32", numbers, is_repeated=True)
