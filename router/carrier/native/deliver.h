@@ -98,7 +98,6 @@ struct stage {
     counter *counters;
     struct reporter reporter;
     struct deadmen *deadmen;
-    struct machine machine;
     /* The boot clock, ns. */
     int64_t (*now)(struct stage *stage);
     /* Send as `command_send` does. */
@@ -106,6 +105,7 @@ struct stage {
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. LEFT: the thread was
      * stuck in the middleware and has been given up, and must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
+    struct machine machine; /* last, as it is large */
 };
 
 /* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false for lack of memory.
