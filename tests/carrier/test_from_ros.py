@@ -436,6 +436,7 @@ def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) ->
     run_program("from_ros", tmp_path, sanitizers=sanitizers)
 
 
+@pytest.mark.slow  # as its sanitizer cannot run below the one of `make test-all`
 def test_a_set_that_was_taken_back_is_not_used(tmp_path: Path) -> None:
     run_program("refused_set", tmp_path, sanitizers=MEMORY)
 
