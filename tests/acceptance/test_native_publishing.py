@@ -111,21 +111,22 @@ routes:
   imu_info:
     source: any
     topics:
-      - {{{{topic: beside_a, {_FLOAT}}}}}
-      - {{{{topic: beside_b, {_FLOAT}, {IN_PYTHON}}}}}
+      - {{{{topic: beside_a, {_FLOAT}, queue_depth: 1000}}}}
+      - {{{{topic: beside_b, {_FLOAT}, queue_depth: 1000, {IN_PYTHON}}}}}
       - {{{{topic: beside_latest, {_FLOAT}, on_limit: latest, max_rate: 1000 Hz}}}}
-      - {{{{topic: beside_shared, {_FLOAT}}}}}
+      - {{{{topic: beside_shared, {_FLOAT}, queue_depth: 1000}}}}
       - {{{{topic: beside_kept, {_FLOAT}, qos: {{{{durability: transient_local, depth: 5}}}}}}}}
   gps_info:
     source: any
-    topics: [{{{{topic: beside_shared, type: {FLOAT}, fields: {{{{data: hdop}}}}, {IN_PYTHON}}}}}]
+    topics:
+      - {{{{topic: beside_shared, type: {FLOAT}, fields: {{{{data: hdop}}}}, queue_depth: 1000, {IN_PYTHON}}}}}
 gateways:
   dashboard:
     transport: {{{{websocket: 127.0.0.5:DASHBOARD}}}}
     topics: {{{{include: [/none]}}}}
-    inbound: [{{{{topic: beside_a, type: {FLOAT}}}}}]
+    inbound: [{{{{topic: beside_a, type: {FLOAT}, queue_depth: 1000}}}}]
 """
-"""Braces are doubled once for `Site.table`."""
+"""Publishers keep what a busy subscriber has not taken. Braces are doubled once for `Site.table`."""
 
 
 @pytest.fixture(scope="module")
