@@ -240,7 +240,8 @@ CALLS = ["abs(i32)", "min(i32, 3, single)", "max(i32, u32)", "round(clamp(real, 
          "degrees(single)", "sqrt(real)", "sin(real)", "cos(real)", "tan(real)", "atan2(real, single)",
          "float32(real)", "float64(u64)", "int(flag) + int(rock)", "len(text)", "i32 * u32 - 7", "i64 // 7 % 5",
          "u64 // 3", "i32 ** 2", "single ** 3", "real // single", "real % single", "i32 / 8 if flag else 1 / i32",
-         "wrap(round(real), 0, 359)", "clamp(round(real), -5, 5)", "i32 % i32", "i32 // i32", "real / u32"]  # fmt: skip
+         "wrap(round(real), 0, 359)", "clamp(round(real), -5, 5)", "i32 % i32", "i32 // i32", "real / u32",
+         "min([u32] if flag else [u64, 5])", "sum([u32] if flag else [u64])"]  # fmt: skip
 CHOICES = [
     chosen("rock", {"ROCK_GREEN": "1", "ROCK_BLUE": "i32"}, "3"),
     chosen("rock", {"ROCK_BLUE": "1", "ROCK_UNKNOWN": "2", "ROCK_GREEN": "3"}),

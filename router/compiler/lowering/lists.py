@@ -152,7 +152,9 @@ def _chosen(lowering: Lowering, node: Choice) -> Stored:
     if body.scalar is not orelse.scalar:
         body, orelse = map(_in_cells, (body, orelse))
     made = choice(lowering.value(node.test), body.code, orelse.code)
-    return replace(body if body.element is not None else orelse, code=made)
+    chosen = body if body.element is not None else orelse
+    element = node.kind.element if isinstance(node.kind, ListKind) else chosen.element
+    return replace(chosen, code=made, element=element)
 
 
 def _in_cells(values: Stored) -> Stored:
