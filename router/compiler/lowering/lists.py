@@ -151,10 +151,7 @@ def _chosen(lowering: Lowering, node: Choice) -> Stored:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
     if body.scalar is not orelse.scalar:
         body, orelse = map(_in_cells, (body, orelse))
-    made = choice(lowering.value(node.test), body.code, orelse.code)
-    chosen = body if body.element is not None else orelse
-    element = node.kind.element if isinstance(node.kind, ListKind) else chosen.element
-    return replace(chosen, code=made, element=element)
+    return replace(body, code=choice(lowering.value(node.test), body.code, orelse.code))
 
 
 def _in_cells(values: Stored) -> Stored:
@@ -165,11 +162,11 @@ def _in_cells(values: Stored) -> Stored:
 
 
 def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
-    """Convert the elements of a list to the kind `element`."""
+    """Convert the elements of a list to the kind `element`, also where they are stored alike."""
     kind = values.element
     is_moment = isinstance(element, TimeKind) and values.message is not None
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
-        return values
+        return replace(values, element=element)
     made, each = lowering.names.temporary(), lowering.names.temporary()
     start = code(_begun(made), values.code, keep(each), SIZE)
     taken, meaning = _taken(lowering, values, each)
@@ -253,7 +250,7 @@ def _without_a_detour(made: Code) -> Code:
 
 def element(lowering: Lowering, node: Element) -> Code:
     """Lower an element: a scalar, text or bytes, or a message that becomes an element of another list."""
-    of = _checked(lowering, stored(lowering, node.values))
+    of = checked_list(lowering, node.values)
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
 
 
@@ -265,8 +262,9 @@ def entered(lowering: Lowering, node: Element) -> tuple[Code, Node]:
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)), made
 
 
-def _checked(lowering: Lowering, of: Stored) -> Stored:
-    """Check that all texts of a list are UTF-8."""
+def checked_list(lowering: Lowering, node: Tree) -> Stored:
+    """Lower a list, and check that all its texts are UTF-8."""
+    of = stored(lowering, node)
     if not of.is_unchecked:
         return of
     slot = lowering.names.temporary()
@@ -281,12 +279,7 @@ def length(lowering: Lowering, node: Tree) -> Code:
     """Lower len() of a list. A message of a literal is no value, but it has to be there."""
     if isinstance(node, Listed) and are_messages(node):
         return code(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
-    return code(_checked(lowering, stored(lowering, node)).code, SIZE)
-
-
-def checked_list(lowering: Lowering, node: Tree) -> Stored:
-    """Lower the list of `for_each`, whose texts are checked at once."""
-    return _checked(lowering, stored(lowering, node))
+    return code(checked_list(lowering, node).code, SIZE)
 
 
 def contains(lowering: Lowering, node: Contains) -> Code:
