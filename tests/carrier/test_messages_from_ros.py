@@ -15,6 +15,7 @@ from router.compiler.lookup import Definitions
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
+from tests.carrier.delivering import FILTERED
 from tests.carrier.planes import MAPPING_ERROR, Made, Misfit, Plane, from_ros
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome
 from tests.compiler.generated_types import mirror, payload_sources, values
@@ -329,6 +330,17 @@ EXPRESSIONS: list[tuple[str, dict[str, str]]] = [
     ("stamped", {"stamp": "received_at"}),
     ("optional", {"number": "i32", "text": "source"}),
 ]
+
+
+def test_a_text_without_its_nul_is_refused_where_it_is_used(delivering: CDLL) -> None:
+    """Also as a field of an element that a condition leaves out."""
+    source, fields = source_of(point=POINT), field_map(text="item.name", u32="index")
+    case = case_of("scalars")
+    python, carrier = from_ros(delivering, made_wire(), case, fields, source, "index > 0", "[point, point]")
+    message = cdr(source, {"point": {"name": "cut here", "x": 1.0, "ids": []}})
+    hostile = message.replace(b"cut here\0", b"cut hereX")
+    assert hostile != message
+    assert carrier(hostile) == python(hostile) == [FILTERED, MAPPING_ERROR]
 
 
 @pytest.mark.parametrize(("case", "fields"), EXPRESSIONS)

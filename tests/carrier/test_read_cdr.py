@@ -134,8 +134,23 @@ def test_texts_come_without_their_final_nul(evaluating: CDLL, texts: list[bytes]
     assert machine.value(load(0), of=TEXT) == b"one"
     assert machine.listed(1, of=TEXT) == texts
     assert machine.value(load(2), of=TEXT) == b"end"
-    assert not machine.read(message[:-1] + b"x")
     assert not machine.read(message[:-1])
+
+
+def test_only_what_uses_a_text_without_its_nul_refuses_it(evaluating: CDLL) -> None:
+    each = [Step("READ_EACH", count=2), Step("READ_TEXTS", 2), Step("READ_AGAIN")]
+    steps = [Step("READ_TEXT", 0), Step("READ_TEXT", 1), *each]
+    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    message = Written().text(b"").text(b"whole").text(b"a").text(b"b").message()
+    assert machine.read(message[:8] + b"x" + message[9:])
+    assert machine.value(load(0), Operation("OP_UTF8"), of=TEXT) == Refusal("mapping_error", 1)
+    assert machine.value(load(1), Operation("OP_UTF8"), of=TEXT) == b"whole"
+    assert machine.read(message[:-1] + b"x")
+    first, second = (
+        machine.value(load(2), Operation("OP_ELEMENT", flag=C["IN_CELLS"], number=at), Operation("OP_UTF8"), of=TEXT)
+        for at in range(2)
+    )
+    assert (first, second) == (b"a", Refusal("mapping_error", 2))
 
 
 def test_some_writers_leave_out_the_nul_of_empty_strings(evaluating: CDLL) -> None:

@@ -50,13 +50,16 @@ static bool read_array(struct reader *reader, uint32_t count, unsigned size, str
     return true;
 }
 
-/* Some writers leave out the NUL of an empty string, so that its length is 0. */
+/* Some writers leave out the NUL of an empty string, so that its length is 0. Other text without its NUL is read as text
+ * that is not UTF-8: so only a program that uses it refuses the message. */
 static bool read_text(struct reader *reader, struct value *text) {
+    static const uint8_t NO_UTF8[] = {0xFF};
     uint32_t size;
     if (!read_count(reader, &size) || !read_array(reader, size, 1, text)) return false;
     if (!text || !size) return true;
-    text->size--;
-    return !text->bytes[text->size];
+    if (text->bytes[size - 1]) *text = (struct value){.bytes = NO_UTF8, .size = sizeof NO_UTF8};
+    else text->size--;
+    return true;
 }
 
 /* The READ_AGAIN of a repetition. */
