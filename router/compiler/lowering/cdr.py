@@ -11,7 +11,7 @@ from router.compiler.cdr.primitives import HEADER
 from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
-from router.compiler.lowering.messages import Place, Placed, at, counted, each
+from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
 from router.compiler.lowering.nodes import size_of
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
@@ -23,7 +23,8 @@ from router.types.model import Float, Int, String
 def cdr_message(lowering: Lowering, plan: Record) -> list[Placed]:
     """Return the operations that write a message, each with its place."""
     header = known(HEADER), Place(plan.span, "")
-    return list(_merged([header, *_Writer(lowering).plan(plan, "")], Offset(HIGHEST, -len(HEADER) % HIGHEST)))
+    placed = [header, *_Writer(lowering).plan(plan, "")]
+    return list(merged(_padded(placed, Offset(HIGHEST, -len(HEADER) % HIGHEST))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,9 @@ class _Writer:
         if _are_copied(made, taken):
             (_, _, octets), *_ = taken
             return [*number, *at(place, Operation(Op.DROP), load(octets), Operation(Op.PUT_BYTES))]
-        body = each(self.lowering, taken, place, lambda: list(_merged(self.plan(made.element, place.field), Offset())))
+        body = each(
+            self.lowering, taken, place, lambda: list(merged(_padded(self.plan(made.element, place.field), Offset())))
+        )
         return [*number, *body]
 
 
@@ -93,29 +96,17 @@ _LOSE = frozenset({Op.PUT_TEXT, Op.PUT_BYTES, Op.REPEAT, Op.AGAIN})
 """Behind these the offset is not known."""
 
 
-def _merged(placed: Iterable[Placed], offset: Offset) -> Iterator[Placed]:
-    """Join known bytes that stand beside each other. Where the padding is known it becomes known bytes as well."""
-    last: Placed | None = None
+def _padded(placed: Iterable[Placed], offset: Offset) -> Iterator[Placed]:
+    """Put padding that is known in front of known bytes, which need no alignment then. They begin at `offset`."""
     for operation, place in placed:
         if operation.kind is not Op.KNOWN:
-            if last is not None:
-                yield last
-                last = None
             yield operation, place
             _advance(offset, operation)
             continue
         alignment = int(operation.slot)  # type: ignore[arg-type]
         padding = offset.padding(alignment)
         offset.advance(alignment, operation.size)
-        if last is not None and padding is not None:
-            before, place = last[0], last[1]  # noqa: PLW2901 - of the first of them
-            last = known(before.data + bytes(padding) + operation.data, int(before.slot)), place  # type: ignore[arg-type]
-            continue
-        if last is not None:
-            yield last
-        last = (operation if padding is None else known(bytes(padding) + operation.data)), place
-    if last is not None:
-        yield last
+        yield (operation if padding is None else known(bytes(padding) + operation.data)), place
 
 
 def _advance(offset: Offset, operation: Operation) -> None:

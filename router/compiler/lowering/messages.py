@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from router.compiler.lowering import lists
@@ -18,6 +18,7 @@ from router.compiler.lowering.operations import (
     code,
     integer,
     keep,
+    known,
     load,
     repeat,
 )
@@ -41,6 +42,25 @@ Placed = tuple[Operation, Place]
 
 def at(place: Place, *parts: Operation | Code) -> list[Placed]:
     return [(operation, place) for operation in code(*parts)]
+
+
+def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
+    """Join known bytes with those behind them that need no padding. The place of the first ones stays."""
+    last: Placed | None = None
+    for operation, place in placed:
+        if last is not None and operation.kind is Op.KNOWN and operation.slot == 1:
+            before, first = last
+            last = known(before.data + operation.data, int(before.slot)), first  # type: ignore[arg-type]
+            continue
+        if last is not None:
+            yield last
+            last = None
+        if operation.kind is Op.KNOWN:
+            last = operation, place
+        else:
+            yield operation, place
+    if last is not None:
+        yield last
 
 
 def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.messages import Place, Placed, at, counted, each
+from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.operations import Code, Op, Operation, known
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
@@ -42,7 +42,7 @@ def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase) -> lis
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
     place = Place(plan.span, "")
     inside = _Writer(lowering).record(plan, descriptor, "")
-    return list(_merged(_delimited(case.number << 3 | LEN, inside, place)))
+    return list(merged(_delimited(case.number << 3 | LEN, inside, place)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class _Writer:
 
     def _each(self, made: Each, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
         count, taken = counted(self.lowering, made)
-        loop = each(self.lowering, taken, place, lambda: list(_merged(self._element(made.element, to, place.field))))
+        loop = each(self.lowering, taken, place, lambda: list(merged(self._element(made.element, to, place.field))))
         elements = [*at(place, count), *loop]
         yield from _packed(to, elements, place) if to.is_packed else elements
 
@@ -147,12 +147,12 @@ def _is_set(value: bool | float | str, to: FieldDescriptor) -> bool:
 
 def _delimited(tag: int, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
     """A message, with its tag and its length in front."""
-    yield from _lengthened(tag, list(_merged(inside)), place, is_always=True)
+    yield from _lengthened(tag, list(merged(inside)), place, is_always=True)
 
 
 def _packed(to: FieldDescriptor, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
     """Packed elements, if there are any."""
-    yield from _lengthened(to.number << 3 | LEN, list(_merged(inside)), place, is_always=False)
+    yield from _lengthened(to.number << 3 | LEN, list(merged(inside)), place, is_always=False)
 
 
 def _lengthened(tag: int, inside: list[Placed], place: Place, *, is_always: bool) -> Iterator[Placed]:
@@ -164,18 +164,3 @@ def _lengthened(tag: int, inside: list[Placed], place: Place, *, is_always: bool
         yield _CLOSE, place
     elif data or is_always:
         yield known(varint(tag) + varint(len(data)) + data), place
-
-
-def _merged(placed: Iterable[Placed]) -> Iterator[Placed]:
-    """Join known bytes that stand beside each other."""
-    last: Placed | None = None
-    for operation, place in placed:
-        if operation.kind is Op.KNOWN:
-            last = (operation, place) if last is None else (known(last[0].data + operation.data), last[1])
-            continue
-        if last is not None:
-            yield last
-            last = None
-        yield operation, place
-    if last is not None:
-        yield last
