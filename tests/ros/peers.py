@@ -1,8 +1,8 @@
 """A ROS publisher or subscriber in a process of its own: `Publisher` and `Subscriber` start it, this file is it.
 
-The publisher prints "matched" once a subscriber is there, publishes each line of its standard input (a message's bytes
-in hex), prints "acknowledged" at an empty line when subscribers have all of it. The subscriber prints "matched" once a
-publisher is there, then each message's bytes in hex. Both end with their standard input.
+The publisher prints "matched" for each subscriber that it finds, publishes each line of its standard input (a message's
+bytes in hex), prints "acknowledged" at an empty line when subscribers have all of it. The subscriber prints "matched"
+for each publisher that it finds, and each message's bytes in hex. Both end with their standard input.
 """
 
 from __future__ import annotations
@@ -82,7 +82,8 @@ def main() -> None:
         if status.current_count_change > 0:  # not where a peer of an earlier test is found to be gone
             # A subscriber learns of a publisher later; what it misses until then has to be repaired.
             sleep(0.1 if arguments.role == "publish" else 0)
-            print("matched", file=lines)
+            for _ in range(status.current_count_change):
+                print("matched", file=lines)
 
     if arguments.role == "subscribe":
         node.create_subscription(
