@@ -1,4 +1,4 @@
-"""The native threads: receive, and brakes."""
+"""The native threads: receive, and timers."""
 
 from __future__ import annotations
 

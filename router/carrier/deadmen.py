@@ -40,7 +40,7 @@ class NativeDeadman:
 
     def end(self) -> None:
         """Send a last time, if armed or tripped."""
-        self._library.deadman_end(self._deadmen, self.address)
+        self._library.timer_end(self._deadmen, self.address)
 
     def __del__(self) -> None:
         self._library.deadman_close(self._deadmen, self.address)
@@ -54,7 +54,7 @@ class Deadmen:
         self._library = library
         self._keep = counters, events
         self._names = names
-        self.address: int = library.deadmen_open(counters, events.address)
+        self.address: int = library.timers_open(counters, events.address)
         if not self.address:
             raise MemoryError("the deadmen of the carrier cannot be opened")
 

@@ -37,16 +37,12 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "command_send": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32)),
     "command_send_at": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32, c_int64)),
     "deadman_close": (None, (c_void_p, c_void_p)),
-    "deadman_end": (None, (c_void_p, c_void_p)),
     "deadman_open": (
         c_void_p,
         (c_void_p, c_int64, c_int64, c_bool, c_uint32, c_uint32, c_uint32, c_void_p, c_uint32),
     ),
     "deadman_replace": (None, (c_void_p, c_void_p, c_void_p)),
     "deadman_start": (c_uint64, (c_void_p, c_void_p, c_int64)),
-    "deadmen_close": (None, (c_void_p,)),
-    "deadmen_open": (c_void_p, (c_void_p, c_void_p)),
-    "deadmen_serve": (None, (c_void_p, c_int64)),
     "envelope_read": (c_int, (c_void_p, c_void_p, c_size_t, c_bool, c_void_p)),
     "freshness_born": (structures.Born, (c_void_p, c_int64, c_int64, c_int64, c_int64)),
     "freshness_look": (None, (c_void_p, c_int64, c_int64)),
@@ -81,6 +77,11 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "sender_open": (c_void_p, (c_int, c_int, c_uint32, c_uint16)),
     "sender_send": (c_int, (c_void_p, c_void_p, c_size_t)),
     "sender_send_checked": (c_int, (c_void_p, c_void_p, c_size_t)),
+    "timer_adopt": (None, (c_void_p, c_void_p, c_void_p, c_void_p)),
+    "timer_end": (None, (c_void_p, c_void_p)),
+    "timers_close": (None, (c_void_p,)),
+    "timers_open": (c_void_p, (c_void_p, c_void_p)),
+    "timers_serve": (None, (c_void_p, c_int64)),
 }
 """What each function of the headers returns and takes. Any pointer is a c_void_p, which also takes bytes and arrays."""
 

@@ -176,7 +176,7 @@ class NativeSide:
         self._library.command_send_at(deadmen, to, data, len(data), NEVER, array, len(feeds), now)
 
     def serve(self, now: int) -> None:
-        self._library.deadmen_serve(self.deadmen.address, now)
+        self._library.timers_serve(self.deadmen.address, now)
 
     def breaks(self, endpoint: str, *, is_broken: bool) -> None:
         self._outlets[endpoint].breaks(is_broken=is_broken)

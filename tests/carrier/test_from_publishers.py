@@ -124,7 +124,7 @@ def test_commands_arrive_in_order_with_their_values_and_the_brake_behind_them(ro
     assert router.total("datagrams_sent") == len(distances)
     assert router.total("messages_dropped") == 0
     assert router.thread.failures == 0
-    router.library.deadmen_serve(router.deadmen.address, 1 << 62)
+    router.library.timers_serve(router.deadmen.address, 1 << 62)
     assert router.board.recv(1000) == router.program.deadmen[0].datagrams[0][1]
 
 

@@ -318,14 +318,14 @@ def test_a_brake_leaves_behind_the_last_command_and_commands_of_others_disarm_it
     board = commanding.boards["driving_board"]
     commanding.subscriptions["drive"].put(drive(1), wall_ns())
     wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.deadmen_serve(deadmen, boottime_ns() + SECOND)
+    commanding.library.timers_serve(deadmen, boottime_ns() + SECOND)
     command, brake = board.received()
     assert of(command) == 1
     assert brake == commanding.program.deadmen[0].datagrams[0][1]
     commanding.subscriptions["arm"].put(arm(1), wall_ns())
     wait_until(lambda: commanding.count("messages_received", "arm_ctrl", "arm"))
     assert len(board.received()) == 2
-    commanding.library.deadmen_serve(deadmen, boottime_ns() + 10 * SECOND)
+    commanding.library.timers_serve(deadmen, boottime_ns() + 10 * SECOND)
     assert board.received() == []
 
 
@@ -333,7 +333,7 @@ def test_a_stale_command_feeds_no_deadman(opened: Open) -> None:
     commanding = opened()
     commanding.subscriptions["drive"].put(drive(1), wall_ns() - SECOND)
     wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.deadmen_serve(commanding.deadmen.address, boottime_ns() + SECOND)
+    commanding.library.timers_serve(commanding.deadmen.address, boottime_ns() + SECOND)
     assert commanding.boards["driving_board"].received() == []
 
 

@@ -258,7 +258,7 @@ class Whole:
             for timer in self._rig.timers:  # as the rig does whenever one is due: a pacer then sends what it can
                 timer.due(self._rig.now)
             self._set_clocks()
-            self._library.deadmen_serve(self._deadmen.address, self._rig.now)
+            self._library.timers_serve(self._deadmen.address, self._rig.now)
             self._collect()
         self._rig.pass_time(until - self._rig.now)
         self._set_clocks()

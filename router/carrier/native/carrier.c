@@ -15,10 +15,10 @@
 static const int64_t PYTHON_TIMEOUT = 30000000000; /* ns for which the watchdog is fed while Python is stuck */
 static const char ALIVE[] = "WATCHDOG=1";
 
-struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events) {
+struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
     if (!carrier) return NULL;
-    bool is_open = stage_open(&carrier->stage, counters, events, deadmen);
+    bool is_open = stage_open(&carrier->stage, counters, events, timers);
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);
@@ -32,7 +32,7 @@ struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct 
 int carrier_start(struct carrier *carrier, const struct change *first) {
     carrier_pulse(carrier);
     carrier_adopt_first(carrier, first);
-    int error = start_thread(&carrier->timing, "brakes", timer_thread, carrier);
+    int error = start_thread(&carrier->timing, "timers", timer_thread, carrier);
     if (error) return error;
     error = start_thread(&carrier->receiving, "receive", receive_thread, carrier);
     carrier->has_started = true;
@@ -72,17 +72,17 @@ static int until_turn(struct carrier *carrier, int64_t turn) {
     return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
 }
 
-/* Serves deadmen when nothing is received, and the watchdog. */
+/* Serves what is due when nothing is received, and the watchdog. */
 void *timer_thread(void *of) {
     struct carrier *carrier = of;
     int64_t turn = 0;
     run_first();
     while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->stage.deadmen->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        struct pollfd waiting[] = {{carrier->stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
         poll(waiting, 2, until_turn(carrier, turn));
         eventfd_t ignored;
         if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) deadmen_serve(carrier->stage.deadmen, boottime_ns());
+        if (waiting[0].revents) timers_serve(carrier->stage.timers, boottime_ns());
         if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
             turn = monotonic_ns() + atomic_load(&carrier->interval);

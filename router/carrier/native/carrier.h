@@ -93,7 +93,7 @@ struct program {
 struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
-    struct deadman *const *ended;
+    struct timer *const *ended;
     uint32_t replaced_count, ended_count;
     uint32_t holds; /* receive nothing after the change before `carrier_resume`, for at most 1 s */
     uint32_t reserved;
@@ -129,7 +129,7 @@ struct carrier;
 
 /* Open a carrier that counts in `counters`, and writes losses and rejections to `events`: nobody else writes to either.
  * NULL for lack of memory. */
-struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events);
+struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events);
 
 /* Start the threads. Return 0, or an errno. */
 int carrier_start(struct carrier *carrier, const struct change *first);

@@ -20,7 +20,7 @@ struct delivery {
 
 /* ---- losses ---- */
 
-static void count(const struct delivery *of, uint32_t which) { counter_add(of->stage->counters, which, 1); }
+static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
 
 /* Count and report a loss. `lost` has the reason, and details if there are any. Returns false. */
 static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
@@ -141,7 +141,7 @@ static void send_it(const struct delivery *of) {
         lose(of, (struct lost_event){.reason = loss_of(error), .error = error}, "");
     } else {
         count(of, target->delivered);
-        counter_add(of->stage->counters, target->delivered_bytes, (int64_t)size);
+        stage_count(of->stage, target->delivered_bytes, (int64_t)size);
     }
 }
 
@@ -190,16 +190,22 @@ static int64_t clock_now(struct stage *stage) {
 
 static int send_by_socket(struct stage *stage, const struct target *target, const uint8_t *data, size_t size,
                           int64_t expires) {
-    return command_send(stage->deadmen, target->sender, data, size, expires, target->feeds, target->feed_count);
+    return command_send(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
 }
 
-bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct deadmen *deadmen) {
+static int brake_by_socket(struct stage *stage, const struct deadman_destination *to) {
+    (void)stage;
+    return sender_send_checked(to->sender, to->datagram, to->size);
+}
+
+bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers) {
     memset(stage, 0, sizeof *stage);
     stage->counters = counters;
     stage->reporter.events = events;
-    stage->deadmen = deadmen;
+    stage->timers = timers;
     stage->now = clock_now;
     stage->send = send_by_socket;
+    stage->brake = brake_by_socket;
     return machine_open(&stage->machine);
 }
 

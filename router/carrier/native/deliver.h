@@ -97,11 +97,15 @@ enum publication { PUBLISHED, PUBLISH_FAILED, LEFT };
 struct stage {
     counter *counters;
     struct reporter reporter;
-    struct deadmen *deadmen;
+    struct timers *timers; /* in which its commands feed deadmen */
+    /* Called for each counter that a message or a deadman adds to; NULL in flight. */
+    void (*counted)(struct stage *stage, uint32_t index, int64_t amount);
     /* The boot clock, ns. */
     int64_t (*now)(struct stage *stage);
     /* Send as `command_send` does. */
     int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
+    /* Send the datagram of a deadman, with the lock held. Return 0 or an errno. */
+    int (*brake)(struct stage *stage, const struct deadman_destination *to);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. LEFT: the thread was
      * stuck in the middleware and has been given up, and must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
@@ -110,8 +114,14 @@ struct stage {
 
 /* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false for lack of memory.
  * Close the stage in either case. */
-bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct deadmen *deadmen);
+bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers);
 void stage_close(struct stage *stage);
+
+/* Add to a counter of the stage. */
+static inline void stage_count(struct stage *stage, uint32_t index, int64_t amount) {
+    counter_add(stage->counters, index, amount);
+    if (stage->counted) stage->counted(stage, index, amount);
+}
 
 /* Deliver a message to one of the targets. Return false if the thread has been given up (LEFT). */
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);

@@ -138,7 +138,7 @@ static void serve_route(struct from_ros *thread, const struct ros_route *route, 
     else if (route->targets.ttl) message.born = born(thread, route, served, message.born);
     if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(thread, route, &message);
     else deliver_to_all(&thread->stage, &route->targets, &message);
-    counter_add(thread->stage.counters, route->received, count);
+    stage_count(&thread->stage, route->received, count);
 }
 
 /* Return what is known of a publisher. One with the same hash is forgotten. */
@@ -284,7 +284,7 @@ static void from_ros_close(struct from_ros *thread) {
     free(thread);
 }
 
-struct from_ros *from_ros_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
+struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct ring *events, take_function *take,
                                reset_function *reset, bool is_urgent) {
     struct from_ros *thread = calloc(1, sizeof *thread);
     if (!thread) return NULL;
@@ -296,7 +296,7 @@ struct from_ros *from_ros_open(struct deadmen *deadmen, counter *counters, struc
     condition_open(&thread->changed);
     thread->epoll = epoll_create1(EPOLL_CLOEXEC);
     thread->wake = eventfd(0, EFD_CLOEXEC);
-    bool is_open = stage_open(&thread->stage, counters, events, deadmen);
+    bool is_open = stage_open(&thread->stage, counters, events, timers);
     if (!is_open || thread->epoll < 0 || thread->wake < 0 || from_ros_watch(thread, thread->wake) ||
         start_thread(&thread->thread, is_urgent ? "ros commands" : "ros messages", run, thread)) {
         from_ros_close(thread);

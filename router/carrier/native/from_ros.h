@@ -49,7 +49,7 @@ struct from_ros;
 
 /* Open a thread that serves nothing yet. It counts in `counters`, and losses go to `events`. Messages that are urgent have
  * a thread of their own, which runs first. NULL for lack of memory, descriptors or threads. */
-struct from_ros *from_ros_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
+struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct ring *events, take_function *take,
                                reset_function *reset, bool is_urgent);
 
 /* Have the thread wait for an eventfd as well, before it is in a set. Return 0, or an errno. */

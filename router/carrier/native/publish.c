@@ -66,7 +66,7 @@ static bool serve(struct publish_thread *thread, const struct message_record *re
     struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
     for (uint32_t index = 0; index < to->count; index++) {
         if (!deliver(&thread->stage, to, &to->targets[index], &message)) return false;
-        counter_add(thread->stage.counters, to->targets[index].waiting, -1);
+        stage_count(&thread->stage, to->targets[index].waiting, -1);
     }
     return true;
 }

@@ -37,7 +37,7 @@ static uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(s
 
 static void reject(struct carrier *carrier, const struct received *received, enum reason reason) {
     const struct listener *listener = received->listener;
-    counter_add(carrier->stage.counters, listener->rejected[reason], 1);
+    stage_count(&carrier->stage, listener->rejected[reason], 1);
     if (reason == IGNORED || !may_report(&carrier->stage.reporter, received->now)) return;
     struct rejected_event *event = (struct rejected_event *)carrier->record;
     size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
@@ -69,7 +69,7 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
     memcpy(record + 1, carrier->datagram, kept);
     uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
-    if (!ring_put(to, record, record->size)) counter_add(carrier->stage.counters, lost, 1);
+    if (!ring_put(to, record, record->size)) stage_count(&carrier->stage, lost, 1);
 }
 
 /* ---- targets ---- */
@@ -95,8 +95,8 @@ static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now)
     if (!ring_drop(ring, &oldest, sizeof oldest)) return;
     for (uint32_t index = 0; index < oldest.part->target_count; index++) {
         const struct waiting *target = &oldest.part->targets[index];
-        counter_add(carrier->stage.counters, target->waiting, -1);
-        counter_add(carrier->stage.counters, target->queue_full, 1);
+        stage_count(&carrier->stage, target->waiting, -1);
+        stage_count(&carrier->stage, target->queue_full, 1);
         struct lost_event lost = {.route = oldest.part->route, .topic = NO_NAME, .target = target->id,
                                   .reason = LOSS_QUEUE_FULL, .counter = target->queue_full};
         report_loss(&carrier->stage.reporter, now, &lost, "");
@@ -106,7 +106,7 @@ static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now)
 static void hand_over(struct carrier *carrier, const struct part *part, const struct received *received) {
     if (!is_wanted(part)) {
         for (uint32_t index = 0; index < part->target_count; index++)
-            counter_add(carrier->stage.counters, part->targets[index].filtered, 1);
+            stage_count(&carrier->stage, part->targets[index].filtered, 1);
         return;
     }
     struct message_record *record = (struct message_record *)carrier->record;
@@ -125,7 +125,7 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .handler = part->handler};
     memcpy(record + 1, carrier->datagram, received->envelope.size);
     for (uint32_t index = 0; index < part->target_count; index++)
-        counter_add(carrier->stage.counters, part->targets[index].waiting, 1);
+        stage_count(&carrier->stage, part->targets[index].waiting, 1);
     while (!ring_put(part->ring, record, record->size)) drop_oldest(carrier, part->ring, received->now);
 }
 
@@ -160,13 +160,13 @@ static int route(struct carrier *carrier, const struct payload_case *found, cons
     const struct listener *listener = received->listener;
     if (found->row < 0) {
         if (found->is_ignored) return IGNORED;
-        counter_add(carrier->stage.counters, found->unhandled, 1);
+        stage_count(&carrier->stage, found->unhandled, 1);
         return UNHANDLED;
     }
     const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
     if (entry->route < 0) return SOURCE_MISMATCH;
     const struct route *chosen = &program->routes[entry->route];
-    counter_add(carrier->stage.counters, entry->received, 1);
+    stage_count(&carrier->stage, entry->received, 1);
     if (chosen->sends.count) send_to_all(carrier, &chosen->sends, received);
     for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
     counter_set(carrier->stage.counters, chosen->last_message, received->received_at);
@@ -181,15 +181,15 @@ static void handle(struct carrier *carrier, struct received *received, int64_t a
     received->received_at = wall_ns();
     received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
                                     received->received_at, received->now, INT64_MIN);
-    counter_add(counters, listener->received, 1);
-    counter_add(counters, listener->received_bytes, (int64_t)received->length);
+    stage_count(&carrier->stage, listener->received, 1);
+    stage_count(&carrier->stage, listener->received_bytes, (int64_t)received->length);
     received->peer = find_peer(listener, received->address, received->port);
     received->column = received->peer ? received->peer->column : listener->columns - 1;
     if (received->peer) counter_set(counters, received->peer->last_seen, received->received_at);
     int reason = envelope_read(carrier->program->schema, carrier->datagram, received->length, listener->repairs,
                                &received->envelope);
-    if (received->envelope.is_repaired) counter_add(counters, listener->padded, 1);
-    if (reason == UNKNOWN_CASE) counter_add(counters, carrier->program->unknown_case, 1);
+    if (received->envelope.is_repaired) stage_count(&carrier->stage, listener->padded, 1);
+    if (reason == UNKNOWN_CASE) stage_count(&carrier->stage, carrier->program->unknown_case, 1);
     if (reason == ROUTED) reason = route(carrier, find_case(carrier->program, received->envelope.case_number), received);
     if (reason != ROUTED) reject(carrier, received, (enum reason)reason);
     struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
@@ -256,16 +256,16 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
     return RECEIVED;
 }
 
-static void brake(struct carrier *carrier) {
-    int64_t due = atomic_load_explicit(&carrier->stage.deadmen->next_due, memory_order_relaxed);
+static void serve_due(struct carrier *carrier) {
+    int64_t due = atomic_load_explicit(&carrier->stage.timers->next_due, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = boottime_ns();
-    if (due <= now) deadmen_serve(carrier->stage.deadmen, now);
+    if (due <= now) timers_serve(carrier->stage.timers, now);
 }
 
 static void drain(struct carrier *carrier, const struct listener *listener) {
     for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT) == RECEIVED; left--)
-        brake(carrier);
+        serve_due(carrier);
 }
 
 /* ---- changes of the program ---- */
@@ -279,7 +279,7 @@ static bool has_listener(const struct program *program, int fd) {
 static void wait_for_resume(struct carrier *carrier) {
     int64_t until = monotonic_ns() + LONGEST_HOLD;
     while (atomic_load(&carrier->is_held) && monotonic_ns() < until) {
-        brake(carrier);
+        serve_due(carrier);
         usleep(200);
     }
     atomic_store(&carrier->is_held, false);
@@ -291,8 +291,8 @@ static void adopt(struct carrier *carrier, const struct change *change) {
         for (uint32_t index = 0; index < earlier->listener_count; index++)
             if (!has_listener(change->program, earlier->listeners[index].fd)) drain(carrier, &earlier->listeners[index]);
     for (uint32_t index = 0; index < change->replaced_count; index++)
-        deadman_replace(carrier->stage.deadmen, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    for (uint32_t index = 0; index < change->ended_count; index++) deadman_end(carrier->stage.deadmen, change->ended[index]);
+        deadman_replace(carrier->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
+    for (uint32_t index = 0; index < change->ended_count; index++) timer_end(carrier->stage.timers, change->ended[index]);
     struct timeval turn = {0, TURN_MS * 1000};
     for (uint32_t index = 0; index < change->program->listener_count; index++)
         setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
@@ -314,7 +314,7 @@ static bool is_stopping(struct carrier *carrier) {
 }
 
 static bool goes_on(struct carrier *carrier) {
-    brake(carrier);
+    serve_due(carrier);
     /* Release: who sees the next turn may free what was read in this one. */
     atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_release);
     return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);

@@ -26,7 +26,7 @@ struct board {
 
 static counter counters[COUNTERS];
 static struct ring *events;
-static struct deadmen *deadmen;
+static struct timers *timers;
 static struct board drive, spare;
 static _Atomic(struct deadman *) acting;
 static struct deadman *takes_over; /* of another route */
@@ -61,7 +61,7 @@ static void close_board(struct board board) {
 static struct deadman *open_deadman(bool has_spare) {
     struct deadman_destination to[] = {{drive.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 7},
                                        {spare.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 8}};
-    return deadman_open(deadmen, TIMEOUT, REPEAT, true, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
+    return deadman_open(timers, TIMEOUT, REPEAT, true, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
 }
 
 /* Sends commands, most of them at once; a pause now and then lets a deadman trip, or the command get old. */
@@ -72,7 +72,7 @@ static void *send_commands(void *seed) {
         struct datagram command = {COMMAND, born, born + TTL};
         struct feed feeds[] = {{atomic_load(&acting), 0, 0}, {takes_over, 1, 0}};
         if (rand_r(&random) % 50 == 0) usleep(150);
-        int error = command_send(deadmen, drive.sender, &command, sizeof command, command.expires, feeds, 2);
+        int error = command_send(timers, drive.sender, &command, sizeof command, command.expires, feeds, 2);
         if (error == COMMAND_STALE) atomic_fetch_add(&stale, 1);
         else check(!error, "a command is sent");
         if (rand_r(&random) % 20 == 0) usleep(1500);
@@ -85,7 +85,7 @@ static void *send_others(void *seed) {
     unsigned random = (unsigned)(uintptr_t)seed;
     for (long number = 0; number < commands / 4; number++) {
         struct feed feeds[] = {{takes_over, 0, 0}};
-        command_send(deadmen, spare.sender, "other", 5, NEVER, feeds, 1);
+        command_send(timers, spare.sender, "other", 5, NEVER, feeds, 1);
         if (rand_r(&random) % 2) usleep(700);
     }
     return NULL;
@@ -93,8 +93,8 @@ static void *send_others(void *seed) {
 
 static void *wait_for_timer(void *unused) {
     while (!atomic_load(&is_done)) {
-        struct pollfd waiting = {deadmen->timer, POLLIN, 0};
-        if (poll(&waiting, 1, 20) > 0) deadmen_serve(deadmen, boottime_ns());
+        struct pollfd waiting = {timers->timer, POLLIN, 0};
+        if (poll(&waiting, 1, 20) > 0) timers_serve(timers, boottime_ns());
     }
     return unused;
 }
@@ -103,7 +103,7 @@ static void *wait_for_timer(void *unused) {
 static void *look_for_due(void *unused) {
     while (!atomic_load(&is_done)) {
         int64_t now = boottime_ns();
-        if (atomic_load_explicit(&deadmen->next_due, memory_order_relaxed) <= now) deadmen_serve(deadmen, now);
+        if (atomic_load_explicit(&timers->next_due, memory_order_relaxed) <= now) timers_serve(timers, now);
         usleep(100);
     }
     return unused;
@@ -114,15 +114,15 @@ static void *replace(void *unused) {
     int count = 0;
     while (!atomic_load(&is_done) && count < MOST_REPLACED) {
         struct deadman *earlier = atomic_load(&acting), *next = open_deadman(count % 2);
-        deadman_close(deadmen, open_deadman(true)); /* of a program that was abandoned */
-        deadman_replace(deadmen, next, earlier);
-        deadman_end(deadmen, earlier);
+        deadman_close(timers, open_deadman(true)); /* of a program that was abandoned */
+        deadman_replace(timers, next, earlier);
+        timer_end(timers, (struct timer *)earlier);
         atomic_store(&acting, next);
         replaced[count++] = earlier;
         usleep(3000);
     }
     while (!atomic_load(&is_done)) usleep(1000); /* somebody may feed them until then */
-    for (int index = 0; index < count; index++) deadman_close(deadmen, replaced[index]);
+    for (int index = 0; index < count; index++) deadman_close(timers, replaced[index]);
     return unused;
 }
 
@@ -163,11 +163,11 @@ int main(int count, char **arguments) {
     check(count == 2, "one argument");
     commands = atol(arguments[1]);
     events = ring_open(512);
-    deadmen = deadmen_open(counters, events);
+    timers = timers_open(counters, events);
     drive = open_board();
     spare = open_board();
     atomic_store(&acting, open_deadman(true));
-    takes_over = deadman_open(deadmen, TIMEOUT, REPEAT, true, 4, 5, 2, NULL, 0);
+    takes_over = deadman_open(timers, TIMEOUT, REPEAT, true, 4, 5, 2, NULL, 0);
     void *(*others[])(void *) = {wait_for_timer, look_for_due, replace, read_events, receive};
     void *(*senders[])(void *) = {send_commands, send_commands, send_others};
     enum { OTHERS = 5, SENDERS = 3 };
@@ -178,14 +178,14 @@ int main(int count, char **arguments) {
     for (int index = 0; index < SENDERS; index++) pthread_join(sending[index], NULL);
     atomic_store(&is_done, true);
     for (int index = 0; index < OTHERS; index++) pthread_join(other[index], NULL);
-    deadman_end(deadmen, atomic_load(&acting));
-    deadman_close(deadmen, atomic_load(&acting));
-    deadman_end(deadmen, takes_over);
-    deadman_close(deadmen, takes_over);
-    check(atomic_load(&deadmen->next_due) == NEVER, "nothing is due at the end");
+    timer_end(timers, (struct timer *)atomic_load(&acting));
+    deadman_close(timers, atomic_load(&acting));
+    timer_end(timers, (struct timer *)takes_over);
+    deadman_close(timers, takes_over);
+    check(atomic_load(&timers->next_due) == NEVER, "nothing is due at the end");
     check(!counters[ERRORS], "all brakes are sent");
     check(arrived > 0 && brakes > 0 && counters[TRIPS] > 0, "commands and brakes arrive");
-    deadmen_close(deadmen);
+    timers_close(timers);
     ring_close(events);
     close_board(drive);
     close_board(spare);

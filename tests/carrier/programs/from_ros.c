@@ -50,9 +50,9 @@ int main(void) {
     assert(!socketpair(AF_UNIX, SOCK_SEQPACKET, 0, pair));
     struct sender *sender = sender_open(pair[0], -1, 0, 0);
     struct ring *events = ring_open(1 << 12);
-    struct deadmen *deadmen = deadmen_open(braked, NULL);
+    struct timers *timers = timers_open(braked, NULL);
     struct deadman_destination braking = {.sender = sender, .datagram = MESSAGE, .size = 1, .sent = 2, .send_errors = 3};
-    struct deadman *deadman = deadman_open(deadmen, 1000, 1000000, true, 0, 1, 0, &braking, 1);
+    struct deadman *deadman = deadman_open(timers, 1000, 1000000, true, 0, 1, 0, &braking, 1);
     struct feed feed = {deadman, 0, 0};
     struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,
                             .delivered = SENT, .delivered_bytes = BYTES};
@@ -60,7 +60,7 @@ int main(void) {
     struct ros_route route = {
         .targets = {.ttl = 1000000000, .layout = &LAYOUT, .targets = &target, .count = 1, .topic = NO_NAME},
         .seconds = NONE, .nanoseconds = NONE, .received = RECEIVED, .last_message = LAST, .duration = DURATION};
-    struct from_ros *thread = from_ros_open(deadmen, counters, events, take, middleware_reset, true);
+    struct from_ros *thread = from_ros_open(timers, counters, events, take, middleware_reset, true);
     struct source sources[2];
     struct ros_topic topics[2];
     for (int index = 0; index < 2; index++) {
@@ -75,7 +75,7 @@ int main(void) {
     for (int times = 200; times; times--) {
         int64_t copy[COUNTERS];
         assert(from_ros_serve(thread, times % 2 ? &one : &both));
-        deadmen_serve(deadmen, boottime_ns());
+        timers_serve(timers, boottime_ns());
         if (from_ros_counters(thread, copy, COUNTERS)) assert(copy[RECEIVED] == copy[SENT] + copy[LOST]);
     }
     for (int index = 0; index < 2; index++) pthread_join(publishing[index], NULL);
@@ -88,8 +88,8 @@ int main(void) {
     }
     shutdown(pair[0], SHUT_RDWR);
     pthread_join(draining, NULL);
-    deadman_close(deadmen, deadman);
-    deadmen_close(deadmen);
+    deadman_close(timers, deadman);
+    timers_close(timers);
     sender_close(sender);
     ring_close(events);
     return 0;

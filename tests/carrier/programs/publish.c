@@ -44,7 +44,7 @@ struct made {
 struct round {
     counter *received, *published;
     struct ring *events, *rejections, *messages;
-    struct deadmen *deadmen;
+    struct timers *timers;
     struct carrier *carrier;
     struct publish_thread *publishing;
     int socket;
@@ -228,8 +228,8 @@ static void open_stage(struct round *stage) {
     stage->events = ring_open(1 << 14);
     stage->rejections = ring_open(1 << 12);
     stage->messages = ring_open(QUEUE);
-    stage->deadmen = deadmen_open(stage->received, stage->rejections);
-    stage->carrier = carrier_open(stage->deadmen, stage->received, stage->rejections);
+    stage->timers = timers_open(stage->received, stage->rejections);
+    stage->carrier = carrier_open(stage->timers, stage->received, stage->rejections);
     stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
     check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
     stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget);
@@ -238,7 +238,7 @@ static void open_stage(struct round *stage) {
 
 static void close_stage(struct round *stage) {
     carrier_close(stage->carrier);
-    deadmen_close(stage->deadmen);
+    timers_close(stage->timers);
     ring_close(stage->messages);
     ring_close(stage->events);
     ring_close(stage->rejections);

@@ -57,7 +57,7 @@ static const struct wire_schema schema = {types, 2};
 
 static counter counters[COUNTERS], braked[DEADMAN_COUNTERS];
 static struct ring *receive_events, *brake_events, *messages, *mirrored;
-static struct deadmen *deadmen;
+static struct timers *timers;
 static struct carrier *carrier;
 static struct limit limit = {1000000, 500000, -1000000};
 static int listening[LISTENERS], boards[BOARDS], sending[DESTINATIONS];
@@ -158,7 +158,7 @@ static void make_route(struct made *made, int index) {
 
 static struct deadman *open_deadman(void) {
     struct deadman_destination to = {senders[0], (const uint8_t *)"brake", 5, BRAKES, BRAKE_ERRORS, 0};
-    return deadman_open(deadmen, 2000000, 500000, true, ACTIVE, TRIPS, 1, &to, 1);
+    return deadman_open(timers, 2000000, 500000, true, ACTIVE, TRIPS, 1, &to, 1);
 }
 
 /* A program with one, two or three listeners, in turns: each is missing now and then. */
@@ -181,12 +181,13 @@ static struct made *make(uint32_t generation) {
 }
 
 static void free_made(struct made *made) {
-    deadman_close(deadmen, made->feed.deadman);
+    deadman_close(timers, made->feed.deadman);
     free(made);
 }
 
 static void change(const struct made *next, const struct made *earlier) {
-    struct deadman *replaced[] = {next->feed.deadman, earlier->feed.deadman}, *ended[] = {earlier->feed.deadman};
+    struct deadman *replaced[] = {next->feed.deadman, earlier->feed.deadman};
+    struct timer *ended[] = {(struct timer *)earlier->feed.deadman};
     struct change change = {.program = &next->program, .replaced = replaced, .ended = ended, .replaced_count = 1,
                             .ended_count = 1, .holds = next->program.generation % 5 == 0};
     carrier_change(carrier, &change);
@@ -275,7 +276,7 @@ static void *send_commands(void *unused) {
     while (!atomic_load(&is_quiet)) {
         atomic_store(&commander_at, atomic_load(&latest));
         struct feed feed = {atomic_load(&acting), 0, 0};
-        int error = command_send(deadmen, senders[0], "command", 7, NEVER, &feed, 1);
+        int error = command_send(timers, senders[0], "command", 7, NEVER, &feed, 1);
         check(!error, "a command is sent");
         atomic_fetch_add(&commands, 1);
         usleep(atomic_load(&commands) % 20 ? 200 : 5000);
@@ -382,13 +383,13 @@ int main(int count, char **arguments) {
     brake_events = ring_open(1 << 16);
     messages = ring_open(1 << 12);
     mirrored = ring_open(1 << 12);
-    deadmen = deadmen_open(braked, brake_events);
+    timers = timers_open(braked, brake_events);
     for (int index = 0; index < LISTENERS; index++) listening[index] = bound(1);
     for (int index = 0; index < BOARDS; index++) open_sender(index, address_of(boards[index] = bound(1)));
     int gone = bound(1);
     open_sender(BOARDS, address_of(gone));
     close(gone);
-    carrier = carrier_open(deadmen, counters, receive_events);
+    carrier = carrier_open(timers, counters, receive_events);
     struct made *first = make(1);
     struct change start = {.program = &first->program};
     atomic_store(&acting, first->feed.deadman);
@@ -405,14 +406,14 @@ int main(int count, char **arguments) {
     atomic_store(&has_ended, true);
     for (int index = SENDERS; index < THREADS; index++) pthread_join(threads[index], NULL);
     check_accounts();
-    deadman_end(deadmen, last->feed.deadman);
+    timer_end(timers, (struct timer *)last->feed.deadman);
     carrier_close(carrier);
     free_made(last);
     for (int index = 0; index < DESTINATIONS; index++) {
         close(sending[index]);
         sender_close(senders[index]);
     }
-    deadmen_close(deadmen);
+    timers_close(timers);
     ring_close(receive_events);
     ring_close(brake_events);
     ring_close(messages);
