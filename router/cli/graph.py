@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from router.table.model import RouteTable
 
 SUFFIXES = (".svg", ".mmd", ".dot")
-_DESCRIPTION = """Draw who sends which payload cases, and where each goes: an SVG that any browser shows, light or dark
-as the viewer likes, with a legend, and with addresses, types and conditions under the pointer; or text for Mermaid
-(.mmd) or Graphviz (.dot)."""
+_DESCRIPTION = """Draw who sends which payload cases, and where each goes, with a legend: text for Mermaid (.mmd) or
+Graphviz (.dot), or an SVG, light or dark as the viewer likes, with addresses and types under the pointer. An SVG needs
+Graphviz."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -52,16 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawn(table: RouteTable, suffix: str) -> str:
-    from router.tools.graph import dot, mermaid
-    from router.tools.graph_layout import route_map
-    from router.tools.graph_svg import svg
+    from router.tools.graph import dot, mermaid, svg
 
-    title = table.path.name
-    if suffix == ".svg":
-        return svg(route_map(table), title, f"{table.node.name}: {_counted(table)}")
-    return dot(table, title) if suffix == ".dot" else mermaid(table, title)
-
-
-def _counted(table: RouteTable) -> str:
-    parts = [plural(len(table.routes), "route"), plural(len(table.endpoints), "endpoint")]
-    return ", ".join(parts + ([plural(len(table.gateways), "gateway")] if table.gateways else []))
+    draw = {".svg": svg, ".mmd": mermaid, ".dot": dot}[suffix]
+    return draw(table, table.path.name)

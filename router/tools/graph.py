@@ -1,10 +1,13 @@
-"""A table's route map as text that other programs draw: Mermaid and Graphviz. Each has a title and a legend."""
+"""A table's route map as text for Mermaid and Graphviz, and as the picture (SVG) that Graphviz draws of it."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from xml.sax.saxutils import escape
 
+from router.errors import UsageError
 from router.observe.route_map import COLUMNS, Edge, Node, NodeKind, nodes_and_edges
 from router.table.model import RouteTable
 
@@ -17,7 +20,8 @@ LEGEND: Mapping[NodeKind, str] = {
     NodeKind.GATEWAY: "gateway",
     NodeKind.CLIENTS: "clients of a gateway",
 }
-"""What the shapes mean, for pictures too."""
+"""What the shapes mean."""
+_GUARDED = "route with a ttl or a deadman"
 
 _MERMAID_SHAPES = {
     NodeKind.ENDPOINT: ("[", "]"),
@@ -30,14 +34,26 @@ _MERMAID_SHAPES = {
 }
 _DASHED = (NodeKind.ANYONE, NodeKind.IGNORED)
 _DOT_STYLES = {
-    NodeKind.ENDPOINT: 'shape=box, style=bold, color="#0047b3"',
-    NodeKind.ANYONE: 'shape=box, style=dashed, color="#0047b3"',
-    NodeKind.TOPIC: 'shape=box, style=rounded, color="#00602b"',
+    NodeKind.ENDPOINT: 'class=endpoint, shape=box, style=bold, color="#0047b3"',
+    NodeKind.ANYONE: 'class=endpoint, shape=box, style=dashed, color="#0047b3"',
+    NodeKind.TOPIC: 'class=topic, shape=box, style=rounded, color="#00602b"',
     NodeKind.CASE: "shape=cds",
     NodeKind.IGNORED: "shape=cds, style=dashed",
-    NodeKind.GATEWAY: 'shape=hexagon, color="#8a1c9c"',
-    NodeKind.CLIENTS: 'shape=octagon, color="#8a1c9c"',
+    NodeKind.GATEWAY: 'class=gateway, shape=hexagon, color="#8a1c9c"',
+    NodeKind.CLIENTS: 'class=gateway, shape=octagon, color="#8a1c9c"',
 }
+_DOT_GUARDED = ', class=guarded, style=bold, color="#b3261e"'
+_SVG_STYLE = """<style>
+:root { color-scheme: light dark; }
+@media (prefers-color-scheme: dark) {
+.graph > polygon { fill: #101215; } text { fill: #f2f4f7; }
+.cluster polygon, .node polygon, .node path { stroke: #99a1ad; }
+.endpoint polygon { stroke: #8ab4ff; } .topic path { stroke: #6fdc98; }
+.gateway polygon { stroke: #dd9cf0; } .guarded polygon { stroke: #ff8a80; }
+}
+</style>
+"""
+"""Graphviz draws for a light ground."""
 
 
 def mermaid(table: RouteTable, title: str) -> str:
@@ -48,6 +64,18 @@ def mermaid(table: RouteTable, title: str) -> str:
 def dot(table: RouteTable, title: str) -> str:
     nodes, edges = nodes_and_edges(table)
     return "\n".join(_dot_lines(nodes, edges, title)) + "\n"
+
+
+def svg(table: RouteTable, title: str) -> str:
+    """The picture, light or dark as its viewer prefers. Raises UsageError where Graphviz is not installed."""
+    program = shutil.which("dot")
+    if program is None:
+        raise UsageError("an .svg is drawn by Graphviz, which is not installed", "apt install graphviz")
+    command = [program, "-Tsvg"]
+    drawn = subprocess.run(command, input=dot(table, title), capture_output=True, encoding="utf-8", check=True)
+    without_doctype = drawn.stdout[drawn.stdout.index("<svg") :]  # which names another host
+    head, body = without_doctype.split(">", 1)
+    return f"{head}>\n{_SVG_STYLE}{body.lstrip()}"
 
 
 def _mermaid_lines(nodes: Sequence[Node], edges: Sequence[Edge], title: str) -> Iterator[str]:
@@ -94,7 +122,8 @@ def _dot_lines(nodes: Sequence[Node], edges: Sequence[Edge], title: str) -> Iter
         for node in nodes:
             if node.column == column:
                 said = f"label={_dot_text(node.name)}, tooltip={_dot_text(node.about or node.name)}"
-                yield f"    {names[node.key]} [{said}, {_DOT_STYLES[node.kind]}];"
+                style = f"{_DOT_STYLES[node.kind]}{_DOT_GUARDED if node.is_guarded else ''}"
+                yield f"    {names[node.key]} [{said}, {style}];"
         yield "  }"
     for edge in edges:
         condition = f" [label={_dot_text(edge.about)}, style=dashed]" if edge.about else ""
@@ -102,6 +131,8 @@ def _dot_lines(nodes: Sequence[Node], edges: Sequence[Edge], title: str) -> Iter
     yield '  subgraph cluster_legend { label="legend"; fontsize=10;'
     for kind in _kinds(nodes):
         yield f"    {kind.value} [label={_dot_text(LEGEND[kind])}, {_DOT_STYLES[kind]}];"
+    if any(node.is_guarded for node in nodes):
+        yield f"    guarded [label={_dot_text(_GUARDED)}, {_DOT_STYLES[NodeKind.CASE]}{_DOT_GUARDED}];"
     yield "  }"
     yield "}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,16 @@ from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from tests.tables import ROUTES
 
 ROVER = ROUTES / "rover.yaml"
+needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
 
 
 @pytest.mark.parametrize(
     ("suffix", "beginning"),
-    [(".svg", "<svg "), (".mmd", "---\ntitle: 'rover.yaml'\n---\n"), (".dot", 'digraph "rover.yaml" {\n')],
+    [
+        pytest.param(".svg", "<svg ", marks=needs_graphviz),
+        (".mmd", "---\ntitle: 'rover.yaml'\n---\n"),
+        (".dot", 'digraph "rover.yaml" {\n'),
+    ],
 )
 def test_the_suffix_chooses_what_is_written(
     tmp_path: Path, suffix: str, beginning: str, capsys: pytest.CaptureFixture[str]
@@ -24,6 +30,16 @@ def test_the_suffix_chooses_what_is_written(
     assert main(["graph", str(ROVER), "-o", str(output)]) == OK
     assert output.read_text(encoding="utf-8").startswith(beginning)
     assert re.fullmatch(rf"{output}: [0-9]+ routes\n", capsys.readouterr().err)
+
+
+def test_without_graphviz_a_picture_is_refused_and_text_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main(["graph", str(ROVER), "-o", str(tmp_path / "x.svg")]) == BAD_USAGE
+    assert "an .svg is drawn by Graphviz, which is not installed" in capsys.readouterr().err
+    assert not (tmp_path / "x.svg").exists()
+    assert main(["graph", str(ROVER), "-o", str(tmp_path / "x.dot")]) == OK
 
 
 def test_another_suffix_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -42,5 +58,5 @@ def test_a_wrong_table_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_file_that_cannot_be_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["graph", str(ROVER), "-o", str(tmp_path / "no" / "x.svg")]) == BAD_USAGE
+    assert main(["graph", str(ROVER), "-o", str(tmp_path / "no" / "x.mmd")]) == BAD_USAGE
     assert "No such file or directory" in capsys.readouterr().err
