@@ -72,7 +72,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
     }
     struct ring *events = ring_open(1 << 15);
     part.ring = ring_open(1 << 15);
-    carrier = carrier_open(deadmen_open(counters, events), counters, events);
+    carrier = carrier_open(timers_open(counters, events), counters, events);
     struct change first = {.program = &program};
     carrier_adopt_first(carrier, &first);
     carrier_mirror(carrier, ring_open(1 << 15), LOST);
