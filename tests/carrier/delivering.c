@@ -1,7 +1,7 @@
 /* Delivers messages without threads, sockets, clocks and middleware: what would leave is written down. A library of its
  * own, which uses that of the carrier. */
 #define deliver_to_all note_all
-#include "from_ros.c"
+#include "route_ros.c"
 #undef deliver_to_all
 
 enum { DELIVERED = -1, FILTERED_OUT = -2 };
@@ -13,9 +13,9 @@ struct noted {
     uint32_t place, length, reserved;
 };
 
-/* A thread that does not run, and what it has delivered since the last call. */
+/* What it has delivered since the last call. */
 struct delivering {
-    struct from_ros thread;
+    struct ros_routing routing; /* first, as its stage is */
     struct output notes, bytes;
     int64_t now;
 };
@@ -44,7 +44,7 @@ static enum publication note_published(struct stage *stage, const struct target 
 
 /* Counters of targets: which of them has counted says what became of a message. */
 static int32_t outcome_of(const struct delivering *of, const struct target *target, const int64_t *before) {
-    const counter *counters = of->thread.stage.counters;
+    const counter *counters = of->routing.stage.counters;
     if (counters[target->delivered] != before[0]) return DELIVERED;
     if (counters[target->filtered] != before[1]) return FILTERED_OUT;
     for (int32_t reason = 0; reason < LOSSES; reason++)
@@ -81,7 +81,7 @@ bool note_all(struct stage *stage, const struct targets *to, struct message *mes
 struct delivering *seam_open(counter *counters) {
     struct delivering *made = calloc(1, sizeof *made);
     if (!made) return NULL;
-    struct stage *stage = &made->thread.stage;
+    struct stage *stage = &made->routing.stage;
     if (!stage_open(stage, counters, ring_open(1 << 12), NULL)) abort();
     stage->now = now_of;
     stage->send = note_sent;
@@ -90,8 +90,8 @@ struct delivering *seam_open(counter *counters) {
 }
 
 void seam_close(struct delivering *of) {
-    ring_close(of->thread.stage.reporter.events);
-    stage_close(&of->thread.stage);
+    ring_close(of->routing.stage.reporter.events);
+    stage_close(&of->routing.stage);
     free(of->notes.data);
     free(of->bytes.data);
     free(of);
@@ -113,7 +113,7 @@ size_t seam_datagram(struct delivering *of, const struct targets *to, const void
                                 .received_at = received_at};
     struct message message = {.datagram = &datagram};
     of->notes.size = 0;
-    note_all(&of->thread.stage, to, &message);
+    note_all(&of->routing.stage, to, &message);
     free(copy);
     *notes = of->notes.data;
     return of->notes.size;
@@ -122,11 +122,11 @@ size_t seam_datagram(struct delivering *of, const struct targets *to, const void
 /* Serve a message from ROS, likewise. */
 size_t seam_from_ros(struct delivering *of, const struct ros_route *route, const void *data, size_t size,
                      int64_t received_at, const void **notes) {
-    static struct publisher publisher;
+    static struct ros_publisher publisher;
     void *copy = exactly(data, size);
-    struct served served = {.data = copy, .size = size, .received_at = received_at, .publisher = &publisher};
+    struct taken served = {.data = copy, .size = size, .received_at = received_at, .publisher = &publisher};
     of->notes.size = 0;
-    serve_route(&of->thread, route, &served);
+    route_ros(&of->routing, route, &served);
     free(copy);
     *notes = of->notes.data;
     return of->notes.size;

@@ -12,11 +12,11 @@ void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, s
 /* `size` is at most MAX_DATAGRAM + 1. What an earlier datagram left behind this one must not count. */
 void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, size_t size, uint32_t address, uint32_t port,
                  int64_t arrived_at) {
-    struct received received = {.listener = &carrier->program->listeners[listener], .length = size, .address = address,
-                                .port = port};
-    memset(carrier->datagram, 0xa5, sizeof carrier->datagram);
-    if (size) memcpy(carrier->datagram, data, size);
-    handle(carrier, &received, arrived_at);
+    struct received received = {.listener = &carrier->routing.program->listeners[listener], .length = size,
+                                .address = address, .port = port, .arrived_at = arrived_at};
+    memset(carrier->routing.datagram, 0xa5, sizeof carrier->routing.datagram);
+    if (size) memcpy(carrier->routing.datagram, data, size);
+    handle(carrier, &received);
 }
 
 /* The thread that publishes, as it is between two messages. */

@@ -18,7 +18,7 @@ static const char ALIVE[] = "WATCHDOG=1";
 struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
     if (!carrier) return NULL;
-    bool is_open = stage_open(&carrier->stage, counters, events, timers);
+    bool is_open = stage_open(&carrier->routing.stage, counters, events, timers);
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);
@@ -78,11 +78,11 @@ void *timer_thread(void *of) {
     int64_t turn = 0;
     run_first();
     while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        struct pollfd waiting[] = {{carrier->routing.stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
         poll(waiting, 2, until_turn(carrier, turn));
         eventfd_t ignored;
         if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) timers_serve(carrier->stage.timers, boottime_ns());
+        if (waiting[0].revents) timers_serve(carrier->routing.stage.timers, boottime_ns());
         if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
             turn = monotonic_ns() + atomic_load(&carrier->interval);
@@ -98,7 +98,7 @@ void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
 }
 
 bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count) {
-    return counters_copy(&carrier->edition, carrier->stage.counters, to, count);
+    return counters_copy(&carrier->edition, carrier->routing.stage.counters, to, count);
 }
 
 void carrier_stop_receiving(struct carrier *carrier) {
@@ -117,6 +117,6 @@ void carrier_close(struct carrier *carrier) {
     }
     if (carrier->epoll >= 0) close(carrier->epoll);
     if (carrier->wake >= 0) close(carrier->wake);
-    stage_close(&carrier->stage);
+    stage_close(&carrier->routing.stage);
     free(carrier);
 }

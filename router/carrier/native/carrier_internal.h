@@ -5,12 +5,10 @@
 
 #include "carrier.h"
 #include "priority.h"
+#include "route.h"
 
 struct carrier {
     /* Of the receive thread alone: */
-    struct stage stage;
-    const struct program *program;
-    struct freshness freshness;
     struct share share;
     int epoll;
     /* Shared: */
@@ -28,9 +26,7 @@ struct carrier {
     uint64_t turns_seen;
     pthread_t receiving, timing;
     bool has_started, has_stopped;
-    /* A datagram, and the record that is made of it. Last, as they are large. */
-    _Alignas(8) uint8_t datagram[MAX_DATAGRAM + 8];
-    _Alignas(8) uint8_t record[MAX_DATAGRAM + 256];
+    struct routing routing; /* of the receive thread, too; last, as it is large */
 };
 
 void *receive_thread(void *carrier);

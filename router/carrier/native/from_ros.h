@@ -11,33 +11,7 @@
 
 #include "carrier.h"
 #include "rcl_types.h"
-
-/* `for_each`: each element of a list is served as a message. */
-struct for_each {
-    struct code list;   /* leaves the list on the stack; empty without `for_each` */
-    uint16_t stored;    /* how, an enum scalar */
-    uint16_t node;      /* into which an element is read that is a message, or NONE */
-    uint16_t item;      /* slot of any other element */
-    uint16_t index, count; /* slots, NONE if nothing uses them */
-    uint16_t reserved[3];
-};
-
-/* A route, as one of its topics feeds it. */
-struct ros_route {
-    struct targets targets;
-    struct for_each for_each;
-    uint16_t seconds, nanoseconds; /* slots of the message's stamp, or NONE */
-    uint32_t received, last_message, duration; /* counters; the last one is a histogram */
-};
-
-struct ros_topic {
-    const void *subscription; /* rcl_subscription_t */
-    const struct ros_route *routes;
-    uint32_t route_count;
-    uint32_t capacity; /* messages that the subscription holds */
-    int32_t eventfd;   /* the middleware adds to it when messages come; nobody reads it */
-    uint32_t reserved;
-};
+#include "route_ros.h"
 
 /* What the thread serves. Belongs to the caller, with all that it refers to. */
 struct ros_set {

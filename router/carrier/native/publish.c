@@ -55,22 +55,6 @@ static enum publication publish_unlocked(struct stage *stage, const struct targe
     return thread->is_left ? LEFT : error ? PUBLISH_FAILED : PUBLISHED;
 }
 
-/* ---- messages ---- */
-
-/* Serve a message. Return false if the thread was left meanwhile. */
-static bool serve(struct publish_thread *thread, const struct message_record *record) {
-    const struct targets *to = record->part->publishes;
-    struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
-                                .length = record->payload_length, .is_single = record->is_single,
-                                .column = record->column, .received_at = record->received_at};
-    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
-    for (uint32_t index = 0; index < to->count; index++) {
-        if (!deliver(&thread->stage, to, &to->targets[index], &message)) return false;
-        stage_count(&thread->stage, to->targets[index].waiting, -1);
-    }
-    return true;
-}
-
 /* ---- the thread ---- */
 
 /* Take messages, without the lock. Return how many bytes they have. */
@@ -95,7 +79,7 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
         const struct message_record *record = (const struct message_record *)(thread->records + at);
         reach(thread, record->generation);
         edition_begin(&thread->edition);
-        bool goes_on = serve(thread, record);
+        bool goes_on = route_to_topics(&thread->stage, record);
         edition_end(&thread->edition);
         if (!goes_on) return false;
         at += record->size;

@@ -10,7 +10,6 @@
 #include <unistd.h>
 
 #include "clock.h"
-#include "events.h"
 
 enum {
     TURN_MS = 50,              /* the longest wait for a datagram */
@@ -19,45 +18,11 @@ enum {
 };
 static const int64_t LONGEST_HOLD = 1000000000;
 
-/* A datagram that was received, with what is known about it. */
-struct received {
-    const struct listener *listener;
-    size_t length;
-    uint32_t address, port; /* of the sender */
-    const struct peer *peer; /* NULL for a stranger */
-    uint32_t column;
-    int64_t received_at, now;
-    struct born born;
-    struct envelope envelope;
-};
-
-/* ---- events ---- */
-
-static uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(size_t)7); }
-
-static void reject(struct carrier *carrier, const struct received *received, enum reason reason) {
-    const struct listener *listener = received->listener;
-    stage_count(&carrier->stage, listener->rejected[reason], 1);
-    if (reason == IGNORED || !may_report(&carrier->stage.reporter, received->now)) return;
-    struct rejected_event *event = (struct rejected_event *)carrier->record;
-    size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
-    *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
-                                     .kind = EVENT_REJECTED,
-                                     .listener = listener->id,
-                                     .reason = reason,
-                                     .address = received->address,
-                                     .port = received->port,
-                                     .length = (uint32_t)received->length,
-                                     .counter = listener->rejected[reason]};
-    memcpy(event + 1, carrier->datagram, kept);
-    ring_put(carrier->stage.reporter.events, event, event->size);
-}
-
 /* ---- the mirror ---- */
 
 /* `reason`: why no route took it, or ROUTED. */
 static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
-    struct mirror_record *record = (struct mirror_record *)carrier->record;
+    struct mirror_record *record = (struct mirror_record *)carrier->routing.record;
     size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
     *record = (struct mirror_record){.size = padded_to_word(sizeof *record + kept),
                                      .listener = received->listener->id,
@@ -67,133 +32,9 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .length = (uint32_t)kept,
                                      .reason = reason,
                                      .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
-    memcpy(record + 1, carrier->datagram, kept);
+    memcpy(record + 1, carrier->routing.datagram, kept);
     uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
-    if (!ring_put(to, record, record->size)) stage_count(&carrier->stage, lost, 1);
-}
-
-/* ---- targets ---- */
-
-static void send_to_all(struct carrier *carrier, const struct targets *to, const struct received *received) {
-    const struct envelope *envelope = &received->envelope;
-    struct datagram datagram = {.data = carrier->datagram, .size = envelope->size, .start = envelope->start,
-                                .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
-                                .received_at = received->received_at};
-    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born};
-    deliver_to_all(&carrier->stage, to, &message);
-}
-
-static bool is_wanted(const struct part *part) {
-    if (part->is_always_wanted) return true;
-    for (uint32_t index = 0; index < part->wanted_count; index++)
-        if (__atomic_load_n(part->wanted[index], __ATOMIC_RELAXED)) return true;
-    return false;
-}
-
-static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now) {
-    struct message_record oldest;
-    if (!ring_drop(ring, &oldest, sizeof oldest)) return;
-    for (uint32_t index = 0; index < oldest.part->target_count; index++) {
-        const struct waiting *target = &oldest.part->targets[index];
-        stage_count(&carrier->stage, target->waiting, -1);
-        stage_count(&carrier->stage, target->queue_full, 1);
-        struct lost_event lost = {.route = oldest.part->route, .topic = NO_NAME, .target = target->id,
-                                  .reason = LOSS_QUEUE_FULL, .counter = target->queue_full};
-        report_loss(&carrier->stage.reporter, now, &lost, "");
-    }
-}
-
-static void hand_over(struct carrier *carrier, const struct part *part, const struct received *received) {
-    if (!is_wanted(part)) {
-        for (uint32_t index = 0; index < part->target_count; index++)
-            stage_count(&carrier->stage, part->targets[index].filtered, 1);
-        return;
-    }
-    struct message_record *record = (struct message_record *)carrier->record;
-    *record = (struct message_record){.size = padded_to_word(sizeof *record + received->envelope.size),
-                                      .generation = carrier->program->generation,
-                                      .part = part,
-                                      .received_at = received->received_at,
-                                      .now = received->now,
-                                      .oldest = received->born.oldest,
-                                      .youngest = received->born.youngest,
-                                      .column = received->column,
-                                      .is_single = received->envelope.is_single,
-                                      .length = received->envelope.size,
-                                      .start = received->envelope.start,
-                                      .payload_length = received->envelope.length,
-                                      .handler = part->handler};
-    memcpy(record + 1, carrier->datagram, received->envelope.size);
-    for (uint32_t index = 0; index < part->target_count; index++)
-        stage_count(&carrier->stage, part->targets[index].waiting, 1);
-    while (!ring_put(part->ring, record, record->size)) drop_oldest(carrier, part->ring, received->now);
-}
-
-/* ---- routing ---- */
-
-/* Return the endpoint that has sent, or NULL for a stranger. One with a port is preferred to one without. */
-static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
-    uint32_t low = 0, high = listener->peer_count;
-    while (low < high) {
-        uint32_t middle = (low + high) / 2;
-        if (listener->peers[middle].address < address) low = middle + 1;
-        else high = middle;
-    }
-    for (; low < listener->peer_count && listener->peers[low].address == address; low++)
-        if (!listener->peers[low].port || listener->peers[low].port == port) return &listener->peers[low];
-    return NULL;
-}
-
-static const struct payload_case *find_case(const struct program *program, uint32_t number) {
-    uint32_t low = 0, high = program->case_count;
-    while (low < high) {
-        uint32_t middle = (low + high) / 2;
-        if (program->cases[middle].number < number) low = middle + 1;
-        else high = middle;
-    }
-    return &program->cases[low]; /* envelope_read returns no other number */
-}
-
-/* Return ROUTED, or the reason why no route takes the datagram. */
-static int route(struct carrier *carrier, const struct payload_case *found, const struct received *received) {
-    const struct program *program = carrier->program;
-    const struct listener *listener = received->listener;
-    if (found->row < 0) {
-        if (found->is_ignored) return IGNORED;
-        stage_count(&carrier->stage, found->unhandled, 1);
-        return UNHANDLED;
-    }
-    const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
-    if (entry->route < 0) return SOURCE_MISMATCH;
-    const struct route *chosen = &program->routes[entry->route];
-    stage_count(&carrier->stage, entry->received, 1);
-    if (chosen->sends.count) send_to_all(carrier, &chosen->sends, received);
-    for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
-    counter_set(carrier->stage.counters, chosen->last_message, received->received_at);
-    count_duration(carrier->stage.counters, chosen->duration, boottime_ns() - received->now);
-    return ROUTED;
-}
-
-static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
-    const struct listener *listener = received->listener;
-    counter *counters = carrier->stage.counters;
-    received->now = boottime_ns();
-    received->received_at = wall_ns();
-    received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
-                                    received->received_at, received->now, INT64_MIN);
-    stage_count(&carrier->stage, listener->received, 1);
-    stage_count(&carrier->stage, listener->received_bytes, (int64_t)received->length);
-    received->peer = find_peer(listener, received->address, received->port);
-    received->column = received->peer ? received->peer->column : listener->columns - 1;
-    if (received->peer) counter_set(counters, received->peer->last_seen, received->received_at);
-    int reason = envelope_read(carrier->program->schema, carrier->datagram, received->length, listener->repairs,
-                               &received->envelope);
-    if (received->envelope.is_repaired) stage_count(&carrier->stage, listener->padded, 1);
-    if (reason == UNKNOWN_CASE) stage_count(&carrier->stage, carrier->program->unknown_case, 1);
-    if (reason == ROUTED) reason = route(carrier, find_case(carrier->program, received->envelope.case_number), received);
-    if (reason != ROUTED) reject(carrier, received, (enum reason)reason);
-    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
-    if (observed) mirror(carrier, observed, received, reason);
+    if (!ring_put(to, record, record->size)) stage_count(&carrier->routing.stage, lost, 1);
 }
 
 /* ---- receiving ---- */
@@ -227,9 +68,21 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
 
 /* There was nothing to receive: so what is still to come was not stamped under a setting of the clock that has passed. */
 static void found_empty(struct carrier *carrier) {
-    freshness_forget_past(&carrier->freshness);
+    freshness_forget_past(&carrier->routing.freshness);
     int64_t now = boottime_ns();
-    freshness_look(&carrier->freshness, wall_ns(), now);
+    freshness_look(&carrier->routing.freshness, wall_ns(), now);
+}
+
+static void handle(struct carrier *carrier, struct received *received) {
+    edition_begin(&carrier->edition);
+    received->now = boottime_ns();
+    received->received_at = wall_ns();
+    int reason = route_datagram(&carrier->routing, received);
+    if (received->route)
+        count_duration(carrier->routing.stage.counters, received->route->duration, boottime_ns() - received->now);
+    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
+    if (observed) mirror(carrier, observed, received, reason);
+    edition_end(&carrier->edition);
 }
 
 enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
@@ -238,7 +91,7 @@ enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
 static enum outcome receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
     struct sockaddr_in sender;
     union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct timespec))]; } control;
-    struct iovec into = {carrier->datagram, MAX_DATAGRAM + 1};
+    struct iovec into = {carrier->routing.datagram, MAX_DATAGRAM + 1};
     struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
                              .msg_control = &control, .msg_controllen = sizeof control};
     ssize_t length = receive(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
@@ -247,20 +100,18 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
         if (!(flags & MSG_DONTWAIT)) usleep(1000);
         return FOUND_EMPTY;
     }
-    struct received received = {.listener = listener, .length = (size_t)length,
+    struct received received = {.listener = listener, .length = (size_t)length, .arrived_at = arrival(listener->fd, &message),
                                 .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
-    edition_begin(&carrier->edition);
-    handle(carrier, &received, arrival(listener->fd, &message));
-    edition_end(&carrier->edition);
+    handle(carrier, &received);
     share_processor(&carrier->share, received.now);
     return RECEIVED;
 }
 
 static void serve_due(struct carrier *carrier) {
-    int64_t due = atomic_load_explicit(&carrier->stage.timers->next_due, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&carrier->routing.stage.timers->next_due, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = boottime_ns();
-    if (due <= now) timers_serve(carrier->stage.timers, now);
+    if (due <= now) timers_serve(carrier->routing.stage.timers, now);
 }
 
 static void drain(struct carrier *carrier, const struct listener *listener) {
@@ -286,17 +137,14 @@ static void wait_for_resume(struct carrier *carrier) {
 }
 
 static void adopt(struct carrier *carrier, const struct change *change) {
-    const struct program *earlier = carrier->program;
+    const struct program *earlier = carrier->routing.program;
     if (earlier)
         for (uint32_t index = 0; index < earlier->listener_count; index++)
             if (!has_listener(change->program, earlier->listeners[index].fd)) drain(carrier, &earlier->listeners[index]);
-    for (uint32_t index = 0; index < change->replaced_count; index++)
-        deadman_replace(carrier->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    for (uint32_t index = 0; index < change->ended_count; index++) timer_end(carrier->stage.timers, change->ended[index]);
     struct timeval turn = {0, TURN_MS * 1000};
     for (uint32_t index = 0; index < change->program->listener_count; index++)
         setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
-    carrier->program = change->program;
+    route_by(&carrier->routing, change);
     if (change->holds) atomic_store(&carrier->is_held, true);
     atomic_store(&carrier->adopted, change);
 }
@@ -322,23 +170,23 @@ static bool goes_on(struct carrier *carrier) {
 
 /* With one system call per datagram: a receive that blocks, unless the clock was set since nothing was waiting. */
 static void receive_from_one(struct carrier *carrier) {
-    const struct listener *listener = carrier->program->listeners;
+    const struct listener *listener = carrier->routing.program->listeners;
     do {
-        int flags = carrier->freshness.count ? MSG_DONTWAIT : 0;
+        int flags = carrier->routing.freshness.count ? MSG_DONTWAIT : 0;
         if (receive_one(carrier, listener, flags) == FOUND_EMPTY) found_empty(carrier);
     } while (goes_on(carrier));
 }
 
 /* One datagram of each listener that has some per turn, so that none starves the others. */
 static void receive_from_many(struct carrier *carrier, int waiting) {
-    const struct program *program = carrier->program;
+    const struct program *program = carrier->routing.program;
     for (uint32_t index = 0; index < program->listener_count; index++) {
         struct epoll_event interest = {.events = EPOLLIN, .data.u32 = index};
         epoll_ctl(waiting, EPOLL_CTL_ADD, program->listeners[index].fd, &interest);
     }
     do {
         struct epoll_event ready[LISTENERS_PER_WAIT];
-        int turn = carrier->freshness.count ? 0 : TURN_MS;
+        int turn = carrier->routing.freshness.count ? 0 : TURN_MS;
         int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, turn), empty = 0;
         bool has_noted = false;
         for (int index = 0; index < count; index++) {
@@ -357,12 +205,12 @@ void *receive_thread(void *of) {
     struct carrier *carrier = of;
     carrier->share.may_be_first = carrier->share.is_first = run_first();
     while (!is_stopping(carrier)) {
-        if (carrier->program->listener_count == 1) receive_from_one(carrier);
+        if (carrier->routing.program->listener_count == 1) receive_from_one(carrier);
         else receive_from_many(carrier, carrier->epoll);
         adopt_next(carrier);
     }
-    for (uint32_t index = 0; index < carrier->program->listener_count; index++)
-        if (!carrier->program->listeners[index].keeps_input) drain(carrier, &carrier->program->listeners[index]);
+    for (uint32_t index = 0; index < carrier->routing.program->listener_count; index++)
+        if (!carrier->routing.program->listeners[index].keeps_input) drain(carrier, &carrier->routing.program->listeners[index]);
     return NULL;
 }
 

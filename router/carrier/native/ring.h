@@ -21,6 +21,9 @@ struct ring {
     _Atomic uint64_t *words;
 };
 
+/* The size of a record with that many bytes in it. */
+static inline uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(size_t)7); }
+
 /* Return a ring for `capacity` bytes, a power of two, or NULL for lack of memory or descriptors. */
 struct ring *ring_open(size_t capacity);
 void ring_close(struct ring *ring);

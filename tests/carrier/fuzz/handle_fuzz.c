@@ -72,7 +72,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
     }
     struct ring *events = ring_open(1 << 15);
     part.ring = ring_open(1 << 15);
-    carrier = carrier_open(deadmen_open(counters, events), counters, events);
+    carrier = carrier_open(timers_open(counters, events), counters, events);
     struct change first = {.program = &program};
     carrier_adopt_first(carrier, &first);
     carrier_mirror(carrier, ring_open(1 << 15), LOST);
@@ -83,9 +83,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     if (!size || size > MAX_DATAGRAM + 2) return 0;
     uint8_t chosen = input[0];
     struct received received = {.listener = &listeners[chosen % 2], .length = size - 1, .address = chosen / 2 % 4,
-                                .port = chosen & 16 ? 7 : 9};
-    memcpy(carrier->datagram, input + 1, size - 1);
-    handle(carrier, &received, chosen & 32 ? 1 : 0);
+                                .port = chosen & 16 ? 7 : 9, .arrived_at = chosen & 32 ? 1 : 0};
+    memcpy(carrier->routing.datagram, input + 1, size - 1);
+    handle(carrier, &received);
     int64_t balance = counters[ACCEPTED];
     for (uint32_t index = 0; index < LISTENERS; index++) {
         balance -= counters[listeners[index].received];

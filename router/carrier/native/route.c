@@ -1,0 +1,168 @@
+#include "route.h"
+
+#include <string.h>
+
+#include "events.h"
+
+/* ---- events ---- */
+
+static void reject(struct routing *routing, const struct received *received, enum reason reason) {
+    const struct listener *listener = received->listener;
+    stage_count(&routing->stage, listener->rejected[reason], 1);
+    if (reason == IGNORED || !may_report(&routing->stage.reporter, received->now)) return;
+    struct rejected_event *event = (struct rejected_event *)routing->record;
+    size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
+    *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
+                                     .kind = EVENT_REJECTED,
+                                     .listener = listener->id,
+                                     .reason = reason,
+                                     .address = received->address,
+                                     .port = received->port,
+                                     .length = (uint32_t)received->length,
+                                     .counter = listener->rejected[reason]};
+    memcpy(event + 1, routing->datagram, kept);
+    ring_put(routing->stage.reporter.events, event, event->size);
+}
+
+/* ---- targets ---- */
+
+static void send_to_all(struct routing *routing, const struct targets *to, const struct received *received) {
+    const struct envelope *envelope = &received->envelope;
+    struct datagram datagram = {.data = routing->datagram, .size = envelope->size, .start = envelope->start,
+                                .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
+                                .received_at = received->received_at};
+    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born};
+    deliver_to_all(&routing->stage, to, &message);
+}
+
+static bool is_wanted(const struct part *part) {
+    if (part->is_always_wanted) return true;
+    for (uint32_t index = 0; index < part->wanted_count; index++)
+        if (__atomic_load_n(part->wanted[index], __ATOMIC_RELAXED)) return true;
+    return false;
+}
+
+static void drop_oldest(struct routing *routing, struct ring *ring, int64_t now) {
+    struct message_record oldest;
+    if (!ring_drop(ring, &oldest, sizeof oldest)) return;
+    for (uint32_t index = 0; index < oldest.part->target_count; index++) {
+        const struct waiting *target = &oldest.part->targets[index];
+        stage_count(&routing->stage, target->waiting, -1);
+        stage_count(&routing->stage, target->queue_full, 1);
+        struct lost_event lost = {.route = oldest.part->route, .topic = NO_NAME, .target = target->id,
+                                  .reason = LOSS_QUEUE_FULL, .counter = target->queue_full};
+        report_loss(&routing->stage.reporter, now, &lost, "");
+    }
+}
+
+static void hand_over(struct routing *routing, const struct part *part, const struct received *received) {
+    if (!is_wanted(part)) {
+        for (uint32_t index = 0; index < part->target_count; index++)
+            stage_count(&routing->stage, part->targets[index].filtered, 1);
+        return;
+    }
+    struct message_record *record = (struct message_record *)routing->record;
+    *record = (struct message_record){.size = padded_to_word(sizeof *record + received->envelope.size),
+                                      .generation = routing->program->generation,
+                                      .part = part,
+                                      .received_at = received->received_at,
+                                      .now = received->now,
+                                      .oldest = received->born.oldest,
+                                      .youngest = received->born.youngest,
+                                      .column = received->column,
+                                      .is_single = received->envelope.is_single,
+                                      .length = received->envelope.size,
+                                      .start = received->envelope.start,
+                                      .payload_length = received->envelope.length,
+                                      .handler = part->handler};
+    memcpy(record + 1, routing->datagram, received->envelope.size);
+    for (uint32_t index = 0; index < part->target_count; index++)
+        stage_count(&routing->stage, part->targets[index].waiting, 1);
+    while (!ring_put(part->ring, record, record->size)) drop_oldest(routing, part->ring, received->now);
+}
+
+/* ---- routing ---- */
+
+/* Return the endpoint that has sent, or NULL for a stranger. One with a port is preferred to one without. */
+static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
+    uint32_t low = 0, high = listener->peer_count;
+    while (low < high) {
+        uint32_t middle = (low + high) / 2;
+        if (listener->peers[middle].address < address) low = middle + 1;
+        else high = middle;
+    }
+    for (; low < listener->peer_count && listener->peers[low].address == address; low++)
+        if (!listener->peers[low].port || listener->peers[low].port == port) return &listener->peers[low];
+    return NULL;
+}
+
+static const struct payload_case *find_case(const struct program *program, uint32_t number) {
+    uint32_t low = 0, high = program->case_count;
+    while (low < high) {
+        uint32_t middle = (low + high) / 2;
+        if (program->cases[middle].number < number) low = middle + 1;
+        else high = middle;
+    }
+    return &program->cases[low]; /* envelope_read returns no other number */
+}
+
+/* Return ROUTED, or the reason why no route takes the datagram. */
+static int route(struct routing *routing, const struct payload_case *found, struct received *received) {
+    const struct program *program = routing->program;
+    const struct listener *listener = received->listener;
+    if (found->row < 0) {
+        if (found->is_ignored) return IGNORED;
+        stage_count(&routing->stage, found->unhandled, 1);
+        return UNHANDLED;
+    }
+    const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
+    if (entry->route < 0) return SOURCE_MISMATCH;
+    const struct route *chosen = &program->routes[entry->route];
+    received->route = chosen;
+    stage_count(&routing->stage, entry->received, 1);
+    if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
+    for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(routing, &chosen->parts[index], received);
+    counter_set(routing->stage.counters, chosen->last_message, received->received_at);
+    return ROUTED;
+}
+
+/* ---- for others ---- */
+
+int route_datagram(struct routing *routing, struct received *received) {
+    const struct listener *listener = received->listener;
+    received->born = freshness_born(&routing->freshness, received->arrived_at ? received->arrived_at : received->received_at,
+                                    received->received_at, received->now, INT64_MIN);
+    stage_count(&routing->stage, listener->received, 1);
+    stage_count(&routing->stage, listener->received_bytes, (int64_t)received->length);
+    received->peer = find_peer(listener, received->address, received->port);
+    received->column = received->peer ? received->peer->column : listener->columns - 1;
+    received->route = NULL;
+    if (received->peer) counter_set(routing->stage.counters, received->peer->last_seen, received->received_at);
+    int reason = envelope_read(routing->program->schema, routing->datagram, received->length, listener->repairs,
+                               &received->envelope);
+    if (received->envelope.is_repaired) stage_count(&routing->stage, listener->padded, 1);
+    if (reason == UNKNOWN_CASE) stage_count(&routing->stage, routing->program->unknown_case, 1);
+    if (reason == ROUTED) reason = route(routing, find_case(routing->program, received->envelope.case_number), received);
+    if (reason != ROUTED) reject(routing, received, (enum reason)reason);
+    return reason;
+}
+
+void route_by(struct routing *routing, const struct change *change) {
+    for (uint32_t index = 0; index < change->replaced_count; index++)
+        deadman_replace(routing->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
+    for (uint32_t index = 0; index < change->ended_count; index++) timer_end(routing->stage.timers, change->ended[index]);
+    routing->program = change->program;
+}
+
+bool route_to_topics(struct stage *stage, const struct message_record *record) {
+    const struct targets *to = record->part->publishes;
+    struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
+                                .length = record->payload_length, .is_single = record->is_single,
+                                .column = record->column, .received_at = record->received_at};
+    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
+    for (uint32_t index = 0; index < to->count; index++) {
+        if (!deliver(stage, to, &to->targets[index], &message)) return false;
+        stage_count(stage, to->targets[index].waiting, -1);
+    }
+    return true;
+}

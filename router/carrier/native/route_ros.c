@@ -1,0 +1,115 @@
+#include "route_ros.h"
+
+#include <string.h>
+
+#include "carrier_internal.h"
+#include "evaluate.h"
+#include "lists.h"
+
+enum { MOST_ELEMENTS = 1 << 16 /* that `for_each` sends of one message: the lock is held meanwhile */ };
+
+/* ---- the age of a message ---- */
+
+static struct born earlier_of(struct born one, struct born other) {
+    if (other.oldest < one.oldest) one.oldest = other.oldest;
+    if (other.youngest < one.youngest) one.youngest = other.youngest;
+    return one;
+}
+
+/* When a message was sent by the sender's clock, or arrived if that is earlier: then the sender's clock is ahead. Its
+ * arrival is not known to be in order, so of that the youngest reading counts. */
+static struct born sent(struct ros_routing *routing, const struct taken *taken) {
+    int64_t stamp = taken->published_at ? taken->published_at : taken->arrived_at;
+    if (!stamp) stamp = taken->received_at;
+    struct born sent = freshness_born(&routing->freshness, stamp, taken->received_at, taken->now, taken->publisher->sent);
+    taken->publisher->sent = sent.oldest;
+    if (!taken->published_at || !taken->arrived_at) return sent;
+    int64_t arrived = freshness_born(&routing->freshness, taken->arrived_at, taken->received_at, taken->now,
+                                     INT64_MIN).youngest;
+    return earlier_of(sent, (struct born){arrived, arrived});
+}
+
+/* When the message was born: when it was sent, or when it was stamped, if that is earlier. */
+static struct born born(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken,
+                        struct born sent) {
+    if (route->seconds == NONE) return sent;
+    const struct value *slots = routing->stage.machine.slots;
+    int64_t stamp = slots[route->seconds].integer * 1000000000 + slots[route->nanoseconds].integer;
+    if (!stamp) return sent;
+    struct born stamped = freshness_born(&routing->freshness, stamp, taken->received_at, taken->now,
+                                         taken->publisher->stamped);
+    taken->publisher->stamped = stamped.oldest;
+    return earlier_of(sent, stamped);
+}
+
+/* ---- messages ---- */
+
+/* Take an element off a list, and deliver it. The cells that this takes are freed afterwards. */
+static void serve_element(struct ros_routing *routing, const struct ros_route *route, struct message message,
+                          struct value *list, int64_t index) {
+    struct machine *machine = &routing->stage.machine;
+    const struct for_each *each = &route->for_each;
+    uint32_t cell_count = machine->cell_count;
+    struct value item = list_next(machine, list, each->stored);
+    if (each->index != NONE) machine->slots[each->index].integer = index;
+    if (each->node == NONE) machine->slots[each->item] = item;
+    else if (!machine_enter(machine, each->node, &item)) message.outcome = LOSS_MAPPING_ERROR;
+    deliver_to_all(&routing->stage, &route->targets, &message);
+    machine->cell_count = cell_count;
+}
+
+/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused or too long counts as
+ * one message. */
+static int64_t serve_each(struct ros_routing *routing, const struct ros_route *route, struct message *message) {
+    struct machine *machine = &routing->stage.machine;
+    struct value list;
+    uint32_t at;
+    message->place = PLACE_FOR_EACH;
+    message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
+    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) message->outcome = LOSS_MAPPING_ERROR;
+    if (message->outcome != EVALUATED) {
+        deliver_to_all(&routing->stage, &route->targets, message);
+        return 1;
+    }
+    int64_t count = list.size;
+    if (route->for_each.count != NONE) machine->slots[route->for_each.count].integer = count;
+    for (int64_t index = 0; index < count; index++) serve_element(routing, route, *message, &list, index);
+    return count;
+}
+
+/* ---- for others ---- */
+
+struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid) {
+    uint32_t hash = 2166136261; /* FNV-1a */
+    for (int index = 0; index < GID_SIZE; index++) hash = (hash ^ gid[index]) * 16777619;
+    struct ros_publisher *found = &routing->publishers[hash % MOST_PUBLISHERS];
+    if (memcmp(found->gid, gid, GID_SIZE)) {
+        memcpy(found->gid, gid, GID_SIZE);
+        found->sent = found->stamped = INT64_MIN;
+    }
+    return found;
+}
+
+void route_ros(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken) {
+    struct message message = {.now = taken->now, .is_read = true, .outcome = EVALUATED};
+    struct machine *machine = &routing->stage.machine;
+    int64_t count = 1;
+    if (route->targets.ttl) message.born = sent(routing, taken);
+    machine_begin(machine, route->targets.layout);
+    machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
+    if (!machine_read(machine, 0, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;
+    else if (route->targets.ttl) message.born = born(routing, route, taken, message.born);
+    if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
+    else deliver_to_all(&routing->stage, &route->targets, &message);
+    stage_count(&routing->stage, route->received, count);
+}
+
+void route_ros_message(struct ros_routing *routing, const struct ros_topic *topic, const struct taken *taken) {
+    struct stage *stage = &routing->stage;
+    for (uint32_t index = 0; index < topic->route_count; index++) {
+        const struct ros_route *route = &topic->routes[index];
+        route_ros(routing, route, taken);
+        counter_set(stage->counters, route->last_message, taken->received_at);
+        count_duration(stage->counters, route->duration, stage->now(stage) - taken->now);
+    }
+}
