@@ -26,7 +26,7 @@ IMPORTS = {
     "net": f"{GROUND} {LANGUAGE} engine",
     "carrier": f"{GROUND} {LANGUAGE} engine net",
     "ros": f"{GROUND} {LANGUAGE} engine",
-    "gateway": f"{GROUND} {LANGUAGE} engine net ros",
+    "gateway": f"{GROUND} {LANGUAGE} engine net carrier ros",
     "recording": f"{GROUND} {LANGUAGE} engine net",
     "observe": f"{GROUND} {LANGUAGE} values engine net recording",
     "rehearsal": f"{LANGUAGE} values engine recording",

@@ -39,6 +39,7 @@ from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.from_ros import native_from_ros
+from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.ring import Ring
@@ -53,7 +54,6 @@ from router.engine import OutboundEngine, PartEngine
 from router.engine.binding import State
 from router.engine.deadman import feeder
 from router.engine.freshness import Freshness
-from router.engine.pacing import RateLimit
 from router.engine.slow_path import Rejected, SlowPath
 from router.errors import StartError
 from router.log import logger
@@ -494,9 +494,8 @@ def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
     """The limit of a target with `max_rate`, which lives as long as programs have the target."""
     rate = target.max_rate
     assert rate is not None  # noqa: S101 - asked for by the caller
-    period = RateLimit.period(rate)
     key = "native limit", handler.route, handler.topic, target
-    return state.keep(key, lambda: c.Limit(period, period - period // 2, -period))
+    return state.keep(key, lambda: open_limit(rate))
 
 
 def _endpoints(program: Program, *, by_carrier: bool) -> set[str | None]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.app.wiring import Datapath, RouterContext, Wiring
+from router.carrier.library import load
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import SourceSpan, StartError
@@ -210,8 +211,8 @@ class Runtime:
         if self.gateways is None:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
-            reporter = self._context.reporter
-            self.gateways = GatewayThread(self._ros, self._context.counts.gateways, reporter.report, reporter.failed)
+            reporter, counts = self._context.reporter, self._context.counts.gateways
+            self.gateways = GatewayThread(self._ros, load(), counts, reporter.report, reporter.failed)
             undo.callback(self._stop_gateways)
         change = self.gateways.prepare(program, wiring.feed)
         undo.callback(self.gateways.abandon, change)

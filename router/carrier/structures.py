@@ -406,6 +406,26 @@ class Born(ctypes.Structure):
     _fields_ = (("oldest", c_int64), ("youngest", c_int64))
 
 
+class Setting(ctypes.Structure):
+    """`struct setting` in freshness.h."""
+
+    _fields_ = (("offset", c_int64), ("since", c_int64), ("until", c_int64))
+
+
+class Freshness(ctypes.Structure):
+    """`struct freshness` in freshness.h."""
+
+    _fields_ = (
+        ("is_known", c_int64),
+        ("offset", c_int64),
+        ("since", c_int64),
+        ("seen", c_int64),
+        ("first", c_uint32),
+        ("count", c_uint32),
+        ("past", Setting * 32),
+    )
+
+
 class MirrorRecord(ctypes.Structure):
     """`struct mirror_record` in carrier.h; the datagram follows."""
 
@@ -438,6 +458,7 @@ __all__ = [
     "Entry",
     "Feed",
     "ForEach",
+    "Freshness",
     "Layout",
     "Limit",
     "Listener",
@@ -455,6 +476,7 @@ __all__ = [
     "RosTopic",
     "Route",
     "Schema",
+    "Setting",
     "Target",
     "Targets",
     "Topic",

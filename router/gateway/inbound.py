@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from router.carrier.limits import Freshness, RateLimit
 from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters
 from router.compiler.program import GatewayPlan, InboundPlan
 from router.engine import Report
-from router.engine.delivery import Feed as FeedDeadman
-from router.engine.freshness import Freshness
-from router.engine.pacing import RateLimit
 from router.gateway.documents import PublishRequest, SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.json_codec import InvalidMessageError, decoder
@@ -35,11 +34,13 @@ class RefusedError(Exception):
 class InboundOutputs:
     """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
     the deadman's route, each called once a message was published, with the time (boot clock) before that. Clocks in ns.
+    `library` is the carrier's.
     """
 
+    library: ctypes.CDLL
     publish: Mapping[str, Callable[[bytes], None]]
     publish_errors: tuple[type[Exception], ...]
-    feed_deadman: Mapping[str, FeedDeadman]
+    feed_deadman: Mapping[str, Callable[[int], None]]
     report: Callable[[Report], None]
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]
@@ -48,12 +49,12 @@ class InboundOutputs:
 class _Topic:
     """One topic that clients may publish on."""
 
-    def __init__(self, plan: InboundPlan, style: Style, counters: Counters, gateway: str) -> None:
+    def __init__(self, library: ctypes.CDLL, plan: InboundPlan, style: Style, counters: Counters, gateway: str) -> None:
         self.plan = plan
         self.decode = decoder(plan.type, style)
         self.max_rate, ttl = plan.settings.topic.max_rate, plan.settings.ttl
         self.ttl = ttl.value if ttl else None
-        self.may_pass = RateLimit(self.max_rate).may_pass if self.max_rate is not None else None
+        self.may_pass = RateLimit(library, self.max_rate).may_pass if self.max_rate is not None else None
         self.published = counters.index("messages_published", gateway, plan.label)
         self.dropped = {
             reason: counters.index("messages_dropped", gateway, plan.label, reason) for reason in INBOUND_DROP_REASONS
@@ -74,10 +75,12 @@ class InboundPublisher:
         self._gateway = name
         self._encoding = encoding
         self._most = plan.settings.max_inbound
-        self._topics = {topic: _Topic(each, encoding.style, counters, name) for topic, each in plan.inbound.items()}
+        self._topics = {
+            topic: _Topic(outputs.library, each, encoding.style, counters, name) for topic, each in plan.inbound.items()
+        }
         self._counts = counts
         self._outputs = outputs
-        self._freshness = Freshness()
+        self._freshness = Freshness(outputs.library)
         self.log = FloodLog()
         self._accepted = counters.index("messages_received", name, CLIENTS)
         self._last = counters.index("route_last_message_timestamp_seconds", name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
@@ -67,13 +68,15 @@ class GatewayThread:
     """Serves the gateways of a program, and changes to those of another one.
 
     `prepare` opens what is new, `retire` closes what is not wanted any more, `finish` starts the new services; or
-    `abandon` undoes the change. `counts` belong to this thread, in which all callbacks are called. `kernel_drops` has,
-    by gateway that receives datagrams, a thread-safe function that returns how many the kernel dropped.
+    `abandon` undoes the change. `library` is the carrier's. `counts` belong to this thread, in which all callbacks are
+    called. `kernel_drops` has, by gateway that receives datagrams, a thread-safe function that returns how many the
+    kernel dropped.
     """
 
     def __init__(
         self,
         ros: RouterNode,
+        library: ctypes.CDLL,
         counts: list[int],
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
@@ -82,6 +85,7 @@ class GatewayThread:
         self._failed = failed
         self._counts = counts
         self._ros = ros
+        self._library = library
         self._report = report
         self._converting = DaemonThread("gateway bulk")
         self._loop = asyncio.new_event_loop()
@@ -98,7 +102,7 @@ class GatewayThread:
         `feed` makes the functions that feed deadmen. A gateway that is the same as before keeps its clients. One that
         has changed loses them here: its socket has to be closed before the new one can be opened.
         """
-        return self._call(self._prepare(program, _outputs(program, self._ros, feed, self._report)))
+        return self._call(self._prepare(program, _outputs(program, self._ros, self._library, feed, self._report)))
 
     async def _prepare(self, program: Program, outputs: InboundOutputs) -> GatewayChange:
         kept = {
@@ -251,10 +255,13 @@ def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
     return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
 
 
-def _outputs(program: Program, ros: RouterNode, feed: FeedMaker, report: Callable[[Report], None]) -> InboundOutputs:
+def _outputs(
+    program: Program, ros: RouterNode, library: ctypes.CDLL, feed: FeedMaker, report: Callable[[Report], None]
+) -> InboundOutputs:
     inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
     guarded = [each.deadman.route for each in inbound if each.deadman]
     return InboundOutputs(
+        library=library,
         publish=ros.publish,
         publish_errors=ros.publish_errors,
         feed_deadman={route: feed(route, (route,)) for route in guarded},

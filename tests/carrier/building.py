@@ -6,7 +6,7 @@ import ctypes
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
-from ctypes import c_bool, c_int, c_int64, c_void_p
+from ctypes import c_int, c_int64, c_void_p
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,6 @@ RACES = "thread"
 
 
 _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
-    "seam_limit_passes": (c_bool, (c_void_p, c_int64)),
     "seam_lock": (None, (c_void_p,)),
     "seam_next_due": (c_int64, (c_void_p,)),
     "seam_timer": (c_int, (c_void_p,)),

@@ -17,11 +17,11 @@ from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.from_ros import FromRosThread, native_from_ros
+from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine.pacing import RateLimit
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 16
@@ -161,10 +161,7 @@ class Commanding:
 
     def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
         assert target.max_rate is not None
-        period = RateLimit.period(target.max_rate)
-        return self._limits.setdefault(
-            (handler.route, handler.topic, target), c.Limit(period, period - period // 2, -period)
-        )
+        return self._limits.setdefault((handler.route, handler.topic, target), open_limit(target.max_rate))
 
     def serve(self, subscriptions: Mapping[str, Subscription] | None = None) -> None:
         self.thread.serve(self.messages, subscriptions or self.subscriptions)

@@ -16,12 +16,12 @@ from router.app.parts import Part, divided
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
+from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine.pacing import RateLimit
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 12
@@ -154,8 +154,7 @@ class Publishing:
 
     def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
         assert target.max_rate is not None
-        period = RateLimit.period(target.max_rate)
-        return self._limits.setdefault((handler.route, target), c.Limit(period, period - period // 2, -period))
+        return self._limits.setdefault((handler.route, target), open_limit(target.max_rate))
 
 
 def wait_until(condition: Callable[[], object]) -> None:

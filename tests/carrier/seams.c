@@ -1,5 +1,4 @@
-/* What tests look at and change in the structures of the carrier, and inline functions. A library of its own. */
-#include "limit.h"
+/* What tests look at and change in the structures of the carrier. A library of its own. */
 #include "timers.h"
 
 int64_t seam_next_due(struct timers *timers) { return atomic_load(&timers->next_due); }
@@ -7,4 +6,3 @@ int64_t seam_timer_set_for(struct timers *timers) { return timers->timer_set_for
 int seam_timer(struct timers *timers) { return timers->timer; }
 void seam_lock(struct timers *timers) { pthread_mutex_lock(&timers->lock); }
 void seam_unlock(struct timers *timers) { pthread_mutex_unlock(&timers->lock); }
-bool seam_limit_passes(struct limit *limit, int64_t now) { return limit_passes(limit, now); }

@@ -19,6 +19,7 @@ from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.library import load
+from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import native_program
 from router.carrier.ring import Ring
@@ -27,7 +28,6 @@ from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import PartEngine
 from router.engine.binding import State
 from router.engine.freshness import Born
-from router.engine.pacing import RateLimit
 from router.types.framing import MAX_DATAGRAM
 from tests.carrier.building import sanitizing
 from tests.carrier.commanding import Serialized
@@ -295,10 +295,9 @@ class Whole:
         return [(self._braking[name], name != route) for name in names]
 
     def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
-        assert target.max_rate is not None
-        period = RateLimit.period(target.max_rate)
-        key = handler.route, target
-        return self._limits.keep(key, lambda: c.Limit(period, period - period // 2, -period))
+        rate, key = target.max_rate, (handler.route, target)
+        assert rate is not None
+        return self._limits.keep(key, lambda: open_limit(rate))
 
     def _published_natively(self, publisher: int, message: Any, _: object) -> int:
         """As a middleware."""

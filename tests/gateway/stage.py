@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
 
+from router.carrier.library import load
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.program import GatewayPlan, Program
@@ -189,6 +190,7 @@ class Stage:
             return lambda cdr: self.published.append((topic, cdr))
 
         outputs = InboundOutputs(
+            library=load(),
             publish={topic: publisher(topic) for topic in plan.inbound},
             publish_errors=(),
             feed_deadman={},

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from router.carrier.library import load
 from router.clock import monotonic_ns, wall_ns
 from router.gateway.encoding import ENCODINGS
 from router.gateway.inbound import InboundOutputs, InboundPublisher, RefusedError
@@ -35,6 +36,7 @@ def test_a_message_feeds_the_deadman_once_it_is_published_and_one_that_fails_doe
     [guarded] = [each.deadman for each in plan.inbound.values()]
     assert guarded is not None
     outputs = InboundOutputs(
+        library=load(),
         publish=dict.fromkeys(plan.inbound, publish),
         publish_errors=(MiddlewareError,),
         feed_deadman={guarded.route: lambda _: done.append("fed")},

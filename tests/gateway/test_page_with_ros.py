@@ -14,6 +14,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
 
+from router.carrier.library import load
 from router.gateway.thread import GatewayThread
 from tests.gateway.browser import Browser
 from tests.gateway.pictures import IMAGE, TIMES, png, shown_pixel
@@ -32,7 +33,7 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path,
     picture = png(320, 240, (0, 128, 255))
     message = CompressedImage(format="png", data=list(picture))
     with closing(open_ros()) as ros, closing(Publisher("camera/compressed", IMAGE)) as publisher:
-        gateways = GatewayThread(ros, made.counters.fresh_counts(), print, print)
+        gateways = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print)
         gateways.finish(gateways.prepare(made, lambda *_: lambda _: None))
         try:
             page = browser.open(f"http://127.0.0.1:{port}/?topic=/camera/compressed")

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from router.carrier.library import load
 from router.compiler.program import Program
 from router.errors import StartError
 from router.gateway.thread import GatewayThread
@@ -22,7 +23,7 @@ from tests.ports import free_port
 
 def opened(made: Program) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
-    thread = GatewayThread(ros, made.counters.fresh_counts(), print, print)
+    thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print)
     try:
         thread.finish(thread.prepare(made, lambda *_: lambda _: None))
     except BaseException:

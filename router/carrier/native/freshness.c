@@ -3,9 +3,6 @@
 #include <stdbool.h>
 #include <stdlib.h>
 
-/* TOLERANCE and MEMORY of engine/freshness.py, in ns. */
-static const int64_t TOLERANCE = 10000000, MEMORY = 10000000000;
-
 /* Remember a past setting of the clock, in place of the oldest one if there are too many. */
 static void remember(struct freshness *freshness, struct setting setting) {
     if (freshness->count == FRESHNESS_MOST_SETTINGS) {
@@ -17,14 +14,14 @@ static void remember(struct freshness *freshness, struct setting setting) {
 }
 
 static void forget_old(struct freshness *freshness, int64_t now) {
-    while (freshness->count && now - freshness->past[freshness->first].until > MEMORY) {
+    while (freshness->count && now - freshness->past[freshness->first].until > FRESHNESS_MEMORY) {
         freshness->first = (freshness->first + 1) % FRESHNESS_MOST_SETTINGS;
         freshness->count--;
     }
 }
 
 static bool is_possible(int64_t time, int64_t since, int64_t until) {
-    return since - TOLERANCE <= time && time <= until + TOLERANCE;
+    return since - FRESHNESS_TOLERANCE <= time && time <= until + FRESHNESS_TOLERANCE;
 }
 
 static int64_t earlier(int64_t one, int64_t other) { return one < other ? one : other; }
@@ -40,7 +37,7 @@ static void find(struct found *found, int64_t time, int64_t not_before) {
     if (!found->is_any || time < found->born.oldest) found->born.oldest = time;
     if (!found->is_any || time > found->born.youngest) found->born.youngest = time;
     found->is_any = true;
-    if (not_before == INT64_MIN || time < not_before - TOLERANCE) return;
+    if (not_before == INT64_MIN || time < not_before - FRESHNESS_TOLERANCE) return;
     if (!found->is_in_order || time < found->oldest_in_order) found->oldest_in_order = time;
     found->is_in_order = true;
 }
@@ -64,7 +61,7 @@ void freshness_look(struct freshness *freshness, int64_t received_at, int64_t no
     if (!freshness->is_known) {
         freshness->is_known = 1;
         freshness->offset = offset;
-    } else if (llabs(offset - freshness->offset) > TOLERANCE / 2) {
+    } else if (llabs(offset - freshness->offset) > FRESHNESS_TOLERANCE / 2) {
         remember(freshness, (struct setting){freshness->offset, freshness->since, now});
         freshness->offset = offset;
         freshness->since = freshness->seen;

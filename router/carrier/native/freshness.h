@@ -1,6 +1,23 @@
 /* When a message was born by the boot clock: its time stamp is of the wall clock, which may have been set since.
  *
- * The rules and their reasons are in engine/freshness.py; both have to give the same answers. */
+ * Each look compares the wall clock with the boot clock. If the offset has changed, the clock was set since the last look.
+ * A stamp means a different time under each setting, but only times at which that setting may have been in force are
+ * possible. While several are, the stamp is ambiguous: a clock that is set back shows the same time twice.
+ *
+ * Provided that the clock was set at most once between two looks, and that stamps come from clocks that are set together
+ * with ours, it follows for an event of the last FRESHNESS_MEMORY, within FRESHNESS_TOLERANCE:
+ *
+ * - The oldest reading is never younger than the event: what is stale by it stays so whatever is done to the clock. For a
+ *   while after the clock was set back by `d`, it takes fresh messages for `d` older, unless it is known that they cannot
+ *   be: by `not_before`, or because the past was forgotten.
+ * - The youngest reading is never older than the event: no jump makes a fresh message stale by it. It is younger only if
+ *   the clock was set since, or since the last look before the event, by some `d` no greater than its age.
+ *
+ * An older event may be taken for any age if the clock was set since.
+ *
+ * A stamp in the future under all settings comes from a computer whose clock is ahead; it counts as now. For
+ * FRESHNESS_MEMORY after our clock was set back by more than theirs is ahead, it is instead taken for a stamp from before
+ * that. */
 #ifndef FRESHNESS_H
 #define FRESHNESS_H
 
@@ -8,6 +25,11 @@
 
 enum { FRESHNESS_MOST_SETTINGS = 32 };
 
+/* The error (ns) of a reading while the wall clock is slewed, at up to 1 ms/s; and for how long a past setting of the
+ * clock is remembered after the next one was detected. */
+static const int64_t FRESHNESS_TOLERANCE = 10000000, FRESHNESS_MEMORY = 10000000000;
+
+/* The wall clock was `offset` ahead of the boot clock, at most from `since` until `until`. */
 struct setting {
     int64_t offset, since, until;
 };

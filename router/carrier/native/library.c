@@ -21,7 +21,7 @@ const char *carrier_checksum(void) { return CARRIER_CHECKSUM; }
 /* The structures that structures.py has too. The last one has no name. */
 const struct structure_size *carrier_structure_sizes(void) {
     static const struct structure_size sizes[] = {
-        SIZE(born), SIZE(wire_field), SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
+        SIZE(born), SIZE(setting), SIZE(freshness), SIZE(wire_field), SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
         SIZE(deadman_destination), SIZE(board_field), SIZE(board_message), SIZE(board), SIZE(value), SIZE(operation),
         SIZE(code), SIZE(node_field), SIZE(closed_enum), SIZE(read_operation), SIZE(node), SIZE(layout), SIZE(topic),
         SIZE(target), SIZE(targets), SIZE(waiting), SIZE(part), SIZE(route), SIZE(entry), SIZE(payload_case),

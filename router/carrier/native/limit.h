@@ -1,4 +1,8 @@
-/* `max_rate`: passes at most so many messages per second, on a grid; as RateLimit in engine/pacing.py. */
+/* `max_rate`: passes at most so many messages per second; all times are of the boot clock, in ns.
+ *
+ * Passes keep to a grid of one period. A message up to half a period early takes its place on the grid (a limiter by
+ * interval would wait for the next and undershoot: 25 instead of 30 Hz out of 100); after a pause the grid starts anew, so
+ * nothing is saved up for a burst. At most one message more than the rate passes in any second. */
 #ifndef LIMIT_H
 #define LIMIT_H
 
@@ -6,15 +10,11 @@
 #include <stdint.h>
 
 struct limit {
-    int64_t period, late, next_pass; /* ns; `late` is period - period / 2, `next_pass` starts as -period */
+    int64_t period, late; /* `late` is period - period / 2 */
+    int64_t next_pass;    /* from when on a message may pass; -period at first */
 };
 
 /* Whether a message may pass now; if so, it takes the place. */
-static inline bool limit_passes(struct limit *limit, int64_t now) {
-    int64_t waited = now - limit->next_pass;
-    if (waited < 0) return false;
-    limit->next_pass = waited < limit->period ? limit->next_pass + limit->period : now + limit->late;
-    return true;
-}
+bool limit_passes(struct limit *limit, int64_t now);
 
 #endif

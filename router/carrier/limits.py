@@ -1,0 +1,56 @@
+"""Age and rate of messages that Python handles, checked by the functions that native threads use."""
+
+from __future__ import annotations
+
+import ctypes
+from math import ceil
+from typing import NamedTuple
+
+from router.carrier import structures as c
+
+_UNKNOWN = -(1 << 63)
+_NS = 1_000_000_000
+
+
+class Born(NamedTuple):
+    """`struct born` in freshness.h: the earliest and the latest time that a stamp can mean, in ns of the boot clock."""
+
+    oldest: int
+    youngest: int
+
+
+class Freshness:
+    """`struct freshness`: follows the wall clock through its jumps. For one thread."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._structure = c.Freshness()
+        self._at = ctypes.addressof(self._structure)
+        self._born = library.freshness_born
+
+    def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
+        """Return when an event was that the wall clock stamped `stamp`; never after `now`.
+
+        `now` and `received_at` are boot and wall clock in ns, read now in this order. The event was not before
+        `not_before` (boot clock), if that is known; else None.
+        """
+        found = self._born(self._at, stamp, received_at, now, _UNKNOWN if not_before is None else not_before)
+        return Born(found.oldest, found.youngest)
+
+
+class RateLimit:
+    """`struct limit`, open for one thread at a time: passes at most `hertz` messages per second."""
+
+    def __init__(self, library: ctypes.CDLL, hertz: float) -> None:
+        self._structure = open_limit(hertz)
+        self._at = ctypes.addressof(self._structure)
+        self._passes = library.limit_passes
+
+    def may_pass(self, now: int) -> bool:
+        """Return whether a message may pass now (boot clock, ns); if so, it takes the place."""
+        return bool(self._passes(self._at, now))
+
+
+def open_limit(hertz: float) -> c.Limit:
+    """Return a limit of which nothing was used: a whole period ago at any time, as the boot clock is not negative."""
+    period = ceil(_NS / hertz)
+    return c.Limit(period, period - period // 2, -period)

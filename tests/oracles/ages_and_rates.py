@@ -1,0 +1,57 @@
+"""The oracle of ages and rates: the rules of `freshness.h` and `limit.h` in few words. Slow and plain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import ceil
+
+from router.carrier.limits import Born
+
+TOLERANCE, MEMORY, MOST_SETTINGS = 10_000_000, 10_000_000_000, 32
+
+
+@dataclass
+class Freshness:
+    """`settings` are the past ones: how far the wall clock was ahead, at most from when until when."""
+
+    settings: list[tuple[int, int, int]] = field(default_factory=list)
+    now: tuple[int, int, int] | None = None
+    """How far it is ahead, since when at most, and when that was last seen."""
+
+    def look(self, received_at: int, now: int) -> None:
+        offset = received_at - now
+        if self.now is None:
+            self.now = offset, 0, now
+            return
+        before, since, seen = self.now
+        if abs(offset - before) > TOLERANCE // 2:
+            self.settings = [*self.settings, (before, since, now)][-MOST_SETTINGS:]
+            before, since = offset, seen
+        self.now = before, since, now
+
+    def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
+        self.look(received_at, now)
+        assert self.now is not None
+        while self.settings and now - self.settings[0][2] > MEMORY:
+            self.settings = self.settings[1:]
+        event = stamp - (received_at - now)
+        candidates = [(stamp - offset, since, until) for offset, since, until in self.settings]
+        candidates.append((event, self.now[1], now))
+        possible = [at for at, since, until in candidates if since - TOLERANCE <= at <= until + TOLERANCE]
+        if not possible or not self.settings:
+            possible = [event]
+        in_order = [at for at in possible if not_before is not None and at >= not_before - TOLERANCE]
+        return Born(min(*(in_order or possible), now), min(max(possible), now))
+
+
+class RateLimit:
+    def __init__(self, hertz: float) -> None:
+        self._period = ceil(1_000_000_000 / hertz)
+        self._next = -self._period
+
+    def may_pass(self, now: int) -> bool:
+        if now < self._next:
+            return False
+        is_on_the_grid = now < self._next + self._period
+        self._next = self._next + self._period if is_on_the_grid else now + self._period - self._period // 2
+        return True
