@@ -21,11 +21,10 @@ import re
 import socket
 import struct
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import closing, suppress
 from email.message import Message
-from enum import IntEnum
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from io import BytesIO
@@ -62,17 +61,16 @@ IDLE_SECONDS = 30.0
 """A connection ends when there is no whole request for so long, or nothing is taken of a tap."""
 RESPONSE_SECONDS = 10.0
 """A connection ends when a response is not taken as a whole within so long."""
-STALLED_SECONDS = 3.0
-"""A tap, which sends something each second, is ended for another connection if nothing is taken for so long."""
 REST_SECONDS = 0.05
 """Between two requests on a connection, so that who asks without end costs routing little."""
-EVICTION_SECONDS = 0.003
-"""After a connection was ended for another one, which so has time to send its request."""
+REFUSAL_SECONDS = 0.003
+"""After a connection was refused, so that who connects without end costs routing little."""
 
 OWN_COMPUTER = "own"
 
 _END = re.compile(rb"\r?\n\r?\n")
 _RESET = struct.pack("ii", 1, 0)
+_FULL = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _BY_BROWSERS = ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode")
 
 
@@ -110,7 +108,7 @@ class HttpServer:
 
 
 class _Server:
-    """A thread for each connection that is admitted; others are closed at once.
+    """A thread for each connection that is admitted; others are refused at once (503).
 
     Where memory, threads or descriptors have run out, the connection is closed, and the next one accepted after a rest.
     """
@@ -144,7 +142,10 @@ class _Server:
             if self.connections.admit(connection, OWN_COMPUTER if is_own else peer[0]):
                 Thread(self._serve, "http connection", (connection, peer)).start()
             else:
-                connection.close()
+                with suppress(OSError):  # the client has left already
+                    connection.send(_FULL)
+                self._close(connection)
+                sleep(REFUSAL_SECONDS)
         except BaseException:
             self._close(connection)
             raise
@@ -152,8 +153,10 @@ class _Server:
     def _serve(self, connection: socket.socket, peer: object) -> None:
         try:
             _Handler(self._responder, self.connections, connection, peer, self)
-        except (ConnectionError, TimeoutError):
+        except ConnectionError:
             pass  # the client has left
+        except TimeoutError:
+            _reset(connection)  # what was not taken is dropped
         except Exception as error:  # noqa: BLE001 reported, and lost to this client alone
             self._lost(error)
         finally:
@@ -170,124 +173,45 @@ class _Server:
         self._log.flush()
 
 
-class _Stage(IntEnum):
-    """In the order in which connections are ended for new ones."""
-
-    ANSWERED = 0
-    NEW = 1
-    ASKING = 2
-
-
-@dataclass(slots=True)
-class _Open:
-    """A connection. `progress`: when it got further last (monotonic, s). `is_busy`: its client waits for the router."""
-
-    host: str
-    progress: float
-    stage: _Stage = _Stage.NEW
-    is_busy: bool = False
-    is_tap: bool = False
-
-    @property
-    def is_kept(self) -> bool:
-        """Whether it is not ended for others."""
-        return monotonic() - self.progress < STALLED_SECONDS if self.is_tap else self.is_busy
-
-
 class Connections:
-    """Those that are open, and how many each host may have. Thread-safe.
+    """Those that are open, with their hosts, and those of them that are taps. Thread-safe.
 
-    A new one is admitted even where its host has all that it may have: of the connections that share its limit, one is
-    ended that was answered, or else one that has not asked, or else one that waits for its answer; of these the one
-    without progress for longest.
+    Where all places are taken a new one is refused; the limits of time free places that nobody uses.
     """
 
     def __init__(self) -> None:
-        self._open: dict[socket.socket, _Open] = {}  # longest without progress first
+        self._hosts: dict[socket.socket, str] = {}
+        self._taps: set[socket.socket] = set()
         self._lock = threading.Lock()
 
     def admit(self, connection: socket.socket, host: str) -> bool:
-        """Return whether there is room. `host` is OWN_COMPUTER or an IP address.
-
-        Sleeps for EVICTION_SECONDS where another connection was ended.
-        """
+        """Return whether there is room. `host` is OWN_COMPUTER or an IP address."""
         with self._lock:
-            before = len(self._open)
-            has_room = self._makes_room(MAX_PER_HOST, lambda other: other.host == host) and (
-                host == OWN_COMPUTER or self._makes_room(MAX_FROM_OTHERS, lambda other: other.host != OWN_COMPUTER)
-            )
-            has_evicted = len(self._open) < before
+            taken = Counter(self._hosts.values())
+            from_others = taken.total() - taken[OWN_COMPUTER]
+            has_room = taken[host] < MAX_PER_HOST and (host == OWN_COMPUTER or from_others < MAX_FROM_OTHERS)
             if has_room:
-                self._open[connection] = _Open(host, monotonic())
-        if has_evicted:
-            sleep(EVICTION_SECONDS)
+                self._hosts[connection] = host
         return has_room
 
     def admit_tap(self, connection: socket.socket) -> bool:
         """Return whether a connection may become a tap."""
         with self._lock:
-            if connection not in self._open or not self._makes_room(MAX_TAPS, lambda other: other.is_tap):
-                return False
-            self._open[connection].is_tap = True
-            return True
-
-    def note_request(self, connection: socket.socket) -> bool:
-        """Note that there is a whole request. Return whether the connection is still open."""
-        return self._proceeds(connection, _Stage.ASKING)
-
-    def note_response(self, connection: socket.socket) -> None:
-        """Note that a response begins, or that some of it was taken."""
-        self._proceeds(connection, _Stage.ANSWERED)
-
-    def _proceeds(self, connection: socket.socket, stage: _Stage) -> bool:
-        with self._lock:
-            if (found := self._open.pop(connection, None)) is None:
-                return False
-            found.progress, found.stage = monotonic(), stage
-            self._open[connection] = found
-            return True
-
-    @contextmanager
-    def busy(self, connection: socket.socket) -> Iterator[None]:
-        """Inside, the client waits for the router: the connection is not ended for others."""
-        self._set_busy(connection, True)
-        try:
-            yield
-        finally:
-            self._set_busy(connection, False)
-
-    def _set_busy(self, connection: socket.socket, is_busy: bool) -> None:
-        with self._lock:
-            if (found := self._open.get(connection)) is not None:
-                found.is_busy = is_busy
+            has_room = len(self._taps) < MAX_TAPS
+            if has_room:
+                self._taps.add(connection)
+        return has_room
 
     def remove(self, connection: socket.socket) -> None:
         with self._lock:
-            self._open.pop(connection, None)
+            self._hosts.pop(connection, None)
+            self._taps.discard(connection)
 
     def end_all(self) -> None:
         with self._lock:
-            for each in self._open:
-                _end(each)
-
-    def _makes_room(self, most: int, shares: Callable[[_Open], bool]) -> bool:
-        """Return whether fewer than `most` connections share a limit, if need be after one of them was ended."""
-        sharing = {connection: found for connection, found in self._open.items() if shares(found)}
-        if len(sharing) < most:
-            return True
-        can_end = [connection for connection, found in sharing.items() if not found.is_kept]
-        longest = min(can_end, key=lambda connection: sharing[connection].stage, default=None)  # the first of equals
-        if longest is None:
-            return False
-        del self._open[longest]
-        _reset(longest)
-        _end(longest)
-        return True
-
-
-def _end(connection: socket.socket) -> None:
-    with suppress(OSError):  # the client has left already
-        connection.shutdown(socket.SHUT_RDWR)
+            for connection in self._hosts:
+                with suppress(OSError):  # the client has left already
+                    connection.shutdown(socket.SHUT_RDWR)
 
 
 def _reset(connection: socket.socket) -> None:
@@ -325,13 +249,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle(self) -> None:
         self.close_connection = False
+        rested_at = monotonic()
         while (request := self._request()) is not None:
+            sleep(max(0.0, rested_at - monotonic()))
             self.rfile = BytesIO(request)
             self.wfile = self._out = BytesIO()
-            self._connections.note_request(self.connection)
             with self._answering:
-                if not self._connections.note_request(self.connection):
-                    return  # ended for another one meanwhile
                 self.handle_one_request()
             if (slow := self._slow) is not None:
                 self._slow = None
@@ -339,7 +262,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send()
             if self.close_connection:
                 return
-            sleep(REST_SECONDS)
+            rested_at = monotonic() + REST_SECONDS
 
     def _request(self) -> bytes | None:
         """The lines of the next request; None where no whole one comes, or one beyond MAX_REQUEST."""
@@ -349,7 +272,11 @@ class _Handler(BaseHTTPRequestHandler):
                 return None
             looked_at = max(0, len(self._ahead) - 3)
             self.connection.settimeout(max(0.001, deadline - monotonic()))
-            if not (piece := self.connection.recv(MAX_REQUEST)):
+            try:
+                piece = self.connection.recv(MAX_REQUEST)
+            except TimeoutError:
+                return None
+            if not piece:
                 return None
             self._ahead += piece
         request = bytes(self._ahead[: end.end()])
@@ -358,13 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self) -> None:
         self.connection.settimeout(RESPONSE_SECONDS)
-        self._connections.note_response(self.connection)
-        try:
-            self.connection.sendall(self._out.getvalue())  # the timeout is that of the whole
-        except TimeoutError:
-            _reset(self.connection)
-            raise
-        self._connections.note_response(self.connection)
+        self.connection.sendall(self._out.getvalue())  # the timeout is that of the whole
 
     def do_GET(self) -> None:
         path, _, asked = self.path.partition("?")
@@ -401,7 +322,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._respond(plain(HTTPStatus.FORBIDDEN, why))
 
     def _order(self, order: Callable[[], Response]) -> None:
-        with self._ordering, self._connections.busy(self.connection):
+        with self._ordering:
             self._respond(order())
 
     def _respond(self, response: Response) -> None:
@@ -447,7 +368,6 @@ class _Handler(BaseHTTPRequestHandler):
             left = memoryview(piece)
             while left:
                 left = left[self.connection.send(left) :]
-            self._connections.note_response(self.connection)
 
     def version_string(self) -> str:
         return "router"

@@ -37,7 +37,6 @@ from router.observe.http import (
 from router.observe.responses import plain
 from router.observe.route_map import Edge, Node, nodes_and_edges
 from router.observe.running import ReloadResult
-from router.observe.tap import MAGIC
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from tests.acceptance.site import wait_until
@@ -324,102 +323,63 @@ def others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "is_own_computer", lambda peer, _: not peer.startswith("127.0.1."))
 
 
-def test_who_has_all_places_of_a_host_makes_room_for_one_more(server: HttpServer) -> None:
-    """Also who asks byte by byte."""
-    with ExitStack() as stack:
-        silent = opened(server, stack, MAX_PER_HOST)
-        for each in silent[::2]:
-            each.sendall(b"GET /ready HTTP/1.1\r\nHost: 127")
-        for _ in range(3):
-            assert answers(server)
-        wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
-        assert not is_ended(silent[-1])
+def is_refused(connection: socket.socket) -> bool:
+    return connection.recv(65536).startswith(b"HTTP/1.1 503 ")
 
 
-def test_who_has_an_answer_goes_before_who_has_not_asked_yet(server: HttpServer) -> None:
+def test_a_host_with_all_its_places_is_refused_until_one_is_free(server: HttpServer) -> None:
     with ExitStack() as stack:
-        silent = opened(server, stack, MAX_PER_HOST - 1)
-        answered = stack.enter_context(asking(server, "/ready"))
-        assert answered.getresponse().read() == b"ready\n"
-        for _ in range(3):
-            assert answers(server)
-        assert not any(map(is_ended, silent))
-        assert answered.sock is not None
-        wait_until(lambda: is_ended(answered.sock), "the end of the one that has its answer")
+        taken = opened(server, stack, MAX_PER_HOST)
+        assert is_refused(opened(server, stack, 1)[0])
+        assert not any(map(is_ended, taken))
+        taken[0].close()
+        wait_until(lambda: answers(server), "the place of the one that left")
+
+
+def test_who_asks_nothing_loses_its_place(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "IDLE_SECONDS", 0.3)
+    with ExitStack() as stack:
+        opened(server, stack, MAX_PER_HOST)
+        wait_until(lambda: answers(server), "the place of one that asked nothing")
 
 
 def test_all_addresses_of_the_own_computer_are_one_host(server: HttpServer) -> None:
     with ExitStack() as stack:
-        silent = [opened(server, stack, 1, f"127.0.0.{number}")[0] for number in range(1, MAX_PER_HOST + 2)]
-        wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
-        assert not any(map(is_ended, silent[1:]))
+        for number in range(1, MAX_PER_HOST + 1):
+            opened(server, stack, 1, f"127.0.0.{number}")
+        assert is_refused(opened(server, stack, 1, "127.0.0.99")[0])
 
 
 @pytest.mark.usefixtures("others")
 def test_other_computers_share_places_that_are_not_the_own_ones(server: HttpServer) -> None:
     with ExitStack() as stack:
-        tap = stack.enter_context(asking(server, "/tap"))
-        own = opened(server, stack, MAX_PER_HOST - 1)
-        first = opened(server, stack, MAX_PER_HOST + 1, "127.0.1.1")
-        wait_until(lambda: is_ended(first[0]), "the end of the one that waited longest of its host")
-        more = [each for number in range(2, 50) for each in opened(server, stack, 1, f"127.0.1.{number}")]
-        taken = [*first, *more]
-        wait_until(lambda: sum(map(is_ended, taken)) == len(taken) - MAX_FROM_OTHERS, "the end of what is too much")
-        assert not any(map(is_ended, taken[-MAX_FROM_OTHERS:]))
-        assert not any(map(is_ended, own))
-        assert tap.getresponse().status == 200
-
-
-def test_an_order_that_takes_long_keeps_its_place(
-    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, done = threading.Event(), threading.Event()
-
-    def reload() -> ReloadResult:
-        begun.set()
-        done.wait(10)
-        return running.reloads
-
-    monkeypatch.setattr(running, "reload", reload)
-    with ExitStack() as stack:
-        connection = stack.enter_context(asking(server, "/-/reload", "POST"))
-        assert begun.wait(10)
-        opened(server, stack, 2 * MAX_PER_HOST)
+        opened(server, stack, MAX_PER_HOST - 1)
+        taken = opened(server, stack, MAX_PER_HOST, "127.0.1.1")
+        assert is_refused(opened(server, stack, 1, "127.0.1.1")[0])
+        for number in range(MAX_FROM_OTHERS - MAX_PER_HOST):
+            taken += opened(server, stack, 1, f"127.0.1.{number + 2}")
+        assert is_refused(opened(server, stack, 1, "127.0.1.99")[0])
+        assert not any(map(is_ended, taken))
         assert answers(server)
-        done.set()
-        assert connection.getresponse().status == 200
-
-
-def test_a_tap_whose_reader_takes_what_comes_keeps_its_place(server: HttpServer, running: FakeRunning) -> None:
-    with ExitStack() as stack:
-        connection = stack.enter_context(asking(server, "/tap"))
-        response = connection.getresponse()
-        assert response.read(len(MAGIC)) == MAGIC
-        opened(server, stack, 2 * MAX_PER_HOST)
-        assert answers(server)
-        running.receive(b"junk", ("127.0.0.99", 1))
-        while b"junk" not in (piece := response.read1()):
-            assert piece
 
 
 def test_of_taps_there_are_a_few_only_and_one_that_is_not_read_goes(
     server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(server_module, "IDLE_SECONDS", 0.3)
     with ExitStack() as stack:
-        for _ in range(MAX_TAPS):
-            tap = stack.enter_context(asking(server, "/tap"))
-            assert tap.getresponse().status == 200
-        refused = ask(server, "/tap")
-        assert (refused.status, refused.text) == (503, "there are 6 taps already: end one\n")
-        monkeypatch.setattr(server_module, "STALLED_SECONDS", 0)
-        another = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        taps = [stack.enter_context(asking(server, "/tap")).getresponse() for _ in range(MAX_TAPS)]
+        assert {tap.status for tap in taps} == {200}
+        with asking(server, "/tap") as one_more:
+            refused = one_more.getresponse()
+            assert refused.status == 503
+            assert refused.read() == b"there are 6 taps already: end one\n"
 
         def is_let_in() -> bool:
             for _ in range(50):
                 running.receive(bytes(60_000), ("127.0.0.99", 1))
-            another.request("GET", "/tap")
-            response = another.getresponse()
-            return response.status == 200 or not response.read()
+            with asking(server, "/tap") as another:
+                return another.getresponse().status == 200
 
         wait_until(is_let_in, "a place of a tap that nobody reads")
 
