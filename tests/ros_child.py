@@ -6,6 +6,7 @@ as a script), has imported it and forks the children.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import runpy
@@ -22,6 +23,9 @@ from typing import Any, TextIO
 
 _LARGEST_REQUEST = 1 << 20
 
+_PIPE = 1 << 20
+"""Bytes that a child may print before somebody reads: one that has to wait loses messages."""
+
 
 class ForkedProcess:
     """A child of the forker, with as much of the interface of `subprocess.Popen` as tests need."""
@@ -29,6 +33,7 @@ class ForkedProcess:
     def __init__(self, *command: str) -> None:
         stdin, self._to_stdin = os.pipe()
         from_stdout, stdout = os.pipe()
+        fcntl.fcntl(stdout, fcntl.F_SETPIPE_SZ, _PIPE)
         environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_suffix(".xml")), **os.environ}
         request = {"command": command, "environment": environment, "folder": str(Path.cwd())}
         self.pid: int = _ask(request, stdin, stdout)
