@@ -80,7 +80,7 @@ class _Shape(NamedTuple):
     parse: Callable[[bytes], Message]
 
 
-class _Row(NamedTuple):
+class _Record(NamedTuple):
     """One message record; see `_HEAD` and `_Shape`."""
 
     length: int
@@ -90,6 +90,18 @@ class _Row(NamedTuple):
     publish_time: int
     data: bytes
     message_index: list[int]
+
+
+class _Records(NamedTuple):
+    """Message records by column, each in the order of the records, with the fields of `_Record`."""
+
+    lengths: Sequence[int]
+    channels: Iterable[int]
+    sequences: Iterable[int]
+    log_times: Sequence[int]
+    publish_times: Iterable[int]
+    data: Iterable[bytes]
+    message_indexes: Iterable[list[int]]
 
 
 class Encoder:
@@ -138,12 +150,21 @@ class Encoder:
         found = [shape for shape in shapes if shape is not None]
         if len(found) == len(batch) and _parses(self._parse_envelope, b"".join(data)):
             _, payloads, lengths, channels, indexes, _ = zip(*found, strict=True)
-            self._append(lengths, channels, sequences, times, steady, map(getitem, data, payloads), indexes)
-            return
-        rows: list[_Row] = []
-        for each, shape, sequence, publish_time in zip(batch, shapes, sequences, steady, strict=True):
-            rows += self._rows(classifier, each, shape, sequence, publish_time)
-        self._append(*zip(*rows, strict=True))
+            records = _Records(
+                lengths=lengths,
+                channels=channels,
+                sequences=sequences,
+                log_times=times,
+                publish_times=steady,
+                data=map(getitem, data, payloads),
+                message_indexes=indexes,
+            )
+        else:
+            rows: list[_Record] = []
+            for each, shape, sequence, publish_time in zip(batch, shapes, sequences, steady, strict=True):
+                rows += self._records_of(classifier, each, shape, sequence, publish_time)
+            records = _Records(*zip(*rows, strict=True))
+        self._append(records)
 
     def take(self) -> Chunk | None:
         """Return what was added since the last time, None for nothing."""
@@ -198,22 +219,20 @@ class Encoder:
         self._steady = steady
         return found
 
-    def _append(
-        self,
-        lengths: Iterable[int],
-        channels: Iterable[int],
-        sequences: Iterable[int],
-        log_times: Iterable[int],
-        publish_times: Iterable[int],
-        data: Iterable[bytes],
-        indexes: Iterable[list[int]],
-    ) -> None:
-        """Add message records, one of each column. A loop here would double the cost of recording."""
-        lengths, log_times = tuple(lengths), tuple(log_times)
-        heads = map(_HEAD.pack, repeat(Opcode.MESSAGE.value), lengths, channels, sequences, log_times, publish_times)
-        self._pieces += chain.from_iterable(zip(heads, data, strict=True))
-        *offsets, self._offset = accumulate(map(_OPCODE_AND_LENGTH.__add__, lengths), initial=self._offset)
-        deque(map(list.extend, indexes, zip(log_times, offsets, strict=True)), maxlen=0)
+    def _append(self, records: _Records) -> None:
+        """Add message records. A loop here would double the cost of recording."""
+        heads = map(
+            _HEAD.pack,
+            repeat(Opcode.MESSAGE.value),
+            records.lengths,
+            records.channels,
+            records.sequences,
+            records.log_times,
+            records.publish_times,
+        )
+        self._pieces += chain.from_iterable(zip(heads, records.data, strict=True))
+        *offsets, self._offset = accumulate(map(_OPCODE_AND_LENGTH.__add__, records.lengths), initial=self._offset)
+        deque(map(list.extend, records.message_indexes, zip(records.log_times, offsets, strict=True)), maxlen=0)
 
     def _shapes_of(
         self,
@@ -273,14 +292,14 @@ class Encoder:
     def _index(self, channel: int) -> list[int]:
         return self._indexes.setdefault(channel, [])
 
-    def _rows(
+    def _records_of(
         self, classifier: Classifier, datagram: Mirrored, shape: _Shape | None, sequence: int, publish_time: int
-    ) -> Iterator[_Row]:
+    ) -> Iterator[_Record]:
         """Yield the payload where that is the whole datagram; else the datagram, and its payload if there is one."""
         at, listener, peer, endpoint, reason, data = datagram
         if shape is not None and _parses(shape.parse, data[shape.payload]):
-            row = (sequence, at, publish_time, data[shape.payload], shape.message_index)
-            yield _Row(shape.length, shape.channel, *row)
+            payload = data[shape.payload]
+            yield _Record(shape.length, shape.channel, sequence, at, publish_time, payload, shape.message_index)
             return
         messages = [(self._other_channel(None, reason), self._datagram(listener, peer, endpoint, data))]
         if (found := classifier.encoded_payload(listener, data)) is not None:
@@ -288,7 +307,7 @@ class Encoder:
             messages.append((self._other_channel(case, reason), payload))
         for channel, message in messages:
             length = _BEHIND_LENGTH + len(message)
-            yield _Row(length, channel, sequence, at, publish_time, message, self._index(channel))
+            yield _Record(length, channel, sequence, at, publish_time, message, self._index(channel))
 
     def _datagram(self, listener: str, peer: Peer, endpoint: str, data: bytes) -> bytes:
         """Encode a `Datagram`; fields before and behind `data` are encoded once for a sender."""

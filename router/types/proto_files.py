@@ -115,11 +115,10 @@ def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
 
 
 _TOKEN = re.compile(
-    rb"""(?P<skipped>//[^\n]*|/\*.*?(?:\*/|\Z)|^(?:<{7}|\|{7}|>{7})[^\n]*)"""
+    rb"""(?P<comment>//[^\n]*|/\*.*?(?:\*/|\Z))"""
     rb"""|"(?:\\.|[^"\\\n])*"?|'(?:\\.|[^'\\\n])*'?|[\w.]+|[{};]""",
-    re.DOTALL | re.MULTILINE,
+    re.DOTALL,
 )
-"""Comments and the marks of an unresolved merge are skipped."""
 _SIGNS = frozenset("{;}")
 
 
@@ -167,7 +166,7 @@ def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
     """The words before each `;` or brace, and whether a block begins there. A `}` is a statement of its own."""
     words: list[str] = []
     for match in _TOKEN.finditer(content):
-        if match["skipped"]:
+        if match["comment"]:
             continue
         word = match[0].decode(errors="replace")
         if word not in _SIGNS:

@@ -17,7 +17,6 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto,
 from router.errors import SourceSpan, shown_path
 
 _TAB_WIDTH = 8
-_MERGE_MARK = re.compile(rb"(?:(<{7}|>{7})|={7})(?=\s|$)")
 _WORD = re.compile(rb'"[^"\n]*"?|[\w.]+|.')
 
 
@@ -44,23 +43,6 @@ class ProtoText:
         start = _offset(text, column)
         word = _WORD.match(text, start)
         return self._span(line, start, word.end() if word else start)
-
-    def nearest(self, pattern: str, line: int) -> SourceSpan | None:
-        """The match of a regular expression that is nearest to the line."""
-        matches = [
-            (number, match) for number, text in enumerate(self._lines) for match in re.finditer(pattern.encode(), text)
-        ]
-        if not matches:
-            return None
-        number, match = min(matches, key=lambda found: abs(found[0] - line))
-        return self._span(number, match.start(), match.end())
-
-    def merge_mark(self, line: int) -> SourceSpan | None:
-        """The first mark that an unresolved merge left in the file, with `=======` only on this line."""
-        for number, text in enumerate(self._lines):
-            if (found := _MERGE_MARK.match(text)) and (found[1] or number == line):
-                return self._span(number, 0, found.end())
-        return None
 
     def before(self, line: int, column: int) -> str:
         """What stands before the place on its line, without blanks at its end."""

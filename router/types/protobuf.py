@@ -139,18 +139,17 @@ def load_protos(
     folder = read_folder(root, protos.span)
     path = lock_path(protos, lock)
     locked = _readable_lock(path)
-    homes = {name: message.file for name, message in locked.messages.items()} if locked is not None else {}
     file, envelope = envelope_file(folder, protos, message, locked)
     used = reached(file, folder.files) if folder.faults else {file}
     if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
         raise TableError(faults)
-    compiled = compile_protos(folder, [file], homes)
+    compiled = compile_protos(folder, [file])
     names = [each.name for each in compiled.file]
     warnings, valid = _check_others(folder, names)
     if with_others and valid:
-        compiled = compile_protos(folder, [*names, *valid], homes)
+        compiled = compile_protos(folder, [*names, *valid])
         names = [each.name for each in compiled.file]
-    findings = _same_name_findings(folder, compiled, homes)
+    findings = _same_name_findings(folder, compiled)
     options = {}
     for name in folder.files:
         if name.endswith(OPTIONS):
@@ -203,7 +202,7 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     complaints = check_protos(folder, compiled, valid)
     news = [complaint for complaint in complaints if complaint.file not in folder.faults]
     files: dict[str, list[Diagnostic]] = {}
-    for finding in findings_of(news, folder, {}):
+    for finding in findings_of(news, folder):
         files.setdefault(finding.span.file, []).append(finding)
     warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
     broken = {complaint.file for complaint in complaints}
@@ -223,7 +222,7 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     return ProtoSources(compiled.file, paths)
 
 
-def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapping[str, str]) -> list[Diagnostic]:
+def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Diagnostic]:
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
@@ -236,8 +235,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapp
     if all(len(same) == 1 for same in names.values()):
         return findings
     sources = _sources(folder, compiled)
-    for short, same in names.items():
-        first, *others = sorted(same, key=lambda name: name not in homes)
+    for short, (first, *others) in names.items():
         place = sources.span(first)
         hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
         text = f"there are two messages '{short}'"

@@ -29,8 +29,8 @@ _NUMBER_TAKEN = re.compile(
     r"Field number \d+ has already been used|uses reserved number|Field name \S+ is reserved"
     r"|uses the same enum value as"
 )
-_RESERVED = re.compile(r'Field "(?P<field>\w+)" uses reserved number (?P<number>\d+)')
-_TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined(?: in file "(?P<other>[^"]+)")?')
+_SENTENCE_END = re.compile(r"\. +(?=[A-Z])")
+_TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined(?: in file "[^"]+")?')
 _NOT_DEFINED = re.compile(r'^"(?P<name>[\w.]+)" is not defined\.')
 _NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
 _NOT_A_TYPE = re.compile(r'^"(?P<name>[\w.]+)" is not a type')
@@ -47,26 +47,15 @@ class Complaint:
     message: str
 
 
-def findings_of(complaints: Sequence[Complaint], folder: Folder, homes: Mapping[str, str]) -> list[Diagnostic]:
-    """One finding for each fault; what only follows from another one is left out.
-
-    Of two messages of one name, the one that is not where `homes` has it is blamed.
-    """
+def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnostic]:
+    """One finding for each fault, in protoc's words but for imports; what only follows from another one is left out."""
     texts = {file: ProtoText(folder.root / file) for file in {complaint.file for complaint in complaints}}
     places: dict[tuple[str, int, int], list[Complaint]] = {}
     findings = []
-    merging = set()
     for complaint in _without_consequences(complaints, folder.files.keys() | folder.faults.keys()):
-        if complaint.file in merging:
-            continue
-        if (span := texts[complaint.file].merge_mark(complaint.line)) is not None:
-            merging.add(complaint.file)
-            hint = "keep what is right of both sides and delete the marks"
-            findings.append(Diagnostic(span, Code.BAD_PROTO, "an unresolved merge", hint))
-        else:
-            places.setdefault((complaint.file, complaint.line, complaint.column), []).append(complaint)
+        places.setdefault((complaint.file, complaint.line, complaint.column), []).append(complaint)
     for first, *more in places.values():
-        finding = _newcomer(first, folder.root, homes) or _finding(first, folder.protos, texts[first.file])
+        finding = _finding(first, folder.protos, texts[first.file])
         # What else protoc says about the same place is advice, or the same again.
         advice = [other.message.rstrip(".") for other in more if other.message != first.message]
         findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
@@ -100,8 +89,6 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     if complaint.line < 0:
         return Diagnostic(SourceSpan(shown_path(text.path)), Code.BAD_PROTO, complaint.message.rstrip("."))
     span = text.word(complaint.line, complaint.column)
-    if reserved := _RESERVED.match(complaint.message):  # protoc reports the `reserved`, not the field
-        span = text.nearest(rf"\b{reserved['field']}\s*=\s*{reserved['number']}\b", complaint.line) or span
     if missing := _IMPORT_FAILED.fullmatch(complaint.message):
         others = files.keys() - {complaint.file, *scan(files.get(complaint.file, b"")).imports}
         hint = _import_hint(missing["name"], complaint.file, others)
@@ -109,8 +96,8 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     if undefined := _NOT_DEFINED.match(complaint.message) or _NOT_IMPORTED.match(complaint.message):
         hint = _type_hint(undefined["name"], complaint.file, files)
         return Diagnostic(span, Code.BAD_PROTO, f'"{undefined["name"]}" is not defined', hint)
-    what, _, advice = complaint.message.partition(". ")
-    return Diagnostic(span, _code(complaint, text), what.rstrip("."), advice.rstrip("."))
+    what, *advice = _SENTENCE_END.split(complaint.message, maxsplit=1)
+    return Diagnostic(span, _code(complaint, text), what.rstrip("."), "".join(advice).rstrip("."))
 
 
 def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
@@ -138,17 +125,6 @@ def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     return "; ".join(parts)
 
 
-def _newcomer(complaint: Complaint, root: Path, homes: Mapping[str, str]) -> Diagnostic | None:
-    """protoc blames the file that comes last in the alphabet; where that one had the message first, blame the other."""
-    taken = _TYPE_TAKEN.match(complaint.message)
-    if taken is None or taken["other"] is None or homes.get(taken["name"]) != complaint.file:
-        return None
-    short = taken["name"].rpartition(".")[2]
-    span = ProtoText(root / taken["other"]).nearest(rf"(?<=\bmessage ){short}\b|\b{short}\b(?=\s*=)", 0)
-    message = f'"{taken["name"]}" is already defined in file "{complaint.file}"'
-    return Diagnostic(span, Code.DUPLICATE_MESSAGE, message) if span is not None else None
-
-
 def _code(complaint: Complaint, text: ProtoText) -> Code:
     if _NUMBER_TAKEN.search(complaint.message):
         return Code.WIRE_NUMBER_CONFLICT
@@ -161,16 +137,15 @@ WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
 """Where grpcio-tools keeps `google/protobuf/*.proto`."""
 
 
-def compile_protos(folder: Folder, names: Sequence[str], homes: Mapping[str, str]) -> FileDescriptorSet:
+def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
     """The descriptors of the named files and of what they import, dependencies first.
 
-    Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. `homes`
-    says which file a message is known to belong to: a second one of that name is blamed elsewhere.
-    Raises TableError with one finding for each error of protoc, and StartError.
+    Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. Raises TableError with one
+    finding for each error of protoc, and StartError.
     """
     with _scratch(folder, names) as include:
         if complaints := _complaints(include):
-            raise TableError(findings_of(complaints, folder, homes))
+            raise TableError(findings_of(complaints, folder))
         output = Path(include[0]).with_name("descriptors")
         options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
         arguments = ["protoc", *(f"--proto_path={path}" for path in include), *options, EVERYTHING]

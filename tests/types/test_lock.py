@@ -336,22 +336,6 @@ def test_envelope_that_grows_says_so(changed: Callable[..., list[Diagnostic]]) -
     )
 
 
-@pytest.mark.parametrize("package", ["", "package first;\n"])
-def test_second_message_of_a_locked_name_is_blamed_although_it_comes_first(
-    record: Record, compare: Compare, package: str
-) -> None:
-    record(PROTO)
-    texts = {
-        "a.proto": f'syntax = "proto3";\n{package}\nmessage Motor {{\n  bool on = 1;\n}}\n',
-        "motor.proto": PROTO.replace("enum", 'import "a.proto";\nenum', 1),
-    }
-    with pytest.raises(TableError) as caught:
-        compare(texts)
-    (finding,) = caught.value.diagnostics
-    assert (finding.code, finding.span) == (Code.DUPLICATE_MESSAGE, SourceSpan("a.proto", 3 + bool(package), 9, 14))
-    assert "motor.proto" in f"{finding.message} {finding.hint}"
-
-
 def test_missing_lock_is_one_warning(compare: Compare) -> None:
     comparison = compare(PROTO)
     (finding,) = comparison.findings()

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code, SourceSpan, TableError
-from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, String
 from router.types.protobuf import Envelope, find_envelope, load_protos
@@ -126,7 +125,6 @@ def test_the_rovers_envelope_has_the_26_cases_of_the_existing_system(rover_envel
     assert {case.number for case in rover_envelope.cases.values()} >= set(range(1, 27))
 
 
-MERGE = "keep what is right of both sides and delete the marks"
 STRAY = {
     "does not compile": ("message A { int32 x = 1 }", 'b.proto:2:25: warning[unused-proto]: {}: Expected ";"'),
     "imports what is not there": (
@@ -144,10 +142,6 @@ STRAY = {
     "has many faults": (
         "message Imu { float x = 1; }\nmessage Note {}\n",
         'b.proto:2:9: warning[unused-proto]: {}: "Imu" is already defined in file "a.proto" (and 1 more)',
-    ),
-    "is in the middle of a merge": (
-        "<<<<<<< HEAD\nmessage A {}\n=======\n>>>>>>> b\n",
-        "b.proto:2:1: warning[unused-proto]: {}: an unresolved merge; " + MERGE,
     ),
 }
 
@@ -209,20 +203,6 @@ def test_imported_files_are_the_folders_own_wherever_they_are(write: Write, tmp_
     schema = load_protos(*settings(root))
     assert schema.files == (f"{linked}/imu.proto", "a.proto")
     assert schema.span("Imu").file == f"rover/{linked}/imu.proto"
-
-
-def test_merge_of_two_envelopes_in_one_file_is_said_to_be_one(refused: Refused) -> None:
-    (finding,) = refused({"a.proto": f"<<<<<<< HEAD\n{ENVELOPE}=======\n{ENVELOPE}>>>>>>> b\n"})
-    assert (finding.message, finding.span.line) == ("an unresolved merge", 1)
-
-
-def test_enum_values_that_are_named_as_messages_are_blamed(write: Write) -> None:
-    root = write({"z.proto": ENVELOPE})
-    schema = load_protos(*settings(root))
-    write_lock(root / LOCK_NAME, LockComparison(schema, find_envelope(schema, ONEOF)).extended())
-    types = 'syntax = "proto3";\nenum Types {\n  NONE = 0;\n  Imu = 1;\n}\n'
-    write({"a.proto": types, "z.proto": ENVELOPE.replace("message Imu", 'import "a.proto";\nmessage Imu')})
-    assert [(found.span.file, found.span.line) for found in refusal(root)] == [("a.proto", 4)]
 
 
 def test_stray_file_without_a_fault_can_be_compiled_too(write: Write) -> None:

@@ -56,7 +56,7 @@ def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch:
         ),
         pytest.param(
             "message A {\n  reserved 3;\n  int32 x = 3;\n}",
-            'a.proto:4:9: error[wire-number-conflict]: Field "x" uses reserved number 3; '
+            'a.proto:3:12: error[wire-number-conflict]: Field "x" uses reserved number 3; '
             "Suggested field numbers for A: 1",
             id="reserved number",
         ),
@@ -85,6 +85,11 @@ def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch:
             "message A {\n  int32 x = 1\n}",
             'a.proto:4:1: error[bad-proto]: Expected ";"',
             id="syntax",
+        ),
+        pytest.param(
+            "<<<<<<< HEAD",
+            'a.proto:2:1: error[bad-proto]: Expected top-level statement (e.g. "message")',
+            id="unresolved merge",
         ),
         pytest.param(
             "message A {\n  Motr motor = 1;\n}",
