@@ -60,30 +60,8 @@ class Deadmen:
 
     def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, NativeSender]) -> NativeDeadman:
         """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
-        destinations = [
-            c.DeadmanDestination(
-                sender=senders[endpoint].address,
-                datagram=datagram,
-                size=len(datagram),
-                sent=counters.index("deadman_datagrams_sent", plan.route, endpoint),
-                send_errors=counters.index("deadman_send_errors", plan.route, endpoint),
-                id=self._names.number(endpoint),
-            )
-            for endpoint, datagram in plan.datagrams
-        ]
-        address = self._library.deadman_open(
-            self.address,
-            plan.timeout,
-            plan.repeat,
-            plan.at_start,
-            counters.index("deadman_active", plan.route),
-            counters.index("deadman_trips", plan.route),
-            self._names.number(plan.route),
-            (c.DeadmanDestination * len(destinations))(*destinations),
-            len(destinations),
-        )
-        if not address:
-            raise MemoryError("a deadman of the carrier cannot be opened")
+        outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}
+        address = open_deadman(self._library, self.address, self._names, counters, plan, outlets)
         return NativeDeadman(self._library, self.address, address, plan, senders)
 
     def command(
@@ -105,3 +83,42 @@ class Deadmen:
             raise OSError(error, os.strerror(error))
 
         return command
+
+
+def open_deadman(
+    library: ctypes.CDLL,
+    group: int,
+    names: Names,
+    counters: Counters,
+    plan: DeadmanPlan,
+    outlets: Mapping[str, Mapping[str, int]],
+) -> int:
+    """Return the address of a `struct deadman`, which is served from now on. Raises MemoryError.
+
+    `outlets` has the sender or the publisher, as in `struct deadman_destination`, by the name of each destination.
+    """
+    destinations = [
+        c.DeadmanDestination(
+            datagram=datagram,
+            size=len(datagram),
+            sent=counters.index("deadman_datagrams_sent", plan.route, name),
+            send_errors=counters.index("deadman_send_errors", plan.route, name),
+            id=names.number(name),
+            **outlets[name],
+        )
+        for name, datagram in plan.datagrams
+    ]
+    address = library.deadman_open(
+        group,
+        plan.timeout,
+        plan.repeat,
+        plan.at_start,
+        counters.index("deadman_active", plan.route),
+        counters.index("deadman_trips", plan.route),
+        names.number(plan.route),
+        (c.DeadmanDestination * len(destinations))(*destinations),
+        len(destinations),
+    )
+    if not address:
+        raise MemoryError("a deadman of the carrier cannot be opened")
+    return int(address)

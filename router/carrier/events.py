@@ -105,7 +105,7 @@ class EventThread:
         elif kind == _LOST:
             _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
             route, target = self._name(of_route), self._name(of_target)
-            detail = bytes(record[_LOSS.size :]).partition(b"\0")[0].decode(errors="replace")
+            detail = _text(record[_LOSS.size :])
             if generation:  # a program of the table refused the message
                 topic = self._name(of_topic) if of_topic != NO_NAME else None
                 detail = self._place(route, topic, target, generation, place)
@@ -113,7 +113,8 @@ class EventThread:
             self._count(counter, lost, counters, last)
         else:
             _, _, route, target, number, counter = _DEADMAN.unpack_from(record)
-            failed = Report("deadman", self._name(route), self._name(target), "send_error", _error(number))
+            error = _error(number) or OSError(f"it cannot be published: {_text(record[_DEADMAN.size :])}")
+            failed = Report("deadman", self._name(route), self._name(target), "send_error", error)
             self._count(counter, failed, counters, last)
 
     def _count(
@@ -131,3 +132,7 @@ class EventThread:
 
 def _error(number: int) -> OSError | None:
     return OSError(number, os.strerror(number)) if number else None
+
+
+def _text(record: memoryview) -> str:
+    return bytes(record).partition(b"\0")[0].decode(errors="replace")

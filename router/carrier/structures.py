@@ -65,6 +65,7 @@ class DeadmanDestination(ctypes.Structure):
         ("sent", c_uint32),
         ("send_errors", c_uint32),
         ("id", c_uint32),
+        ("publisher", c_void_p),
     )
 
 

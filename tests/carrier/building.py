@@ -20,6 +20,7 @@ RACES = "thread"
 _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_lock": (None, (c_void_p,)),
     "seam_next_due": (c_int64, (c_void_p,)),
+    "seam_refuse": (None, (c_void_p, c_int)),
     "seam_timer": (c_int, (c_void_p,)),
     "seam_timer_set_for": (c_int64, (c_void_p,)),
     "seam_unlock": (None, (c_void_p,)),

@@ -1,4 +1,4 @@
-"""The carrier's deadmen give the same answers as those of Python, and no old command leaves behind a brake."""
+"""Deadmen give the same answers as an oracle, and no old command leaves behind a brake."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from struct import Struct
 from typing import cast
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router.carrier import structures as c
@@ -31,9 +31,10 @@ from router.carrier.sender import NativeSender
 from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import Deadman
-from router.engine.delivery import Report, Stale
+from router.engine.delivery import Stale
 from tests.carrier.building import MEMORY, RACES, run_program
+from tests.oracles import deadman as oracle
+from tests.oracles.deadman import GREETING, START, START_AGAIN, Event
 from tests.readable import readable
 
 NEVER = (1 << 63) - 1
@@ -42,9 +43,6 @@ EVENT = Struct("@IIIIiI")
 TRIPPED, RELEASED, ERROR = 1, 2, 3
 PAYLOADS = {"wheels": b"brake", "arm": b"hold", "mast": b"fold\0\0"}
 PLAN = DeadmanPlan("drive", 500, 100, (("wheels", b"brake"), ("arm", b"hold")))
-
-Event = tuple[str, str, str, int]
-"""What happened, to the deadman of which route, and at which endpoint, with which errno."""
 
 
 class Outlet:
@@ -76,68 +74,6 @@ class Outlet:
 
 def senders(outlets: Mapping[str, Outlet]) -> Mapping[str, NativeSender]:
     return cast("Mapping[str, NativeSender]", outlets)
-
-
-class PythonSide:
-    """Deadmen of Python, with all that comes out of them."""
-
-    def __init__(self) -> None:
-        self.counters = Counters()
-        self.counts = [0] * 100
-        self._sent: dict[str, list[bytes]] = {endpoint: [] for endpoint in PAYLOADS}
-        self._broken: set[str] = set()
-        self._events: list[Event] = []
-        self._deadmen: list[Deadman] = []
-        self._send = {endpoint: self._sender(endpoint) for endpoint in PAYLOADS}
-
-    def _sender(self, endpoint: str) -> Callable[[bytes], int]:
-        def send(data: bytes) -> int:
-            if endpoint in self._broken:
-                raise OSError(errno.ENOTSOCK, "")
-            self._sent[endpoint].append(data)
-            return len(data)
-
-        return send
-
-    def _report(self, report: Report) -> None:
-        assert isinstance(report.error, OSError)
-        self._events.append(("error", report.place, report.target, report.error.errno or 0))
-
-    def _changed(self, route: str, is_active: bool) -> None:
-        self._events.append(("tripped" if is_active else "released", route, "", 0))
-
-    def add(self, plan: DeadmanPlan) -> Deadman:
-        deadman = Deadman(plan, self.counters, self.counts, self._send, self._report, self._changed)
-        self._deadmen.append(deadman)
-        return deadman
-
-    def replace(self, later: Deadman, earlier: Deadman) -> None:
-        later.replace(earlier)
-
-    def remove(self, deadman: Deadman) -> None:
-        deadman.end(0)
-        self._deadmen.remove(deadman)
-
-    def command(self, now: int, feeds: list[tuple[Deadman, bool]], data: bytes) -> None:
-        with suppress(OSError):
-            self._send["wheels"](data)
-            for deadman, disarms in feeds:
-                (deadman.disarm if disarms else deadman.feed)(now)
-
-    def serve(self, now: int) -> None:
-        for deadman in reversed(self._deadmen):
-            deadman.due(now)
-
-    def breaks(self, endpoint: str, *, is_broken: bool) -> None:
-        (self._broken.add if is_broken else self._broken.discard)(endpoint)
-
-    def seen(self) -> object:
-        due = min((each.next_due for each in self._deadmen if each.next_due is not None), default=NEVER)
-        sent = {endpoint: list(taken) for endpoint, taken in self._sent.items()}
-        for taken in self._sent.values():
-            taken.clear()
-        events, self._events = self._events, []
-        return sent, events, min(due, NEVER), self.counts
 
 
 class NativeSide:
@@ -181,6 +117,18 @@ class NativeSide:
     def breaks(self, endpoint: str, *, is_broken: bool) -> None:
         self._outlets[endpoint].breaks(is_broken=is_broken)
 
+    def refuses(self, endpoint: str) -> None:
+        self._seams.seam_refuse(self._outlets[endpoint].address, errno.ECONNREFUSED)
+
+    def await_subscribers(self, deadman: NativeDeadman, now: int) -> None:
+        self._library.deadman_await_subscribers(self.deadmen.address, deadman.address, now)
+
+    def greet(self, deadman: NativeDeadman, now: int) -> bool:
+        return bool(self._library.deadman_greet(self.deadmen.address, deadman.address, now))
+
+    def end_when_served(self, deadman: NativeDeadman) -> None:
+        self._library.deadman_end_by_thread(self.deadmen.address, deadman.address)
+
     def events(self) -> list[Event]:
         name, events = self._names.name, []
         for _, kind, route, target, error, _ in EVENT.iter_unpack(self._ring.take()):
@@ -196,102 +144,144 @@ class NativeSide:
     def timer_set_for(self) -> int:
         return int(self._seams.seam_timer_set_for(self.deadmen.address))
 
-    def seen(self) -> object:
-        due = self.next_due
-        assert self.timer_set_for <= due
-        sent = {endpoint: outlet.take() for endpoint, outlet in self._outlets.items()}
-        return sent, self.events(), due, list(self.counts)
+    def taken(self) -> list[tuple[str, bytes]]:
+        """What was sent since the last call, by endpoint."""
+        return [(endpoint, data) for endpoint, outlet in self._outlets.items() for data in outlet.take()]
 
 
 plans = st.builds(
-    lambda timeout, repeat, endpoints: (timeout, repeat, sorted(endpoints)),
+    lambda timeout, repeat, endpoints, at_start: (timeout, repeat, sorted(endpoints), at_start),
     st.integers(1, 50),
     st.integers(1, 20),
     st.sets(st.sampled_from(list(PAYLOADS))),
+    st.booleans(),
 )
 routes = st.sampled_from(["drive", "stop"])
+endpoints = st.sampled_from(list(PAYLOADS))
+chosen = st.tuples(routes, st.integers(0, 3))
+pauses = st.integers(0, 80) | st.sampled_from([GREETING, START_AGAIN - 1, START_AGAIN, START])
 steps = st.one_of(
     st.tuples(st.just("command"), st.lists(st.tuples(routes, st.booleans(), st.integers(0, 3)), max_size=3)),
     st.tuples(st.just("command"), st.just([("drive", False, 0)])),
     st.tuples(st.just("pass"), st.integers(0, 80)),
-    st.tuples(st.just("pass"), st.integers(0, 80)),
+    st.tuples(st.just("pass"), pauses),
     st.tuples(st.just("replace"), st.tuples(routes, plans)),
-    st.tuples(st.just("remove"), st.tuples(routes, st.integers(0, 3))),
-    st.tuples(st.just("start"), st.tuples(routes, st.integers(0, 3))),
-    st.tuples(st.just("end"), st.tuples(routes, st.integers(0, 3))),
-    st.tuples(st.just("break"), st.tuples(st.sampled_from(list(PAYLOADS)), st.booleans())),
+    st.tuples(st.just("remove"), chosen),
+    st.tuples(st.just("start"), routes),
+    st.tuples(st.just("await_subscribers"), chosen),
+    st.tuples(st.just("greet"), chosen),
+    st.tuples(st.just("end"), chosen),
+    st.tuples(st.just("end_when_served"), chosen),
+    st.tuples(st.just("break"), st.tuples(endpoints, st.booleans())),
+    st.tuples(st.just("refuse"), endpoints),
 )
+
+Pair = tuple[oracle.Deadman, NativeDeadman]
 
 
 class Comparison:
     """Has both sides take the same steps. Deadmen are chosen by route and age: the last one of a route acts."""
 
     def __init__(self, library: ctypes.CDLL, seams: ctypes.CDLL, stack: ExitStack) -> None:
-        self._python = PythonSide()
-        self._native = NativeSide(library, seams, stack, self._python.counters)
+        self._counters = Counters()
+        self._plain = oracle.Deadmen()
+        self._native = NativeSide(library, seams, stack, self._counters)
         self._now = 0
-        self._routes: dict[str, list[tuple[Deadman, NativeDeadman]]] = {"drive": [], "stop": []}
-        self._add("drive", (50, 10, ["wheels", "arm"]))
-        self._add("stop", (20, 20, ["wheels"]))
+        self._routes: dict[str, list[Pair]] = {"drive": [], "stop": []}
+        self._add("drive", (50, 10, ["wheels", "arm"], True))
+        self._add("stop", (20, 20, ["wheels"], True))
+        for route in self._routes:
+            self.do_await_subscribers((route, 0))
 
-    def _add(self, route: str, plan: tuple[int, int, list[str]]) -> tuple[Deadman, NativeDeadman]:
-        timeout, repeat, endpoints = plan
-        made = DeadmanPlan(route, timeout, repeat, tuple((each, PAYLOADS[each]) for each in endpoints))
-        pair = self._python.add(made), self._native.add(made)
+    def _add(self, route: str, plan: tuple[int, int, list[str], bool]) -> Pair:
+        timeout, repeat, endpoints, at_start = plan
+        made = DeadmanPlan(route, timeout, repeat, tuple((each, PAYLOADS[each]) for each in endpoints), at_start)
+        pair = self._plain.add(made), self._native.add(made)
         self._routes[route].append(pair)
         return pair
 
-    def _chosen(self, route: str, age: int) -> tuple[Deadman, NativeDeadman]:
+    def _chosen(self, route: str, age: int) -> Pair:
         deadmen = self._routes[route]
         return deadmen[-1 - age % len(deadmen)]
 
     def step(self, what: str, arguments: object) -> None:
         getattr(self, f"do_{what}")(arguments)
-        assert self._native.seen() == self._python.seen()
+        sent, self._plain.sent = self._plain.sent, []
+        events, self._plain.events = self._plain.events, []
+        assert self._native.taken() == sorted(sent, key=lambda each: [*PAYLOADS].index(each[0]))
+        assert self._native.events() == events
+        assert self._native.next_due == (NEVER if self._plain.next_due is None else self._plain.next_due)
+        assert self._native.timer_set_for <= self._native.next_due
+        for (metric, *labels), count in self._plain.counts.items():
+            index = self._counters.index(f"deadman_{metric}", *labels)
+            assert self._native.counts[index] == count
+        assert sum(self._native.counts) == sum(self._plain.counts.values())
 
     def do_command(self, feeds: list[tuple[str, bool, int]]) -> None:
         chosen = [(*self._chosen(route, age), disarms) for route, disarms, age in feeds]
         data = b"command %d" % self._now
-        self._python.command(self._now, [(python, disarms) for python, _, disarms in chosen], data)
+        self._plain.command(self._now, [(plain, disarms) for plain, _, disarms in chosen], "wheels", data)
         self._native.command(self._now, [(native, disarms) for _, native, disarms in chosen], data)
 
     def do_pass(self, time: int) -> None:
         self._now += time
-        self._python.serve(self._now)
+        self._plain.serve(self._now)
         self._native.serve(self._now)
 
-    def do_replace(self, arguments: tuple[str, tuple[int, int, list[str]]]) -> None:
+    def do_replace(self, arguments: tuple[str, tuple[int, int, list[str], bool]]) -> None:
         route, plan = arguments
-        (python, native), (next_python, next_native) = self._chosen(route, 0), self._add(route, plan)
-        self._python.replace(next_python, python)
+        (plain, native), (next_plain, next_native) = self._chosen(route, 0), self._add(route, plan)
+        self._plain.replace(next_plain, plain)
         self._native.replace(next_native, native)
 
     def do_remove(self, arguments: tuple[str, int]) -> None:
         """As when an earlier program is retired."""
         route, age = arguments
-        python, native = chosen = self._chosen(route, age)
+        plain, native = chosen = self._chosen(route, age)
         if chosen == self._chosen(route, 0):
             return
         self._routes[route].remove(chosen)
-        self._python.remove(python)
+        self._plain.end(plain)
+        self._plain.remove(plain)
         self._native.remove(native)
 
-    def do_start(self, arguments: tuple[str, int]) -> None:
-        python, native = self._chosen(*arguments)
-        if arguments[1] == 0:  # one that was replaced has fewer destinations than its plan
-            assert native.start(self._now) == python.start(self._now)
+    def do_start(self, route: str) -> None:
+        plain, native = self._chosen(route, 0)  # one that was replaced has fewer destinations than its plan
+        assert native.start(self._now) == self._plain.start(plain, self._now)
+
+    def do_await_subscribers(self, arguments: tuple[str, int]) -> None:
+        plain, native = self._chosen(*arguments)
+        self._plain.await_subscribers(plain, self._now)
+        self._native.await_subscribers(native, self._now)
+
+    def do_greet(self, arguments: tuple[str, int]) -> None:
+        plain, native = self._chosen(*arguments)
+        assert self._native.greet(native, self._now) == self._plain.greet(plain, self._now)
 
     def do_end(self, arguments: tuple[str, int]) -> None:
-        python, native = self._chosen(*arguments)
-        python.end(self._now)
+        plain, native = self._chosen(*arguments)
+        self._plain.end(plain)
         native.end()
+
+    def do_end_when_served(self, arguments: tuple[str, int]) -> None:
+        plain, native = self._chosen(*arguments)
+        self._plain.end_when_served(plain)
+        self._native.end_when_served(native)
 
     def do_break(self, arguments: tuple[str, bool]) -> None:
         endpoint, is_broken = arguments
-        self._python.breaks(endpoint, is_broken=is_broken)
+        (self._plain.broken.add if is_broken else self._plain.broken.discard)(endpoint)
         self._native.breaks(endpoint, is_broken=is_broken)
 
+    def do_refuse(self, endpoint: str) -> None:
+        self._plain.refused.add(endpoint)
+        self._native.refuses(endpoint)
 
+
+@example(
+    steps=[("greet", ("stop", 0)), ("replace", ("stop", (20, 20, ["wheels"], True))), ("pass", 1), ("pass", GREETING)]
+)
+@example(steps=[("replace", ("stop", (20, 20, ["wheels"], False))), ("greet", ("stop", 0))])
 @given(steps=st.lists(steps, max_size=60))
 def test_they_give_the_same_answers(library: ctypes.CDLL, seams: ctypes.CDLL, steps: list[tuple[str, object]]) -> None:
     with ExitStack() as stack:

@@ -6,8 +6,12 @@
 
 #include "deliver.h"
 
-enum { MOST_REACHED = 64 };
-static const int64_t START_AGAIN = 1000000000; /* ns */
+enum { MOST_REACHED = 64, LONGEST_TEXT = 255 };
+
+/* In ns: after what time a payload of the start that could not leave is sent again; for how long after the start a new
+ * subscriber may be one that was there before, as discovery takes less; and after what time a subscriber that was
+ * discovered has discovered the publisher as well. */
+static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 500000000;
 
 struct deadman {
     struct timer timer;      /* not due while it is unarmed, unless it starts again, and once it is replaced */
@@ -17,6 +21,9 @@ struct deadman {
     bool has_tripped;
     bool starts;             /* sends when the router starts */
     bool is_kept_back;       /* a datagram that was sent last has not left */
+    bool is_ending;          /* it ends when it is served next */
+    int64_t greets_until;    /* it greets new subscribers before that, while it is unarmed */
+    int64_t greets_again;    /* when it is due after the next time, while it is unarmed; or NEVER */
     uint32_t active, trips, id;
     uint32_t count;
     struct deadman_destination destinations[];
@@ -24,13 +31,29 @@ struct deadman {
 
 /* What follows, up to the public functions, is called with the lock held. */
 
-static void report(struct timers *timers, enum event_kind kind, const struct deadman *deadman,
-                   const struct deadman_destination *to, int error) {
-    struct deadman_event event = {sizeof event, kind, deadman->id, to ? to->id : 0, error, to ? to->send_errors : 0};
+static void put_event(struct timers *timers, const struct deadman_event *event) {
     struct deadman_event oldest;
     struct ring *events = timers->stage->reporter.events;
     if (!events) return;
-    while (!ring_put(events, &event, sizeof event)) ring_drop(events, &oldest, sizeof oldest);
+    while (!ring_put(events, event, event->size)) ring_drop(events, &oldest, sizeof oldest);
+}
+
+static void report(struct timers *timers, enum event_kind kind, const struct deadman *deadman) {
+    struct deadman_event event = {.size = sizeof event, .kind = kind, .deadman = deadman->id};
+    put_event(timers, &event);
+}
+
+/* A datagram has not left: `error` is an errno, or 0 and `why` says more. */
+static void report_error(struct timers *timers, const struct deadman *deadman, const struct deadman_destination *to,
+                         int error, const char *why) {
+    struct {
+        struct deadman_event event;
+        char text[LONGEST_TEXT + 1];
+    } record = {{sizeof record.event, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, ""};
+    size_t length = strnlen(why, LONGEST_TEXT);
+    memcpy(record.text, why, length);
+    if (length) record.event.size += (uint32_t)(length + 8) / 8 * 8;
+    put_event(timers, &record.event);
 }
 
 /* Send the datagrams. Return a bit for each of the first 64 destinations reached. One that is refused has left: whoever
@@ -41,9 +64,10 @@ static uint64_t send_all(struct timers *timers, struct deadman *deadman) {
     for (uint32_t index = 0; index < deadman->count; index++) {
         const struct deadman_destination *to = &deadman->destinations[index];
         int error = timers->stage->brake(timers->stage, to);
+        if (error == BRAKE_LATER) continue;
         stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
         deadman->is_kept_back |= error && error != ECONNREFUSED;
-        if (error) report(timers, EVENT_DEADMAN_ERROR, deadman, to, error);
+        if (error) report_error(timers, deadman, to, error, "");
         else if (index < MOST_REACHED) reached |= (uint64_t)1 << index;
     }
     return reached;
@@ -53,7 +77,7 @@ static void release(struct timers *timers, struct deadman *deadman) {
     if (!deadman->has_tripped) return;
     deadman->has_tripped = false;
     counter_set(timers->stage->counters, deadman->active, 0);
-    report(timers, EVENT_RELEASED, deadman, NULL, 0);
+    report(timers, EVENT_RELEASED, deadman);
 }
 
 static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
@@ -75,12 +99,29 @@ static void arm_one(const struct feed *feed, int64_t now) {
 /* Send what is sent when the router starts. A network that is not there yet keeps it back: then do so again. */
 static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t now) {
     uint64_t reached = send_all(timers, deadman);
-    deadman->timer.due = deadman->is_kept_back ? now + START_AGAIN : NEVER;
+    int64_t again = deadman->is_kept_back ? now + START_AGAIN : NEVER;
+    deadman->timer.due = again < deadman->greets_again ? again : deadman->greets_again;
+    deadman->greets_again = NEVER;
     return reached;
+}
+
+/* Send a last time if it is armed or has tripped. */
+static void end(struct timers *timers, struct timer *timer, int64_t now) {
+    struct deadman *deadman = (struct deadman *)timer;
+    (void)now;
+    bool was_armed = deadman->is_armed;
+    deadman->is_armed = false;
+    deadman->timer.due = NEVER;
+    deadman->greets_until = 0;
+    if (was_armed) send_all(timers, deadman);
 }
 
 static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     struct deadman *deadman = (struct deadman *)timer;
+    if (deadman->is_ending) {
+        end(timers, timer, now);
+        return;
+    }
     if (!deadman->is_armed) {
         start(timers, deadman, now);
         return;
@@ -95,17 +136,7 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     counter_set(timers->stage->counters, deadman->active, 1);
     stage_count(timers->stage, deadman->trips, 1);
     send_all(timers, deadman);
-    report(timers, EVENT_TRIPPED, deadman, NULL, 0);
-}
-
-/* Send a last time if it is armed or has tripped. */
-static void end(struct timers *timers, struct timer *timer, int64_t now) {
-    struct deadman *deadman = (struct deadman *)timer;
-    (void)now;
-    bool was_armed = deadman->is_armed;
-    deadman->is_armed = false;
-    deadman->timer.due = NEVER;
-    if (was_armed) send_all(timers, deadman);
+    report(timers, EVENT_TRIPPED, deadman);
 }
 
 static const struct timer_kind DEADMAN = {.serve = serve, .end = end};
@@ -139,6 +170,7 @@ static void redirect(struct timers *timers, struct deadman *next, const struct d
 static void take_over(struct timers *timers, struct deadman *next, struct deadman *earlier) {
     redirect(timers, next, earlier);
     keep_others_than(earlier, next);
+    next->greets_until = next->starts ? earlier->greets_until : 0;
     int64_t due = earlier->timer.due;
     earlier->timer.due = NEVER;
     if (due == NEVER) return;
@@ -147,7 +179,9 @@ static void take_over(struct timers *timers, struct deadman *next, struct deadma
         return;
     }
     if (!earlier->is_armed) {
-        if (next->starts) next->timer.due = due;
+        if (!next->starts) return;
+        next->timer.due = due;
+        next->greets_again = earlier->greets_again;
         return;
     }
     next->is_armed = true;
@@ -166,7 +200,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     if (!deadman) return NULL;
     *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER}, .acting = deadman, .timeout = timeout,
                                 .repeat = repeat, .starts = starts, .active = active, .trips = trips, .id = id,
-                                .count = count};
+                                .count = count, .greets_again = NEVER};
     uint8_t *copy = (uint8_t *)&deadman->destinations[count];
     for (uint32_t index = 0; index < count; index++) {
         deadman->destinations[index] = destinations[index];
@@ -191,6 +225,24 @@ uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t n
     return reached;
 }
 
+void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, int64_t now) {
+    pthread_mutex_lock(&timers->lock);
+    deadman->greets_until = deadman->starts ? now + START : 0;
+    pthread_mutex_unlock(&timers->lock);
+}
+
+bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now) {
+    pthread_mutex_lock(&timers->lock);
+    bool greets = now < deadman->greets_until && !deadman->is_armed;
+    if (greets) {
+        deadman->timer.due = now;
+        deadman->greets_again = now + GREETING;
+        timers_note_due(timers);
+    }
+    pthread_mutex_unlock(&timers->lock);
+    return greets;
+}
+
 void deadman_replace(struct timers *timers, struct deadman *next, struct deadman *earlier) {
     pthread_mutex_lock(&timers->lock);
     take_over(timers, next, earlier);
@@ -203,6 +255,45 @@ void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t coun
         if (refused) arm_one(&feeds[index], now);
         else feed_one(timers, &feeds[index], now);
     }
+    timers_note_due(timers);
+}
+
+void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
+    struct feed feed = {.deadman = deadman};
+    pthread_mutex_lock(&timers->lock);
+    deadmen_feed(timers, &feed, 1, 0, now);
+    pthread_mutex_unlock(&timers->lock);
+}
+
+void deadman_schedule_end(struct timers *timers, struct timer *timer) {
+    struct deadman *deadman = (struct deadman *)timer;
+    deadman->is_ending = deadman->is_armed;
+    deadman->timer.due = deadman->is_armed ? 0 : NEVER;
+    deadman->greets_until = 0;
+    timers_note_due(timers);
+}
+
+void deadman_end_by_thread(struct timers *timers, struct deadman *deadman) {
+    pthread_mutex_lock(&timers->lock);
+    deadman_schedule_end(timers, &deadman->timer);
+    pthread_mutex_unlock(&timers->lock);
+}
+
+static bool is_served(const struct timers *timers, const struct timer *timer) {
+    for (const struct timer *each = timers->first; each; each = each->next)
+        if (each == timer) return true;
+    return false;
+}
+
+void deadman_settle(struct timers *timers, struct timer *timer, const struct deadman_destination *to, const char *why,
+                    int64_t now) {
+    stage_count(timers->stage, why ? to->send_errors : to->sent, 1);
+    if (!why || !is_served(timers, timer)) return;
+    struct deadman *deadman = (struct deadman *)timer;
+    report_error(timers, deadman, to, 0, why);
+    deadman = deadman->acting;
+    if (deadman->is_armed || now >= deadman->greets_until || deadman->timer.due <= now + START_AGAIN) return;
+    deadman->timer.due = now + START_AGAIN;
     timers_note_due(timers);
 }
 

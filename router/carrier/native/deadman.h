@@ -1,6 +1,12 @@
 /* Deadmen: timers that send a ready datagram in place of a route's commands when these stop coming.
  *
- * The state machine is described in engine/deadman.py; both have to give the same answers. */
+ * Unarmed: no command was sent yet, or another route has taken over; nothing is due.
+ * Armed:   trips `timeout` after the last command was sent.
+ * Tripped: has sent when it tripped, and repeats that on the grid of the time at which that was due.
+ *
+ * A command that was sent arms the deadman in any state; one of a route that it hands over to disarms it. A command that
+ * failed changes nothing: the deadman trips when no other one leaves. One that was sent though an earlier one was refused
+ * arms the deadman and puts off nothing. What is sent when the router starts changes no state. */
 #ifndef DEADMAN_H
 #define DEADMAN_H
 
@@ -20,6 +26,7 @@ struct deadman_destination {
     uint32_t size;
     uint32_t sent, send_errors; /* counters */
     uint32_t id;                /* in events */
+    const void *publisher;      /* rcl_publisher_t, where there is no sender: the one topic of a gateway's deadman */
 };
 
 struct deadman;
@@ -44,6 +51,13 @@ void deadman_close(struct timers *timers, struct deadman *deadman);
  * While one of the datagrams does not leave, all are sent again each second, until a command feeds or disarms it. */
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now);
 
+/* `deadman_start` where it publishes: nobody can be reached before subscribers are discovered. So it greets each new
+ * subscriber for some time: it is due at once, while no command was sent, and again after half a second, as subscriber and
+ * publisher do not discover each other at the same time and best effort loses what is sent in between. `deadman_greet`
+ * returns whether it does so. */
+void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, int64_t now);
+bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now);
+
 /* Have `next` take over deadline and state of `earlier`, the deadman of the same route in the previous program.
  * `earlier` keeps only the destinations (by sender) that `next` does not have, and sends to them when it ends. Feeds of
  * `earlier` act on `next` from now on. */
@@ -61,6 +75,18 @@ int command_send(struct timers *timers, struct sender *sender, const void *data,
 /* As `command_send` at the time `now`, for callers that hold the lock if there are feeds. */
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now);
+
+/* A command of the deadman's route has left at `now`; takes the lock. */
+void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now);
+
+/* As `timer_end`, by the thread that serves the group: it is due at once for that if it is armed or has tripped. */
+void deadman_end_by_thread(struct timers *timers, struct deadman *deadman);
+void deadman_schedule_end(struct timers *timers, struct timer *timer); /* with the lock held */
+
+/* What a stage's `brake` was to send later has left, or has not: `why`, else NULL. The lock is held. The deadman may be
+ * gone. */
+void deadman_settle(struct timers *timers, struct timer *timer, const struct deadman_destination *to, const char *why,
+                    int64_t now);
 
 /* A command has left at `now`, and returned `refused`: 0, or an errno about an earlier one. The lock is held. */
 void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now);

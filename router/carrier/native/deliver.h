@@ -92,6 +92,7 @@ struct message {
 /* ---- how it is delivered ---- */
 
 enum publication { PUBLISHED, PUBLISH_FAILED, LEFT };
+enum { BRAKE_LATER = -1 };
 
 /* What a thread needs to deliver messages. */
 struct stage {
@@ -104,7 +105,7 @@ struct stage {
     int64_t (*now)(struct stage *stage);
     /* Send as `command_send` does. */
     int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
-    /* Send the datagram of a deadman, with the lock held. Return 0 or an errno. */
+    /* Send the datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
     int (*brake)(struct stage *stage, const struct deadman_destination *to);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. LEFT: the thread was
      * stuck in the middleware and has been given up, and must not use anything that belongs to others. */

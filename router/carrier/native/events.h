@@ -11,7 +11,7 @@ enum event_kind { EVENT_TRIPPED = 1, EVENT_RELEASED, EVENT_DEADMAN_ERROR, EVENT_
 struct deadman_event {
     uint32_t size, kind;           /* EVENT_TRIPPED, EVENT_RELEASED or EVENT_DEADMAN_ERROR */
     uint32_t deadman, destination; /* `destination` only of an error */
-    int32_t error;                 /* errno */
+    int32_t error;                 /* errno; 0 of an error whose text follows, up to a NUL */
     uint32_t counter;              /* of such errors */
 };
 

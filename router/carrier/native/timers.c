@@ -89,13 +89,15 @@ void timers_note_due(struct timers *timers) {
     if (next < timers->timer_set_for) set_timer(timers, next);
 }
 
+void timers_await_next(struct timers *timers) { set_timer(timers, find_due(timers)); }
+
 /* ---- public ---- */
 
 void timers_serve(struct timers *timers, int64_t now) {
     pthread_mutex_lock(&timers->lock);
     for (struct timer *each = timers->first; each; each = each->next)
         if (each->due <= now) each->kind->serve(timers, each, now);
-    set_timer(timers, find_due(timers));
+    timers_await_next(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 

@@ -72,4 +72,7 @@ void timer_end(struct timers *timers, struct timer *timer);
 /* To be called with the lock held, once `due` of a timer has changed. */
 void timers_note_due(struct timers *timers);
 
+/* Set the timerfd for the next timer, once those that are due were served. The lock is held. */
+void timers_await_next(struct timers *timers);
+
 #endif

@@ -1,0 +1,113 @@
+"""Deadmen of gateway clients, which publish. A native thread of their own serves them, as publishing may block."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Mapping
+from time import sleep
+
+from router.carrier.deadmen import NativeDeadman, open_deadman
+from router.carrier.outlets import Names, Publication
+from router.carrier.ring import Ring
+from router.clock import monotonic_ns
+from router.compiler.metrics import Counters
+from router.compiler.program import DeadmanPlan
+
+_POLL_S = 0.002
+
+
+class ClientDeadman(NativeDeadman):
+    """The deadman of a topic that clients of a gateway may publish on. Times in ns of the boot clock.
+
+    No call waits for the middleware.
+    """
+
+    def feed(self, now: int) -> None:
+        """Called when a client's message was published; `now` is a time before that."""
+        self._library.deadman_feed(self._deadmen, self.address, now)
+
+    def await_subscribers(self, now: int) -> None:
+        """Publish to each subscriber that is discovered shortly after the start, unless the table says otherwise."""
+        self._library.deadman_await_subscribers(self._deadmen, self.address, now)
+
+    def greet(self, now: int) -> bool:
+        """A subscriber was discovered: return whether it is published to, as no client has published yet."""
+        return bool(self._library.deadman_greet(self._deadmen, self.address, now))
+
+    def end(self) -> None:
+        """Have the thread publish a last time, if armed or tripped."""
+        self._library.deadman_end_by_thread(self._deadmen, self.address)
+
+
+class ClientDeadmen:
+    """All deadmen of gateway clients, and their thread; never closed.
+
+    They count in `counters`, and write to `events` what they do.
+    """
+
+    def __init__(
+        self, library: ctypes.CDLL, counters: ctypes.Array[ctypes.c_int64], events: Ring, names: Names
+    ) -> None:
+        """Raises MemoryError."""
+        self._library = library
+        self._keep = counters, events
+        self._names = names
+        self._address: int = library.client_deadmen_open(counters, events.address)
+        if not self._address:
+            raise MemoryError("the deadmen of gateways cannot be opened")
+        self._group: int = library.client_deadmen_group(self._address)
+        self._has_started = False
+
+    def start(self, functions: tuple[int, int, int]) -> None:
+        """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
+
+        Raises OSError.
+        """
+        if not self._has_started:
+            error = self._library.client_deadmen_start(self._address, *functions)
+            if error:
+                raise OSError(error, f"a thread cannot be started: {os.strerror(error)}")
+            self._has_started = True
+
+    def add(self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication]) -> ClientDeadman:
+        """Serve a deadman from now on, by the publisher of its topic. Raises MemoryError."""
+        outlets = {topic: {"publisher": publications[topic].address} for topic, _ in plan.datagrams}
+        address = open_deadman(self._library, self._group, self._names, counters, plan, outlets)
+        return ClientDeadman(self._library, self._group, address, plan, publications)
+
+    def adopt(self, now: Mapping[str, ClientDeadman], then: Mapping[str, ClientDeadman], generation: int) -> None:
+        """Go on from the deadmen of a program to those of the next one, which has that generation. By name.
+
+        Those with other settings inherit the state of earlier ones.
+        """
+        for name, before in now.items():
+            next_one = then.get(name)
+            if next_one is None:
+                before.end()
+            elif next_one is not before:
+                next_one.succeeds(before)
+                self._library.deadman_replace(self._group, next_one.address, before.address)
+        self._library.client_deadmen_advance(self._address, generation)
+
+    def wait_for(self, generation: int, timeout: float) -> bool:
+        """Wait until no publisher of earlier generations is in use. Return False after `timeout` s."""
+        for _ in range(int(timeout / _POLL_S)):
+            if not self._has_started or self._library.client_deadmen_have_reached(self._address, generation):
+                return True
+            sleep(_POLL_S)
+        return False
+
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher the thread is now, and for how many seconds; None if in none."""
+        topic = ctypes.c_uint32()
+        since = self._library.client_deadmen_since(self._address, ctypes.byref(topic))
+        return (self._names.name(topic.value), (monotonic_ns() - since) / 1e9) if since else None
+
+    def stop(self) -> bool:
+        """Have armed deadmen publish a last time, and end the thread.
+
+        Return False if it is stuck in the middleware after 1 s: then it is left, and publishers must stay open.
+        Idempotent.
+        """
+        return bool(self._library.client_deadmen_stop(self._address))

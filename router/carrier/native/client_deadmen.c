@@ -1,0 +1,185 @@
+#include "client_deadmen.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+#include "carrier_internal.h"
+#include "clock.h"
+
+struct client_deadmen {
+    struct stage stage; /* first: `brake` is given this */
+    struct timers *group;
+    pthread_t thread;
+    pthread_cond_t changed;
+    bool has_started, has_stopped; /* of whoever starts and stops the thread */
+    bool has_ended, is_left;       /* under the lock of the group */
+    int wake;                      /* eventfd */
+    _Atomic bool is_stopping;
+    _Atomic uint32_t latest; /* generation */
+    /* Written by the thread: */
+    _Atomic uint32_t generation; /* nothing of an earlier one is in use */
+    _Atomic int64_t since;       /* when it entered the middleware, or 0 */
+    _Atomic uint32_t topic;      /* where it did */
+    /* Of the thread: */
+    publish_function *publish;
+    error_function *error;
+    reset_function *reset;
+    bool has_message;              /* a deadman was served, and sends this: */
+    struct deadman_destination to; /* its `datagram` is not used: the deadman may go */
+    uint8_t *message;
+    size_t size, capacity;
+};
+
+/* ---- with the lock held ---- */
+
+/* Keep what a deadman sends, of which only one is served at a time. */
+static int keep_message(struct stage *stage, const struct deadman_destination *to) {
+    struct client_deadmen *of = (struct client_deadmen *)stage;
+    if (to->size > of->capacity) {
+        uint8_t *larger = realloc(of->message, to->size);
+        if (!larger) return ENOMEM;
+        of->message = larger;
+        of->capacity = to->size;
+    }
+    memcpy(of->message, to->datagram, to->size);
+    of->size = to->size;
+    of->to = *to;
+    of->has_message = true;
+    return BRAKE_LATER;
+}
+
+/* Publish what was kept of a deadman; without the lock meanwhile. */
+static void publish_message(struct client_deadmen *of, struct timer *from) {
+    struct serialized_message message = {of->message, of->size, of->capacity, ALLOCATOR};
+    struct error_text why;
+    of->has_message = false;
+    atomic_store_explicit(&of->topic, of->to.id, memory_order_relaxed);
+    atomic_store_explicit(&of->since, monotonic_ns(), memory_order_release);
+    pthread_mutex_unlock(&of->group->lock);
+    int error = of->publish(of->to.publisher, &message, NULL);
+    if (error) {
+        why = of->error();
+        of->reset();
+    }
+    pthread_mutex_lock(&of->group->lock);
+    atomic_store_explicit(&of->since, 0, memory_order_relaxed);
+    if (!of->is_left) deadman_settle(of->group, from, &of->to, error ? why.text : NULL, boottime_ns());
+}
+
+static struct timer *find_due(const struct timers *group, int64_t now) {
+    for (struct timer *each = group->first; each; each = each->next)
+        if (each->due <= now) return each;
+    return NULL;
+}
+
+/* Serve each deadman that is due by now once. One that is fed while another one publishes is not due any more. */
+static void serve_all(struct client_deadmen *of) {
+    int64_t now = boottime_ns();
+    struct timer *due;
+    while (!of->is_left && (due = find_due(of->group, now))) {
+        due->kind->serve(of->group, due, boottime_ns());
+        if (of->has_message) publish_message(of, due);
+    }
+}
+
+static void end_all(struct client_deadmen *of) {
+    for (struct timer *each = of->group->first; each; each = each->next) deadman_schedule_end(of->group, each);
+}
+
+/* ---- the thread ---- */
+
+static void wait_for_more(struct client_deadmen *of) {
+    struct pollfd waiting[] = {{of->group->timer, POLLIN, 0}, {of->wake, POLLIN, 0}};
+    eventfd_t ignored;
+    timers_await_next(of->group);
+    pthread_mutex_unlock(&of->group->lock);
+    poll(waiting, 2, -1);
+    if (waiting[1].revents) eventfd_read(of->wake, &ignored);
+    pthread_mutex_lock(&of->group->lock);
+}
+
+static void *run(void *argument) {
+    struct client_deadmen *of = argument;
+    run_soon();
+    pthread_mutex_lock(&of->group->lock);
+    for (;;) {
+        uint32_t latest = atomic_load(&of->latest);
+        bool is_stopping = atomic_load(&of->is_stopping);
+        if (is_stopping) end_all(of);
+        serve_all(of);
+        if (of->is_left || is_stopping) break;
+        atomic_store(&of->generation, latest);
+        wait_for_more(of);
+    }
+    of->has_ended = true;
+    pthread_cond_broadcast(&of->changed);
+    pthread_mutex_unlock(&of->group->lock);
+    return NULL;
+}
+
+/* ---- for others ---- */
+
+static void wake_up(struct client_deadmen *of) { eventfd_write(of->wake, 1); }
+
+struct client_deadmen *client_deadmen_open(counter *counters, struct ring *events) {
+    struct client_deadmen *of = calloc(1, sizeof *of);
+    if (!of) return NULL;
+    bool is_open = stage_open(&of->stage, counters, events, NULL);
+    of->stage.brake = keep_message;
+    of->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    of->group = is_open && of->wake >= 0 ? timers_open_on(&of->stage) : NULL;
+    condition_open(&of->changed);
+    if (of->group) return of;
+    pthread_cond_destroy(&of->changed);
+    if (of->wake >= 0) close(of->wake);
+    stage_close(&of->stage);
+    free(of);
+    return NULL;
+}
+
+struct timers *client_deadmen_group(struct client_deadmen *of) { return of->group; }
+
+int client_deadmen_start(struct client_deadmen *of, publish_function *publish, error_function *error,
+                         reset_function *reset) {
+    of->publish = publish;
+    of->error = error;
+    of->reset = reset;
+    int failed = start_thread(&of->thread, "client deadmen", run, of);
+    of->has_started = !failed;
+    return failed;
+}
+
+void client_deadmen_advance(struct client_deadmen *of, uint32_t generation) {
+    atomic_store(&of->latest, generation);
+    wake_up(of);
+}
+
+bool client_deadmen_have_reached(struct client_deadmen *of, uint32_t generation) {
+    return atomic_load(&of->generation) >= generation;
+}
+
+int64_t client_deadmen_since(struct client_deadmen *of, uint32_t *topic) {
+    int64_t since = atomic_load_explicit(&of->since, memory_order_acquire);
+    *topic = atomic_load_explicit(&of->topic, memory_order_relaxed);
+    return since;
+}
+
+bool client_deadmen_stop(struct client_deadmen *of) {
+    struct timespec until = patience();
+    if (!of->has_started || of->has_stopped) return !of->is_left;
+    of->has_stopped = true;
+    atomic_store(&of->is_stopping, true);
+    wake_up(of);
+    pthread_mutex_lock(&of->group->lock);
+    while (!of->has_ended && !pthread_cond_timedwait(&of->changed, &of->group->lock, &until)) {}
+    bool has_ended = of->has_ended;
+    of->is_left = !has_ended;
+    pthread_mutex_unlock(&of->group->lock);
+    if (has_ended) pthread_join(of->thread, NULL);
+    else pthread_detach(of->thread);
+    return has_ended;
+}
