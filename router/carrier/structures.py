@@ -200,12 +200,15 @@ class Target(ctypes.Structure):
         ("condition", Code),
         ("message", Code),
         ("limit", POINTER(Limit)),
+        ("deferral", c_void_p),
+        ("period", c_int64),
         ("topic", POINTER(Topic)),
         ("sender", c_void_p),
         ("board", POINTER(Board)),
         ("feeds", POINTER(Feed)),
         ("feed_count", c_uint32),
         ("trims", c_uint32),
+        ("priority", c_uint32),
         ("id", c_uint32),
         ("waiting", c_uint32),
         ("filtered", c_uint32),
@@ -319,17 +322,32 @@ class Program(ctypes.Structure):
     )
 
 
+class Adoption(ctypes.Structure):
+    """`struct adoption` in timers.h."""
+
+    _fields_ = (("timer", c_void_p), ("to", c_void_p), ("target", c_void_p))
+
+
+class TimerChange(ctypes.Structure):
+    """`struct timer_change` in timers.h."""
+
+    _fields_ = (
+        ("adopted", POINTER(Adoption)),
+        ("ended", POINTER(c_void_p)),
+        ("adopted_count", c_uint32),
+        ("ended_count", c_uint32),
+    )
+
+
 class Change(ctypes.Structure):
     """`struct change` in carrier.h."""
 
     _fields_ = (
         ("program", POINTER(Program)),
         ("replaced", POINTER(c_void_p)),
-        ("ended", POINTER(c_void_p)),
+        ("timers", TimerChange),
         ("replaced_count", c_uint32),
-        ("ended_count", c_uint32),
         ("holds", c_uint32),
-        ("reserved", c_uint32),
     )
 
 
@@ -446,6 +464,7 @@ __all__ = [
     "LOSSES",
     "NO_NAME",
     "REASONS",
+    "Adoption",
     "Board",
     "BoardField",
     "BoardMessage",
@@ -479,6 +498,7 @@ __all__ = [
     "Setting",
     "Target",
     "Targets",
+    "TimerChange",
     "Topic",
     "Value",
     "Waiting",

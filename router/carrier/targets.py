@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.carrier import structures as c
+from router.carrier.deferrals import PRIORITIES, Adoption, held_period
 from router.carrier.lowered import Programs, native_values
 from router.carrier.outlets import Outlets
 from router.compiler.lowering import LoweredRoute, LoweredTarget
@@ -21,6 +22,8 @@ class TargetWriter:
     outlets: Outlets
     generation: int
     arrays: list[object]
+    adopted: list[Adoption] = field(default_factory=list)
+    """The deferrals, for `struct change`."""
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
 
@@ -50,14 +53,21 @@ class TargetWriter:
             self._complete(target, handler, plan)
             targets.append(target)
         number = self.outlets.names.number
-        return c.Targets(
+        array = (c.Target * len(targets))(*targets)
+        made = c.Targets(
             ttl=handler.ttl or 0,
-            targets=(c.Target * len(targets))(*targets),
+            targets=array,
             count=len(targets),
             route=number(handler.route),
             topic=c.NO_NAME if handler.topic is None else number(handler.topic),
             generation=self.generation,
         )
+        for target, plan in zip(array, plans, strict=True):
+            if target.deferral:
+                to = ctypes.addressof(made), ctypes.addressof(target)
+                self.adopted.append(Adoption(target.deferral, plan.is_topic, *to))
+        self.arrays.append(made)
+        return made
 
     def _complete(self, made: c.Target, handler: Handler, plan: TargetPlan) -> None:
         """Add what all targets have."""
@@ -69,7 +79,11 @@ class TargetWriter:
         made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in c.LOSSES]
         if not plan.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
-        if plan.max_rate is not None:
+        made.period, made.priority = held_period(plan), PRIORITIES.index(plan.priority)
+        if (deferral := self.outlets.deferral(handler, plan)) is not None:
+            made.deferral = deferral.address
+            self.arrays.append(deferral)
+        if plan.max_rate is not None and not made.period:
             limit = self.outlets.limit(handler, plan)
             made.limit = ctypes.pointer(limit)
             self.arrays.append(limit)

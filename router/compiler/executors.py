@@ -86,10 +86,8 @@ def _own_executor(checked: CheckedRoute, target: CheckedTarget) -> Executor:
     """The executor of a target, without regard to others."""
     if target.topic and checked.collect is not None:
         return Executor("`collect` needs it", checked.collect.span)
-    if target.declared.on_limit is OnLimit.LATEST:
+    if target.topic and target.declared.on_limit is OnLimit.LATEST:
         return Executor("`on_limit: latest` needs it", target.span)
-    if target.endpoint is not None and target.endpoint.bandwidth is not None:
-        return Executor(f"the bandwidth of '{target.label}' needs it", target.endpoint.span)
     return CARRIER
 
 

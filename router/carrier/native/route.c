@@ -150,7 +150,7 @@ int route_datagram(struct routing *routing, struct received *received) {
 void route_by(struct routing *routing, const struct change *change) {
     for (uint32_t index = 0; index < change->replaced_count; index++)
         deadman_replace(routing->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    for (uint32_t index = 0; index < change->ended_count; index++) timer_end(routing->stage.timers, change->ended[index]);
+    timers_change(routing->stage.timers, &change->timers);
     routing->program = change->program;
 }
 
