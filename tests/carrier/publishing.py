@@ -16,6 +16,7 @@ from router.app.parts import Part, divided
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
+from router.carrier.deferrals import timer_change
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import NativeProgram, native_program
@@ -92,7 +93,7 @@ class Publishing:
     def change(self, generation: int, program: Program | None = None) -> None:
         """Receive with another program from now on; the thread goes on to it."""
         self._programs.append(self._made(program or self.program, generation))
-        self._carrier.change(self._programs[-1], (), (), holds=False)
+        self._carrier.change(self._programs[-1], (), timer_change((), ()), holds=False)
         self.thread.advance(generation)
 
     def stop_receiving(self) -> None:
@@ -146,6 +147,7 @@ class Publishing:
             publications=self.publishers,
             feeds=lambda _route, _names: (),
             limit=self._limit,
+            deferral=lambda *_: None,
             carried=lambda _: (),
             parts=parts_of,
             names=self._names,

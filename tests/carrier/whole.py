@@ -18,6 +18,7 @@ from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deferrals import Adoption, Deferrals, timer_change
 from router.carrier.library import load
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
@@ -193,6 +194,8 @@ class Whole:
         self._parts = {part: self._engine(part) for part in OF_PYTHON}
         self._functions = {part: engine.functions() for part, engine in self._parts.items()}
         self._limits = State()
+        bandwidths = {plan.name: plan.bandwidth for plan in made.senders if plan.bandwidth is not None}
+        self._deferrals = Deferrals(loaded, State(), self._destinations, {}, bandwidths)
         self._topics = list(self._rig.wanted)
         publications = {
             topic: _Publication(number, topic not in unwanted) for number, topic in enumerate(self._topics, 1)
@@ -212,6 +215,7 @@ class Whole:
                 publications=publications,
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
+                deferral=self._deferrals.deferral,
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
                 parts=self._parts_of,
                 names=self._names,
@@ -219,7 +223,9 @@ class Whole:
             ),
         )
         self._carrier = loaded.carrier_open(self._deadmen.address, self._counts, self._events.address)
-        self._change = c.Change(program=ctypes.pointer(self._native.structure))
+        pacers = [Adoption(pacer.address) for name in self._destinations if (pacer := self._deferrals.pacer(name))]
+        timers = timer_change([*pacers, *self._native.adopted], ())
+        self._change = c.Change(program=ctypes.pointer(self._native.structure), timers=timers)
         loaded.carrier_adopt_first(self._carrier, ctypes.byref(self._change))
         self._numbers = {plan.name: number for number, plan in enumerate(made.listeners)}
         self.sent: dict[str, list[bytes]] = {name: [] for name in self._destinations}
@@ -255,8 +261,6 @@ class Whole:
         until = self._rig.now + ns
         while (due := self._library.seam_next_due(self._deadmen.address)) <= until:
             self._rig.pass_time(max(due - self._rig.now, 0))
-            for timer in self._rig.timers:  # as the rig does whenever one is due: a pacer then sends what it can
-                timer.due(self._rig.now)
             self._set_clocks()
             self._library.timers_serve(self._deadmen.address, self._rig.now)
             self._collect()
