@@ -35,6 +35,7 @@ from router.app.wiring import (
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
+from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.deferrals import Adoption, Deferrals, NativeDeferral, NativePacer, timer_change
 from router.carrier.events import EventThread
@@ -224,6 +225,7 @@ class NativeDatapath:
             feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
             limit=limit,
             deferral=deferrals.deferral,
+            collector=partial(kept_collector, self._library, states[_ENDPOINTS]),
             carried=lambda handler: parts[Part.SENT].get(handler.route, ()),
             parts=lambda handler: list(self._parts_of(handler, parts)),
             names=self._names,
@@ -281,7 +283,8 @@ class NativeDatapath:
     def _parts_of(self, handler: Handler, parts: Parts) -> Iterator[PartTargets]:
         """The parts of a route that get their messages by a ring."""
         if targets := parts[Part.PUBLISHED].get(handler.route):
-            yield PartTargets(self._publishing.ring.address, targets, is_always_wanted=False, is_native=True)
+            collects = handler.collect_timeout is not None
+            yield PartTargets(self._publishing.ring.address, targets, is_always_wanted=collects, is_native=True)
         for part, worker in self._workers.items():
             if targets := parts[part].get(handler.route):
                 is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
@@ -336,6 +339,7 @@ class NativeDatapath:
             self._change(wiring, earlier)
         else:
             self._deadmen.change(timer_change(wiring.adopted, ()))
+            self._change_topics(wiring)
         for thread in self._from_ros:
             thread.serve(wiring.topics)
         self._wiring = wiring
@@ -358,6 +362,7 @@ class NativeDatapath:
         holds_topics = _topics(earlier.program, by_carrier=False) & _topics(wiring.program, by_carrier=True)
         if holds_topics:
             self._publishing.hold(generation)
+        self._change_topics(wiring)
         self._carrier.change(
             wiring.native,
             [(next_one.address, before.address) for next_one, before in replaced],
@@ -373,6 +378,14 @@ class NativeDatapath:
         if holds_topics:
             self._workers[Part.TOPICS].wait_for(generation, _PATIENCE_S)
             self._publishing.hold(0)
+
+    def _change_topics(self, wiring: NativeWiring) -> None:
+        """Post what changes in the timers of the publish thread, before it gets a message of this program."""
+        adopted = [each for each in wiring.native.adopted if each.is_topic]
+        left = [each.address for each in wiring.states[_ENDPOINTS].left() if isinstance(each, NativeCollector)]
+        change = c.PublishChange(timers=timer_change(adopted, left), generation=wiring.native.generation)
+        wiring.native.arrays.append(change)
+        self._publishing.change(change)
 
     def start(self) -> None:
         assert self._wiring is not None  # noqa: S101 - `adopt` was called

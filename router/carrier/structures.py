@@ -18,6 +18,7 @@ LOSSES = (
     "send_error",
     "publish_error",
     "too_large",
+    "incomplete",
 )
 """`enum loss` in events.h, as DROP_REASONS names them."""
 
@@ -212,9 +213,27 @@ class Target(ctypes.Structure):
         ("id", c_uint32),
         ("waiting", c_uint32),
         ("filtered", c_uint32),
+        ("collected", c_uint32),
         ("delivered", c_uint32),
         ("delivered_bytes", c_uint32),
         ("dropped", c_uint32 * len(LOSSES)),
+    )
+
+
+class Collect(ctypes.Structure):
+    """`struct collect` in collect.h."""
+
+    _fields_ = (
+        ("collector", c_void_p),
+        ("by", Code),
+        ("count", Code),
+        ("order", Code),
+        ("senders", POINTER(c_uint32)),
+        ("is_text", c_uint32),
+        ("signs", c_uint32),
+        ("items", c_uint16),
+        ("counted", c_uint16),
+        ("reserved", c_uint32),
     )
 
 
@@ -225,6 +244,7 @@ class Targets(ctypes.Structure):
         ("ttl", c_int64),
         ("layout", POINTER(Layout)),
         ("sources", POINTER(Value)),
+        ("collect", POINTER(Collect)),
         ("targets", POINTER(Target)),
         ("count", c_uint32),
         ("route", c_uint32),
@@ -351,6 +371,12 @@ class Change(ctypes.Structure):
     )
 
 
+class PublishChange(ctypes.Structure):
+    """`struct publish_change` in publish.h."""
+
+    _fields_ = (("timers", TimerChange), ("next", c_void_p), ("generation", c_uint32), ("reserved", c_uint32))
+
+
 class ForEach(ctypes.Structure):
     """`struct for_each` in from_ros.h."""
 
@@ -473,6 +499,7 @@ __all__ = [
     "Change",
     "ClosedEnum",
     "Code",
+    "Collect",
     "DeadmanDestination",
     "Entry",
     "Feed",
@@ -489,6 +516,7 @@ __all__ = [
     "Part",
     "Peer",
     "Program",
+    "PublishChange",
     "ReadOperation",
     "RosRoute",
     "RosSet",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.carrier import structures as c
+from router.carrier.collectors import native_collect
 from router.carrier.deferrals import PRIORITIES, Adoption, held_period
 from router.carrier.lowered import Programs, native_values
 from router.carrier.outlets import Outlets
@@ -23,7 +24,7 @@ class TargetWriter:
     generation: int
     arrays: list[object]
     adopted: list[Adoption] = field(default_factory=list)
-    """The deferrals, for `struct change`."""
+    """Deferrals and collectors, for a `struct timer_change`."""
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
 
@@ -33,6 +34,10 @@ class TargetWriter:
             return self.targets(handler, plans, {}, None)
         programs = Programs(lowered.layout, self.arrays)
         made = self.targets(handler, plans, lowered.targets, programs)
+        if lowered.collect is not None:
+            collector = self.outlets.collector(handler)
+            made.collect = ctypes.pointer(native_collect(lowered.collect, programs, collector, self._ids_of_senders()))
+            self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
         made.layout, made.sources = programs.layout(), self._names_of_senders()
         return made
 
@@ -75,6 +80,8 @@ class TargetWriter:
         made.id = self.outlets.names.number(plan.label)
         made.waiting = counters.index("messages_waiting", *place)
         made.filtered = counters.index("messages_filtered", *place)
+        if plan.is_topic and handler.collect_timeout is not None:
+            made.collected = counters.index("messages_collected", *place)
         made.delivered = counters.index("messages_published" if plan.is_topic else "datagrams_sent", *place)
         made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in c.LOSSES]
         if not plan.is_topic:
@@ -113,9 +120,15 @@ class TargetWriter:
             self.arrays.append(publication)
         return c.Target(topic=ctypes.pointer(self._topics[plan.label]))
 
+    def _ids_of_senders(self) -> list[int]:
+        """By column."""
+        return [self.outlets.names.number(label) for label in self._labels_of_senders()]
+
+    def _labels_of_senders(self) -> list[str]:
+        return [*self.program.table.endpoints, source_label(STRANGER)]
+
     def _names_of_senders(self) -> ctypes.Array[c.Value]:
         """By column."""
         if self._sources is None:
-            labels = *self.program.table.endpoints, source_label(STRANGER)
-            self._sources = native_values([label.encode() for label in labels], self.arrays)
+            self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources

@@ -52,11 +52,14 @@ static bool refuse(const struct delivery *of, int reason, uint32_t place) {
 
 /* ---- fields ---- */
 
-/* Read the fields of a datagram that programs of the route use. */
-static bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
+void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
     machine_begin(machine, to->layout);
     machine->slots[SLOT_RECEIVED_AT].integer = from->received_at;
     machine->slots[SLOT_SOURCE] = to->sources[from->column];
+}
+
+bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
+    begin_datagram(machine, to, from);
     if (!from->is_single) return machine_read(machine, NODE_ENVELOPE, from->data, from->size);
     return machine_read(machine, NODE_PAYLOAD, from->data + from->start, from->length);
 }

@@ -52,8 +52,9 @@ struct target {
     uint32_t trims; /* it gets datagrams without their trailing zeros */
     uint32_t priority; /* where its messages wait for a bandwidth, an enum priority in pace.h */
     uint32_t id;    /* in events */
-    /* Counters. `waiting`: of a target whose messages come by a ring; `delivered_bytes`: of a destination. */
-    uint32_t waiting, filtered, delivered, delivered_bytes, dropped[LOSSES];
+    /* Counters. `waiting`: of a target whose messages come by a ring; `collected`: of one that gets frames;
+     * `delivered_bytes`: of a destination. */
+    uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
 };
 
 struct deferral;
@@ -62,11 +63,14 @@ struct deferral;
 enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
 enum { NODE_PAYLOAD, NODE_ENVELOPE };
 
+struct collect;
+
 /* The targets of a route that one thread serves. */
 struct targets {
     int64_t ttl;                 /* ns, 0 for none */
     const struct layout *layout; /* what their programs read; NULL if there are none */
     const struct value *sources; /* names of senders, by column; of datagrams */
+    const struct collect *collect; /* they get frames (collect.h), not each datagram; NULL without `collect` */
     const struct target *targets;
     uint32_t count;
     /* In events: the route, the topic whose messages these are, or NO_NAME, and the generation of the program. */
@@ -128,6 +132,12 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
     counter_add(stage->counters, index, amount);
     if (stage->counted) stage->counted(stage, index, amount);
 }
+
+/* Begin with a datagram: slots have their defaults, but those of its time and its sender. */
+void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
+
+/* Begin with it, and read the fields that programs of the route use. Return false if it is malformed. */
+bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
 
 /* Count and report that a target loses a message. `lost` has the reason, and details if there are any. */
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,

@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "collect.h"
 #include "events.h"
 
 /* ---- events ---- */
@@ -160,8 +161,9 @@ bool route_to_topics(struct stage *stage, const struct message_record *record) {
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};
     struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
+    bool is_delivered = !to->collect || collect(stage, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {
-        if (!deliver(stage, to, &to->targets[index], &message)) return false;
+        if (is_delivered && !deliver(stage, to, &to->targets[index], &message)) return false;
         stage_count(stage, to->targets[index].waiting, -1);
     }
     return true;
