@@ -31,12 +31,13 @@ from router.app.wiring import (
     engine_context,
     gateway_deadmen,
     log_start,
-    open_pacers,
 )
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
+from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deferrals import Adoption, Deferrals, NativeDeferral, NativePacer, timer_change
 from router.carrier.events import EventThread
 from router.carrier.from_ros import native_from_ros
 from router.carrier.limits import open_limit
@@ -88,11 +89,12 @@ _ROS, _ENDPOINTS, _GATEWAYS = "ros", "endpoints", "gateways"
 
 @dataclass(frozen=True, slots=True)
 class NativeWiring(Wiring):
-    """`deadmen` are those of routes; `stages` by part."""
+    """`deadmen` are those of routes; `adopted` what holds back messages for endpoints; `stages` by part."""
 
     native: NativeProgram
     topics: RosTopics
     deadmen: Mapping[str, NativeDeadman]
+    adopted: Sequence[Adoption]
     stages: Mapping[Part, Stage]
 
 
@@ -186,7 +188,6 @@ class NativeDatapath:
         deadmen = {plan.route: self._deadman(plan, program, sockets, states) for plan in program.deadmen}
         behind_gateways = gateway_deadmen(program, context, ros, states[_GATEWAYS])
         send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in senders.items()}
-        pacers = open_pacers(program, timers.pacing, send, states[_ENDPOINTS])
 
         def feeds(route: str, names: Sequence[str]) -> list[tuple[NativeDeadman, bool]]:
             return [(deadmen[name], name != route) for name in names]
@@ -195,7 +196,7 @@ class NativeDatapath:
             return self._deadmen.command(senders[endpoint], feeds(route, names))
 
         errors = ros.publish_errors if ros else ()
-        shared = engine_context(program, context, topics, errors, send, command, pacers)
+        shared = engine_context(program, context, topics, errors, send, command, {})
         of_ros = replace(shared, counts=context.counts.ros, state=states[_ROS])
         outbound = OutboundEngine(program, of_ros, ros.freshness if ros else Freshness())
         parts = divided(program, publishes=self._publishing.open(has_topics=bool(program.lowered.topics)))
@@ -207,6 +208,14 @@ class NativeDatapath:
         }
         functions = {part: engine.functions() for part, engine in engines.items()}
         limit = partial(_limit, states[_ENDPOINTS])
+        deferrals = Deferrals(
+            self._library,
+            states[_ENDPOINTS],
+            senders,
+            topics.publications if topics else {},
+            {endpoint.name: endpoint.bandwidth for endpoint in program.senders if endpoint.bandwidth is not None},
+        )
+        pacers = [pacer for endpoint in program.senders if (pacer := deferrals.pacer(endpoint.name))]
         publications = topics.publications if topics else {}
         generation = next(self._generations)
         outlets = Outlets(
@@ -215,6 +224,8 @@ class NativeDatapath:
             publications=publications,
             feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
             limit=limit,
+            deferral=deferrals.deferral,
+            collector=partial(kept_collector, self._library, states[_ENDPOINTS]),
             carried=lambda handler: parts[Part.SENT].get(handler.route, ()),
             parts=lambda handler: list(self._parts_of(handler, parts)),
             names=self._names,
@@ -255,20 +266,25 @@ class NativeDatapath:
             feed=feeder(behind_gateways, timers.inbound_deadman.locked),
             states=states,
             gateway_deadmen=behind_gateways,
-            pacers=pacers,
+            pacers={},
             engines=(outbound, *engines.values()),
             native=native,
             topics=RosTopics(
                 messages, {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {}
             ),
             deadmen=deadmen,
+            adopted=[
+                *(Adoption(pacer.address) for pacer in pacers),
+                *(each for each in (*native.adopted, *messages.adopted) if not each.is_topic),
+            ],
             stages=stages,
         )
 
     def _parts_of(self, handler: Handler, parts: Parts) -> Iterator[PartTargets]:
         """The parts of a route that get their messages by a ring."""
         if targets := parts[Part.PUBLISHED].get(handler.route):
-            yield PartTargets(self._publishing.ring.address, targets, is_always_wanted=False, is_native=True)
+            collects = handler.collect_timeout is not None
+            yield PartTargets(self._publishing.ring.address, targets, is_always_wanted=collects, is_native=True)
         for part, worker in self._workers.items():
             if targets := parts[part].get(handler.route):
                 is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
@@ -321,6 +337,9 @@ class NativeDatapath:
             for listener in left:
                 listener.end_input()
             self._change(wiring, earlier)
+        else:
+            self._deadmen.change(timer_change(wiring.adopted, ()))
+            self._change_topics(wiring)
         for thread in self._from_ros:
             thread.serve(wiring.topics)
         self._wiring = wiring
@@ -330,7 +349,12 @@ class NativeDatapath:
         pairs = [(deadman, earlier.deadmen.get(route)) for route, deadman in wiring.deadmen.items()]
         replaced = [(next_one, before) for next_one, before in pairs if before is not None and before is not next_one]
         kept = list(wiring.deadmen.values())
-        ended = [before for before in earlier.deadmen.values() if before not in kept]
+        left = list(wiring.states[_ENDPOINTS].left())
+        ended = [
+            *(each.address for each in left if isinstance(each, NativeDeferral)),
+            *(each.address for each in left if isinstance(each, NativePacer)),
+            *(before.address for before in earlier.deadmen.values() if before not in kept),
+        ]
         for next_one, before in replaced:
             next_one.succeeds(before)
         generation = wiring.native.generation
@@ -338,10 +362,11 @@ class NativeDatapath:
         holds_topics = _topics(earlier.program, by_carrier=False) & _topics(wiring.program, by_carrier=True)
         if holds_topics:
             self._publishing.hold(generation)
+        self._change_topics(wiring)
         self._carrier.change(
             wiring.native,
             [(next_one.address, before.address) for next_one, before in replaced],
-            [before.address for before in ended],
+            timer_change(wiring.adopted, ended),
             holds=bool(holds),
         )
         self._publishing.advance(generation)
@@ -353,6 +378,14 @@ class NativeDatapath:
         if holds_topics:
             self._workers[Part.TOPICS].wait_for(generation, _PATIENCE_S)
             self._publishing.hold(0)
+
+    def _change_topics(self, wiring: NativeWiring) -> None:
+        """Post what changes in the timers of the publish thread, before it gets a message of this program."""
+        adopted = [each for each in wiring.native.adopted if each.is_topic]
+        left = [each.address for each in wiring.states[_ENDPOINTS].left() if isinstance(each, NativeCollector)]
+        change = c.PublishChange(timers=timer_change(adopted, left), generation=wiring.native.generation)
+        wiring.native.arrays.append(change)
+        self._publishing.change(change)
 
     def start(self) -> None:
         assert self._wiring is not None  # noqa: S101 - `adopt` was called
@@ -411,8 +444,7 @@ class NativeDatapath:
     def close(self) -> None:
         if not self._is_stopping:  # the start has failed
             self._stop_threads_of_ros()
-        for deadman in self._wiring.deadmen.values() if self._wiring else ():
-            deadman.end()
+        self._deadmen.end()
         if not self._has_stopped:  # `stop` is stuck, and its threads use what would be freed
             return
         self._events.close()

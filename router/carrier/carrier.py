@@ -55,20 +55,19 @@ class Carrier:
         self._running = program, change
 
     def change(
-        self, program: NativeProgram, replaced: Sequence[tuple[int, int]], ended: Sequence[int], *, holds: bool
+        self, program: NativeProgram, replaced: Sequence[tuple[int, int]], timers: c.TimerChange, *, holds: bool
     ) -> None:
         """Execute another program from the next datagram on.
 
-        `replaced` has deadmen with those that they take over from, `ended` those that no deadman replaces. With
+        `replaced` has deadmen with those that they take over from; `timers` says what other timers are to do. With
         `holds`, nothing is received until `resume` is called, or for a second.
         """
         pairs = [deadman for pair in replaced for deadman in pair]
         change = c.Change(
             program=ctypes.pointer(program.structure),
             replaced=(ctypes.c_void_p * len(pairs))(*pairs),
-            ended=(ctypes.c_void_p * len(ended))(*ended),
+            timers=timers,
             replaced_count=len(replaced),
-            ended_count=len(ended),
             holds=holds,
         )
         self._library.carrier_change(self._carrier, ctypes.byref(change))

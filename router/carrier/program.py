@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
+from router.carrier.deferrals import Adoption
 from router.carrier.outlets import Outlets, PartTargets
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetWriter
@@ -23,12 +24,16 @@ from router.table.model import Framing
 
 @dataclass(slots=True)
 class NativeProgram:
-    """`struct program` with all that it refers to. `handlers` by their number in messages for Python."""
+    """`struct program` with all that it refers to. `handlers` by their number in messages for Python.
+
+    `adopted` are the deferrals of its targets.
+    """
 
     generation: int
     handlers: Sequence[Handler]
     sources: Sequence[str]
     """The `source` label of each column."""
+    adopted: Sequence[Adoption] = ()
     arrays: list[object] = field(default_factory=list)
     structure: c.Program = field(default_factory=c.Program)
 
@@ -38,7 +43,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
     schema = wire_schema(program.envelope, program.inbound.keys())
     handlers = [handler for several in program.inbound.values() for handler in several]
     endpoints = list(program.table.endpoints)
-    made = NativeProgram(generation, handlers, [*endpoints, source_label(STRANGER)], [schema])
+    made = NativeProgram(generation, handlers, [*endpoints, source_label(STRANGER)], arrays=[schema])
     targets = TargetWriter(program, outlets, generation, made.arrays)
     writer = _Writer(program, made, outlets, targets, {name: column for column, name in enumerate(endpoints)})
     made.structure = c.Program(
@@ -51,6 +56,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         cases=writer.array(c.Case, writer.cases()),
         routes=writer.array(c.Route, [writer.route(number, handler) for number, handler in enumerate(handlers)]),
     )
+    made.adopted = targets.adopted
     return made
 
 

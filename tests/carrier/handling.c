@@ -22,6 +22,7 @@ void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, s
 /* The thread that publishes, as it is between two messages. */
 struct publish_thread *seam_publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish);
 void seam_publish(struct publish_thread *thread);
+struct timers *seam_publish_timers(struct publish_thread *thread);
 void seam_publish_close(struct publish_thread *thread);
 
 struct publish_thread *seam_publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish) {
@@ -34,5 +35,7 @@ void seam_publish(struct publish_thread *thread) {
     for (size_t size; (size = take(thread, false));) serve_all(thread, size);
     pthread_mutex_unlock(&thread->lock);
 }
+
+struct timers *seam_publish_timers(struct publish_thread *thread) { return thread->stage.timers; }
 
 void seam_publish_close(struct publish_thread *thread) { publish_close(thread); }

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import POINTER, c_int, c_int64, c_size_t, c_uint32, c_void_p
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,7 +18,9 @@ from router.app.parts import OF_PYTHON, Part, divided
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
+from router.carrier.collectors import kept_collector
 from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deferrals import Adoption, Deferrals, timer_change
 from router.carrier.library import load
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
@@ -93,10 +96,14 @@ WHOLE = f"""\
   pressure_info:
     source: sensor_board
     destinations: [basestation]
-    collect: {{by: sensor_index, count: 2, order: sensor_index, timeout: 50ms}}
-    topics: [{{topic: both, {_FLOAT}"items[0].pressure_kpa"}}}}]
+    collect: {{by: round(pressure_kpa), count: 2, order: sensor_index, timeout: 50ms}}
+    topics:
+      - {{topic: both, {_FLOAT}"items[1].pressure_kpa"}}}}
+      - {{topic: unwanted_frames, {_FLOAT}pressure_kpa}}}}
+      - {{topic: inverse_frames, {_FLOAT}"1 / items[1].pressure_kpa"}}, when: pressure_kpa < 5}}
+    ttl: 200ms
 """
-UNWANTED = frozenset({"unwanted", "unwanted_too"})
+UNWANTED = frozenset({"unwanted", "unwanted_too", "unwanted_frames"})
 PEERS = (
     *3 * (("192.168.0.30", 8),), ("192.168.0.30", 9),
     ("192.168.0.222", 8), ("192.168.0.10", 9000), ("192.168.0.20", 9000),
@@ -120,6 +127,7 @@ def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     loaded.seam_next_due.restype, loaded.seam_next_due.argtypes = c_int64, (c_void_p,)
     loaded.seam_handle.restype = None
     loaded.seam_handle.argtypes = (c_void_p, c_uint32, ctypes.c_char_p, c_size_t, c_uint32, c_uint32, c_int64)
+    loaded.seam_publish_timers.restype, loaded.seam_publish_timers.argtypes = c_void_p, (c_void_p,)
     loaded.seam_publish_open.restype = c_void_p
     loaded.seam_publish_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
     loaded.seam_publish.restype, loaded.seam_publish.argtypes = None, (c_void_p,)
@@ -193,6 +201,8 @@ class Whole:
         self._parts = {part: self._engine(part) for part in OF_PYTHON}
         self._functions = {part: engine.functions() for part, engine in self._parts.items()}
         self._limits = State()
+        bandwidths = {plan.name: plan.bandwidth for plan in made.senders if plan.bandwidth is not None}
+        self._deferrals = Deferrals(loaded, State(), self._destinations, {}, bandwidths)
         self._topics = list(self._rig.wanted)
         publications = {
             topic: _Publication(number, topic not in unwanted) for number, topic in enumerate(self._topics, 1)
@@ -212,6 +222,8 @@ class Whole:
                 publications=publications,
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
+                deferral=self._deferrals.deferral,
+                collector=partial(kept_collector, loaded, State()),
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
                 parts=self._parts_of,
                 names=self._names,
@@ -219,7 +231,12 @@ class Whole:
             ),
         )
         self._carrier = loaded.carrier_open(self._deadmen.address, self._counts, self._events.address)
-        self._change = c.Change(program=ctypes.pointer(self._native.structure))
+        pacers = [Adoption(pacer.address) for name in self._destinations if (pacer := self._deferrals.pacer(name))]
+        of_topics = [each for each in self._native.adopted if each.is_topic]
+        timers = timer_change([*pacers, *(each for each in self._native.adopted if not each.is_topic)], ())
+        self._change = c.Change(program=ctypes.pointer(self._native.structure), timers=timers)
+        self._change_of_topics = c.PublishChange(timers=timer_change(of_topics, ()), generation=1)
+        loaded.publish_change(self._publishing, ctypes.byref(self._change_of_topics))
         loaded.carrier_adopt_first(self._carrier, ctypes.byref(self._change))
         self._numbers = {plan.name: number for number, plan in enumerate(made.listeners)}
         self.sent: dict[str, list[bytes]] = {name: [] for name in self._destinations}
@@ -253,12 +270,13 @@ class Whole:
     def pass_time(self, ns: int) -> None:
         """Moves the clocks, and serves deadmen and timers when they are due."""
         until = self._rig.now + ns
-        while (due := self._library.seam_next_due(self._deadmen.address)) <= until:
+        groups = self._deadmen.address, self._library.seam_publish_timers(self._publishing)
+        while (due := min(map(self._library.seam_next_due, groups))) <= until:
             self._rig.pass_time(max(due - self._rig.now, 0))
-            for timer in self._rig.timers:  # as the rig does whenever one is due: a pacer then sends what it can
-                timer.due(self._rig.now)
             self._set_clocks()
-            self._library.timers_serve(self._deadmen.address, self._rig.now)
+            for group in groups:
+                self._library.timers_serve(group, self._rig.now)
+            self._events.take()
             self._collect()
         self._rig.pass_time(until - self._rig.now)
         self._set_clocks()
@@ -316,7 +334,8 @@ class Whole:
             if handler.route in self._functions[part]
         ]
         if targets := self._divided[Part.PUBLISHED].get(handler.route):
-            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, is_native=True))
+            collects = handler.collect_timeout is not None
+            parts.append(PartTargets(self._published.address, targets, is_always_wanted=collects, is_native=True))
         return parts
 
     def _serve(self, part: Part) -> None:

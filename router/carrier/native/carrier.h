@@ -89,14 +89,13 @@ struct program {
     const struct route *routes;
 };
 
-/* What changes with a program, beside it: done between two datagrams. */
+/* What changes with a program, beside it: done between two datagrams. What ends sends what it holds, then. */
 struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
-    struct timer *const *ended;
-    uint32_t replaced_count, ended_count;
+    struct timer_change timers;
+    uint32_t replaced_count;
     uint32_t holds; /* receive nothing after the change before `carrier_resume`, for at most 1 s */
-    uint32_t reserved;
 };
 
 /* A message for a part, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
