@@ -16,9 +16,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from router.compiler.metrics import INTENDED_REASONS
-from router.errors import plural
 from router.observe.snapshot import SERIES, Labels, Snapshot
-from router.table.model import Endpoint, EndpointKind
 from router.values import age_text
 
 if TYPE_CHECKING:
@@ -43,120 +41,134 @@ class Level(enum.Enum):
 
 
 class Kind(enum.Enum):
-    """A kind of problem, by the name of its alert and of its section on PAGE; first those that explain others.
+    """A kind of problem, first those that explain others.
 
-    `words` have labels of `metric`, which is at fault above the `threshold`. Losses are per second.
+    `words` have labels of `metric`, which is at fault above the `threshold`: losses per second, times in seconds.
+    `remedy` may also have the `{address}` of what the labels name.
     """
 
-    level: Level
-    words: str
-    metric: str
-    threshold: float
+    def __init__(self, level: Level, words: str, remedy: str = "", metric: str = "", threshold: float = 0.0) -> None:
+        self.level, self.words, self.remedy, self.metric, self.threshold = level, words, remedy, metric, threshold
 
-    def __new__(cls, name: str, level: Level, words: str, metric: str = "", threshold: float = 0.0) -> Kind:
-        kind = object.__new__(cls)
-        kind._value_ = name
-        kind.level, kind.words, kind.metric, kind.threshold = level, words, metric, threshold
-        return kind
-
-    ROUTER_DOWN = ("RouterDown", Level.CRITICAL, "no router answers at {instance}")
-    RECEIVE_STUCK = ("ReceiveStuck", Level.CRITICAL, "the receive thread is stuck", "", 2.0)
-    """Threshold in seconds; without datagrams the thread makes progress each half second."""
+    ROUTER_DOWN = (Level.CRITICAL, "no router answers at {instance}")
+    RECEIVE_STUCK = (
+        Level.CRITICAL,
+        "the receive thread is stuck",
+        "`systemctl restart rover-router`, then report it with its log.",
+        "",
+        2.0,  # without datagrams it makes progress each half second
+    )
     LISTENER_WAITING = (
-        "ListenerWaiting",
         Level.CRITICAL,
         "{listener} receives nothing: its address or network interface is not there",
+        "It waits for {address}; `ip -br address` shows what there is.",
         "listener_waiting",
     )
     DEADMAN_CANNOT_SEND = (
-        "DeadmanCannotSend",
         Level.CRITICAL,
         "{destination} does not get what the deadman of {route} sends",
+        "Nobody listens at {address}, or the network refuses it. Stop the rover by other means.",
         "deadman_send_errors",
     )
     ENDPOINT_SILENT = (
-        "EndpointSilent",
         Level.WARNING,
         "{endpoint} is silent",
-        "endpoint_last_seen_timestamp_seconds",
+        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what comes.",
+        "endpoint_last_seen_timestamp_seconds",  # the threshold is the endpoint's `stale_after`
     )
-    """The threshold is the endpoint's `stale_after`."""
     DEADMAN_ACTIVE = (
-        "DeadmanActive",
         Level.WARNING,
         "commands of {route} stopped coming: its deadman sends in their place",
+        "`router explain` says who sends them. Do they come often enough, from a clock that agrees with this one?",
         "deadman_active",
     )
     PUBLISH_STALLED = (
-        "PublishStalled",
         Level.WARNING,
         "publishing on {topic} is stuck in the ROS middleware",
+        "A subscriber may be stuck, or was killed; forwarding and deadmen go on.",
         "publish_stalled_seconds",
-        1.0,
+        1.0,  # of all calls together
     )
-    """Threshold in seconds, of all calls together."""
     RELOAD_FAILED = (
-        "ReloadFailed",
         Level.WARNING,
         "the last reload failed: the table from before it goes on",
+        "`router validate` says what is wrong with the changed table.",
         "config_last_reload_successful",
     )
     MESSAGES_DROPPED = (
-        "MessagesDropped",
         Level.WARNING,
         "messages for {target} are dropped: {reason}",
+        "",
         "messages_dropped",
         0.05,
     )
     MESSAGES_WAITING = (
-        "MessagesWaiting",
         Level.WARNING,
         "messages wait for a thread that publishes or sends",
+        "The computer is overloaded (`router top`), or the ROS middleware holds a thread.",
         "messages_waiting",
-        20,
+        20,  # at all times, of all targets together; a few are there at each look where much is published
     )
-    """At all times, of all targets together. A few are there at each look where much is published."""
-    KERNEL_DROPS = ("KernelDrops", Level.WARNING, "the kernel drops datagrams of {listener}", "kernel_drops")
+    KERNEL_DROPS = (
+        Level.WARNING,
+        "the kernel drops datagrams of {listener}",
+        "Raise its `receive_buffer`, or find what takes the processor: `router top --once --sort rate`.",
+        "kernel_drops",
+    )
     DATAGRAMS_REJECTED = (
-        "DatagramsRejected",
         Level.WARNING,
         "{listener} rejects datagrams: {reason}",
+        "",
         "datagrams_rejected",
         0.05,
     )
-    UNHANDLED_CASE = ("UnhandledCase", Level.WARNING, "{payload_case} is received, and has no route", "unhandled")
+    UNHANDLED_CASE = (
+        Level.WARNING,
+        "{payload_case} is received, and has no route",
+        "Write a route for it, or `ignore: reason`; `router tap` shows it.",
+        "unhandled",
+    )
     QOS_INCOMPATIBLE = (
-        "QosIncompatible",
         Level.WARNING,
         "nothing passes between {topic} and peers with another {policy}",
+        "`ros2 topic info -v {topic}` shows theirs, `router explain {route}` ours.",
         "qos_incompatible",
     )
     GATEWAY_DISCONNECTED = (
-        "GatewayDisconnected",
         Level.WARNING,
         "gateway {route} is not connected to its Zenoh router",
+        "Check that the hub runs, and that `connect` can be reached; the log says why it cannot.",
         "gateway_connections",
     )
     RECORDING_INCOMPLETE = (
-        "RecordingIncomplete",
         Level.WARNING,
         "recordings or taps lack datagrams",
-        "record_dropped",
+        "The disk is full or too slow, or the computer too busy: `df`, `router doctor`.",
+        "record_dropped",  # and mirror_dropped
     )
-    ENDPOINT_NEVER_HEARD = ("EndpointNeverHeard", Level.INFO, "{endpoint} was never heard since the router started")
+    ENDPOINT_NEVER_HEARD = (
+        Level.INFO,
+        "{endpoint} was never heard since the router started",
+        ENDPOINT_SILENT[2],
+    )
     GATEWAY_CLIENT_SLOW = (
-        "GatewayClientSlow",
         Level.INFO,
         "client {client} of {route} is behind",
+        "It gets the latest values only. Give its gateway smaller `rates`, or `compression`.",
         "gateway_client_lag_seconds",
         5,
     )
     GATEWAY_TOPIC_NOT_SERVED = (
-        "GatewayTopicNotServed",
         Level.INFO,
         "types that {route} would need are not installed",
+        "`router explain {route} --live` names them: source their packages, or exclude them.",
         "gateway_topics",
     )
+
+    @property
+    def alert(self) -> str:
+        """The name of its alert and of its section on PAGE, such as `EndpointSilent`."""
+        return self.name.title().replace("_", "")
 
     @property
     def labels(self) -> Labels:
@@ -186,16 +198,16 @@ class Problem(NamedTuple):
 
     @property
     def page(self) -> str:
-        return f"{PAGE}#{self.kind.value.lower()}"
+        return f"{PAGE}#{self.kind.alert.lower()}"
 
     def json(self) -> dict[str, Any]:
-        own = {**self._asdict(), "kind": self.kind.value, "level": self.kind.level.value}
+        own = {**self._asdict(), "kind": self.kind.alert, "level": self.kind.level.value}
         return {**own, "words": self.words, "page": self.page}
 
     @classmethod
     def of(cls, read: Mapping[str, Any]) -> Problem:
         """The one with this `json()`. Raises KeyError where it is not."""
-        kind = {kind.value: kind for kind in Kind}[read["kind"]]
+        kind = {kind.alert: kind for kind in Kind}[read["kind"]]
         labels = {label: str(read["labels"][label]) for label in {*kind.labels, *read["labels"]}}
         return cls(kind, labels, read["more"], read["remedy"], tuple(read["routes"]))
 
@@ -217,8 +229,29 @@ REMEDIES: Mapping[str, str] = {
 }
 """By the reason of a loss."""
 
+_MORE: Mapping[Kind, str] = {
+    Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
+    Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
+    Kind.GATEWAY_TOPIC_NOT_SERVED: ", topics not served: {:.0f}",
+}
+"""By how much a value is too large, where that is of interest."""
+
+_GAUGES = (Kind.LISTENER_WAITING, Kind.DEADMAN_ACTIVE, *_MORE)
+_LOSSES = (
+    Kind.DEADMAN_CANNOT_SEND,
+    Kind.MESSAGES_DROPPED,
+    Kind.KERNEL_DROPS,
+    Kind.DATAGRAMS_REJECTED,
+    Kind.UNHANDLED_CASE,
+    Kind.RECORDING_INCOMPLETE,
+)
+_NO_LOSS = {*INTENDED_REASONS, "unhandled"}
+"""What the table asks for, and what UNHANDLED_CASE says."""
+
 _NAMED = 3
 """Routes that are named in words."""
+
+_ALL_SILENT = "All endpoints are silent: check this computer's network, its cable, the switch, the radio."
 
 
 @dataclass(frozen=True)
@@ -253,158 +286,88 @@ class Look:
     @cached_property
     def problems(self) -> tuple[Problem, ...]:
         """All that is wrong, in the order of kinds."""
-        groups = (self._receiving(), self._commands(), self._silent(), self._losses(), self._ros(), self._gateways())
+        found = chain(
+            self._states(), self._silent(), self._waiting(), *map(self._above, _GAUGES), *map(self._lost, _LOSSES)
+        )
         rank = {kind: place for place, kind in enumerate(Kind)}
-        return tuple(sorted(chain(*groups), key=lambda problem: rank[problem.kind]))
+        return tuple(sorted(found, key=lambda problem: rank[problem.kind]))
 
-    def _receiving(self) -> Iterator[Problem]:
+    def _states(self) -> Iterator[Problem]:
         if self.standing > Kind.RECEIVE_STUCK.threshold:
-            remedy = "`systemctl restart rover-router`, then report it with its log."
-            yield Problem(Kind.RECEIVE_STUCK, {}, f" for {age_text(self.standing)}", remedy)
-        for labels, _ in self._above(Kind.LISTENER_WAITING):
-            place = self.program.table.listeners[labels["listener"]].bound_to
-            remedy = f"It waits for {place}; `ip -br address` shows what there is."
-            yield Problem(Kind.LISTENER_WAITING, labels, remedy=remedy)
+            yield self._problem(Kind.RECEIVE_STUCK, {}, f" for {age_text(self.standing)}")
         if not self.now.total(Kind.RELOAD_FAILED.metric):
-            yield Problem(Kind.RELOAD_FAILED, {}, remedy="`router validate` says what is wrong with the changed table.")
-
-    def _commands(self) -> Iterator[Problem]:
-        table = self.program.table
-        for labels, _, routes in self._lost(Kind.DEADMAN_CANNOT_SEND):
-            address = table.endpoints[to].address.value if (to := labels["destination"]) in table.endpoints else to
-            remedy = f"Nobody listens at {address}, or the network refuses it. Stop the rover by other means."
-            yield Problem(Kind.DEADMAN_CANNOT_SEND, labels, "", remedy, routes)
-        for labels, _ in self._above(Kind.DEADMAN_ACTIVE):
-            route = labels["route"]
-            who = self._commander(route)
-            remedy = f"Check that {who} still sends, often enough, and with a clock that agrees with this one."
-            yield Problem(Kind.DEADMAN_ACTIVE, labels, "", remedy, (self._owners.get(route, route),))
-
-    def _commander(self, name: str) -> str:
-        """Who sends the commands of a deadman's route."""
-        for route in self.program.table.routes:
-            if route.name == name:
-                topics = [f"the publisher of {topic.topic.value}" for topic in route.source_topics]
-                return " or ".join([*(source.value for source in route.sources), *topics])
-        return f"the client of {self._owners.get(name, name)}"
-
-    @cached_property
-    def _owners(self) -> Mapping[str, str]:
-        """By the name of a client's deadman: its gateway."""
-        return {
-            inbound.deadman.route: gateway.settings.name
-            for gateway in self.program.gateways
-            for inbound in gateway.inbound.values()
-            if inbound.deadman is not None
-        }
+            yield self._problem(Kind.RELOAD_FAILED, {})
+        for (name, mode), connections in self.now.counts(Kind.GATEWAY_DISCONNECTED.metric).items():
+            if mode == "client" and not connections:
+                yield self._problem(Kind.GATEWAY_DISCONNECTED, {"route": name})
 
     def _silent(self) -> Iterator[Problem]:
         """Those whose commands a deadman replaces first."""
-        routes = self.program.table.routes
-        sources = {route.name: {source.value for source in route.sources} for route in routes}
-        expected = [each for each in self.program.table.endpoints.values() if self._is_expected(each)]
-        silent = [each for each in expected if self.silence.get(each.name, 0.0) > (each.stale_after or 0) / 1e9]
-        are_all = len(silent) == len(expected) > 1
-        names = {each.name for each in silent}
-        active = {route for (route,), is_active in self.now.counts(Kind.DEADMAN_ACTIVE.metric).items() if is_active}
-        halting = {name for route in active for name in sources.get(route, ())}
-        for each in sorted(silent, key=lambda endpoint: endpoint.name not in halting):
-            heard = self.now.total(Kind.ENDPOINT_SILENT.metric, each.name)
+        sources = {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
+        senders = {name for names in sources.values() for name in names}
+        limits = {
+            endpoint.name: endpoint.stale_after / 1e9
+            for endpoint in self.program.table.endpoints.values()
+            if endpoint.stale_after is not None and endpoint.name in senders
+        }
+        silent = {name for name, limit in limits.items() if self.silence.get(name, 0.0) > limit}
+        held = {
+            name for (route,), on in self.now.counts("deadman_active").items() if on for name in sources.get(route, ())
+        }
+        for name in sorted(silent, key=lambda name: (name not in held, name)):
             kind, more = Kind.ENDPOINT_NEVER_HEARD, ""
-            if heard:
-                kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[each.name])}"
-            concerned = tuple(route for route, all_of in sources.items() if each.name in all_of and all_of <= names)
-            remedy = _ALL_SILENT if are_all else _silent_remedy(each)
-            yield Problem(kind, {"endpoint": each.name}, more, remedy, concerned)
+            if self.now.total(Kind.ENDPOINT_SILENT.metric, name):
+                kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[name])}"
+            routes = tuple(route for route, names in sources.items() if name in names and names <= silent)
+            problem = self._problem(kind, {"endpoint": name}, more, routes)
+            yield problem if len(silent) < len(limits) or len(limits) == 1 else problem._replace(remedy=_ALL_SILENT)
 
-    def _is_expected(self, endpoint: Endpoint) -> bool:
-        """Whether it counts as silent after some time."""
-        sends = any(source.value == endpoint.name for route in self.program.table.routes for source in route.sources)
-        return sends and endpoint.stale_after is not None
-
-    def _losses(self) -> Iterator[Problem]:
-        for labels, count, routes in self._lost(Kind.MESSAGES_DROPPED):
-            others = f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else ""
-            more = f"{self._in_window(count)}, of {', '.join(routes[:_NAMED])}{others}"
-            yield Problem(Kind.MESSAGES_DROPPED, labels, more, REMEDIES.get(labels["reason"], ""), routes)
-        for labels, count, _ in self._lost(Kind.DATAGRAMS_REJECTED):
-            if labels["reason"] != "unhandled":  # has a kind of its own
-                remedy = REMEDIES.get(labels["reason"], "")
-                yield Problem(Kind.DATAGRAMS_REJECTED, labels, self._in_window(count), remedy)
-        for labels, count, _ in self._lost(Kind.UNHANDLED_CASE):
-            remedy = "Write a route for it, or `ignore: reason`; `router tap` shows it."
-            yield Problem(Kind.UNHANDLED_CASE, labels, self._in_window(count), remedy)
-        for labels, count, _ in self._lost(Kind.KERNEL_DROPS):
-            remedy = "Raise its `receive_buffer`, or find what takes the processor: `router top --once --sort rate`."
-            yield Problem(Kind.KERNEL_DROPS, labels, self._in_window(count), remedy)
-        unrecorded = [*self.grown("record_dropped"), *((("not copied",), n) for _, n in self.grown("mirror_dropped"))]
-        for (reason,), count in unrecorded:
-            remedy = "The disk is full or too slow, or the computer too busy: `df`, `router doctor`."
-            yield Problem(Kind.RECORDING_INCOMPLETE, {}, f"{self._in_window(count)}: {reason}", remedy)
-        counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]
-        waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
-        if waiting > Kind.MESSAGES_WAITING.threshold:
-            remedy = "The computer is overloaded (`router top`), or the ROS middleware holds a thread."
-            yield Problem(Kind.MESSAGES_WAITING, {}, f", {waiting:.0f} at least", remedy)
-
-    def _ros(self) -> Iterator[Problem]:
+    def _waiting(self) -> Iterator[Problem]:
+        """In a publish call, or for a thread."""
         counts = [snapshot.counts(Kind.PUBLISH_STALLED.metric) for snapshot in self.snapshots]
         for topic, seconds in counts[-1].items():
             stalled = max(seconds, sum(min(each.get(topic, 0.0), PERIOD) for each in counts))
             if stalled > Kind.PUBLISH_STALLED.threshold:
-                remedy = "A subscriber may be stuck, or was killed; forwarding and deadmen go on."
-                yield Problem(Kind.PUBLISH_STALLED, {"topic": topic[0]}, f" for {age_text(stalled)}", remedy)
-        for labels, peers in self._above(Kind.QOS_INCOMPATIBLE):
-            remedy = f"`ros2 topic info -v {labels['topic']}` shows theirs, `router explain {labels['route']}` ours."
-            more = f": {plural(int(peers), 'peer')}"
-            yield Problem(Kind.QOS_INCOMPATIBLE, labels, more, remedy, (labels["route"],))
+                yield self._problem(Kind.PUBLISH_STALLED, {"topic": topic[0]}, f" for {age_text(stalled)}")
+        counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]
+        waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
+        if waiting > Kind.MESSAGES_WAITING.threshold:
+            yield self._problem(Kind.MESSAGES_WAITING, {}, f", {waiting:.0f} at least")
 
-    def _gateways(self) -> Iterator[Problem]:
-        for (name, mode), connections in self.now.counts(Kind.GATEWAY_DISCONNECTED.metric).items():
-            if mode == "client" and not connections:
-                remedy = "Check that the hub runs, and that `connect` can be reached; the log says why it cannot."
-                yield Problem(Kind.GATEWAY_DISCONNECTED, {"route": name}, "", remedy, (name,))
-        for labels, lag in self._above(Kind.GATEWAY_CLIENT_SLOW):
-            remedy = "It gets the latest values only. Give its gateway smaller `rates`, or `compression`."
-            yield Problem(Kind.GATEWAY_CLIENT_SLOW, labels, f" by {age_text(lag)}", remedy, (labels["route"],))
-        for labels, topics in self._above(Kind.GATEWAY_TOPIC_NOT_SERVED):
-            if labels["state"] == "not_installed":
-                name, more = labels["route"], f": {plural(int(topics), 'topic')} not served"
-                remedy = f"`router explain {name} --live` names them: source their packages, or exclude them."
-                yield Problem(Kind.GATEWAY_TOPIC_NOT_SERVED, {"route": name}, more, remedy, (name,))
+    def _above(self, kind: Kind) -> Iterator[Problem]:
+        for values, value in self.now.counts(kind.metric).items():
+            labels = dict(zip(SERIES[kind.metric], values, strict=True))
+            if value > kind.threshold and labels.get("state", "not_installed") == "not_installed":
+                routes = (self._owner(labels["route"]),) if "route" in labels else ()
+                yield self._problem(kind, labels, _MORE.get(kind, "").format(value), routes)
 
-    def _above(self, kind: Kind) -> Iterator[tuple[dict[str, str], float]]:
-        """The labels of the series above the threshold, with their values."""
-        for labels, value in self.now.counts(kind.metric).items():
-            if value > kind.threshold:
-                yield dict(zip(SERIES[kind.metric], labels, strict=True)), value
-
-    def _lost(self, kind: Kind) -> Iterator[tuple[dict[str, str], int, tuple[str, ...]]]:
-        """What was lost in the last seconds and is not meant to be, summed over the labels that its words lack.
-
-        Yields labels, count, and the routes with most of it first.
-        """
+    def _lost(self, kind: Kind) -> Iterator[Problem]:
+        """What was lost in the last seconds and is not meant to be, summed over the labels that its words lack."""
         sums: dict[Labels, Counter[str]] = defaultdict(Counter)
-        for labels, count in self.grown(kind.metric):
-            named = dict(zip(SERIES[kind.metric], labels, strict=True))
-            if named.get("reason") not in INTENDED_REASONS:
-                sums[tuple(named[label] for label in kind.labels)][named.get("route", "")] += count
-        for labels, routes in sums.items():
-            if (count := sum(routes.values())) / self.seconds > kind.threshold:
-                names = tuple(self._owners.get(name, name) for name, _ in routes.most_common() if name)
-                yield dict(zip(kind.labels, labels, strict=True)), count, names
+        for metric in (kind.metric, *(["mirror_dropped"] if kind is Kind.RECORDING_INCOMPLETE else [])):
+            for values, count in self.grown(metric):
+                labels = dict(zip(SERIES[metric], values, strict=True))
+                if labels.get("reason") not in _NO_LOSS:
+                    route = self._owner(labels.get("route", ""))
+                    sums[tuple(labels[label] for label in kind.labels)][route] += count
+        for values, counts in sums.items():
+            if (count := sum(counts.values())) / self.seconds > kind.threshold:
+                labels = dict(zip(kind.labels, values, strict=True))
+                routes = tuple(route for route, _ in counts.most_common() if route)
+                of = f" of {', '.join(routes[:_NAMED])}" if routes and "route" not in labels else ""
+                others = f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else ""
+                yield self._problem(kind, labels, f", {count}{of}{others} in {max(self.seconds, 1):.0f} s", routes)
 
-    def _in_window(self, count: int) -> str:
-        return f", {count} in {max(self.seconds, 1):.0f} s"
+    def _owner(self, route: str) -> str:
+        """The gateway that a client's deadman belongs to, which is called GATEWAY:TOPIC; or the route itself."""
+        gateway, _, topic = route.partition(":")
+        return gateway if topic and gateway in self.program.table.gateways else route
 
-
-_ALL_SILENT = "All endpoints are silent: check this computer's network, its cable, the switch, the radio."
-
-
-def _silent_remedy(endpoint: Endpoint) -> str:
-    address = endpoint.address.value
-    is_remote = endpoint.kind is EndpointKind.BASESTATION
-    what = "the radio link and the basestation" if is_remote else "power and cable"
-    return (
-        f"Check {what}: `ping {address.host}`; `tcpdump -n udp and host {address.host}` shows whether anything comes."
-    )
+    def _problem(self, kind: Kind, labels: Mapping[str, str], more: str = "", routes: tuple[str, ...] = ()) -> Problem:
+        table, address = self.program.table, ""
+        if "listener" in labels and labels["listener"] in table.listeners:
+            address = table.listeners[labels["listener"]].bound_to
+        elif (endpoint := table.endpoints.get(labels.get("endpoint") or labels.get("destination", ""))) is not None:
+            address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
+        remedy = kind.remedy or REMEDIES.get(labels.get("reason", ""), "")
+        return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)

@@ -95,12 +95,12 @@ def test_what_rules_ask_of_each_other_is_recorded(name: str) -> None:
 
 
 def test_there_is_an_alert_for_each_kind_of_problem() -> None:
-    assert ALERTS.keys() - OF_PROMETHEUS == {kind.value for kind in Kind} - NOT_EXPORTED
+    assert ALERTS.keys() - OF_PROMETHEUS == {kind.alert for kind in Kind} - NOT_EXPORTED
 
 
-@pytest.mark.parametrize("kind", [kind for kind in Kind if kind.value in ALERTS], ids=lambda kind: kind.value)
+@pytest.mark.parametrize("kind", [kind for kind in Kind if kind.alert in ALERTS], ids=lambda kind: kind.alert)
 def test_an_alert_has_words_level_metric_and_threshold_of_its_kind_of_problem(kind: Kind) -> None:
-    alert = ALERTS[kind.value]
+    alert = ALERTS[kind.alert]
     words = kind.words.format_map({label: f"{{{{ $labels.{label} }}}}" for label in kind.labels})
     assert alert["annotations"]["summary"].startswith(words)
     assert alert["labels"] == {"severity": kind.level.value}
@@ -114,9 +114,9 @@ def test_an_alert_has_words_level_metric_and_threshold_of_its_kind_of_problem(ki
         assert float(compared[1]) == kind.threshold
 
 
-@pytest.mark.parametrize("kind", [Kind.MESSAGES_DROPPED, Kind.DATAGRAMS_REJECTED], ids=lambda kind: kind.value)
+@pytest.mark.parametrize("kind", [Kind.MESSAGES_DROPPED, Kind.DATAGRAMS_REJECTED], ids=lambda kind: kind.alert)
 def test_losses_that_the_table_asks_for_raise_no_alert(kind: Kind) -> None:
-    [selector] = selectors(ALERTS[kind.value]["expr"])
+    [selector] = selectors(ALERTS[kind.alert]["expr"])
     assert selector.selects(selector.metric, {"reason": "malformed"})
     assert not any(selector.selects(selector.metric, {"reason": reason}) for reason in INTENDED_REASONS)
 
@@ -145,6 +145,6 @@ def test_the_documentation_is_found_where_links_are_put_together() -> None:
 
 
 def test_the_page_has_one_section_for_each_kind_of_problem_and_alert_with_its_level() -> None:
-    levels = {kind.value: kind.level.value.capitalize() for kind in Kind}
+    levels = {kind.alert: kind.level.value.capitalize() for kind in Kind}
     assert {name: level for name, level in SECTIONS.items() if name not in OF_PROMETHEUS} == levels
     assert SECTIONS.keys() >= OF_PROMETHEUS

@@ -113,7 +113,7 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(server: HttpServer, run
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")
     assert (problem["labels"], problem["routes"]) == ({"route": "manual_drive"}, ["manual_drive"])
     assert problem["words"] == "commands of manual_drive stopped coming: its deadman sends in their place"
-    assert problem["remedy"].startswith("Check that basestation still sends")
+    assert problem["remedy"].startswith("`router explain` says who sends them")
 
 
 def test_ready_is_that_everything_is_open(server: HttpServer, running: FakeRunning) -> None:
