@@ -17,10 +17,9 @@ from demo.recorded import first_of, recordings
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
-from router.observe.snapshot import Snapshot
 from router.table.model import RouteTable
-from router.tools.running_router import metrics, url_of
-from router.tools.top import Window, view
+from router.tools.running_router import health, metrics, url_of
+from router.tools.top import View, Window, view
 
 TABLE = Path("routes/sim.yaml")
 DURATION = 12.0
@@ -81,16 +80,14 @@ class Demo:
         with open_screen(console, self._table, DURATION) as screen:
             while simulator.latest["seconds"] < DURATION:
                 time.sleep(REFRESH)
-                window.add(self._snapshot())
-                screen.show(view(*window.ends), listener.latest, simulator.latest)
+                screen.show(self._look(window), listener.latest, simulator.latest)
         shown = self._look_at_page()
         self._finish(talker)
         time.sleep(DRAINING)
         self._finish(simulator)
         time.sleep(SETTLING)
         recorded = first_of(recordings(self._table) - before)
-        window.add(self._snapshot())
-        return judge(self._table, listener.latest, simulator.latest, view(*window.ends), shown, recorded)
+        return judge(self._table, listener.latest, simulator.latest, self._look(window), shown, recorded)
 
     def _look_at_page(self) -> Shown | None:
         """None where the table has no page."""
@@ -114,10 +111,11 @@ class Demo:
             self._check()
             time.sleep(0.1)
 
-    def _snapshot(self) -> Snapshot:
+    def _look(self, window: Window) -> View:
         self._check()
         try:
-            return metrics(self._url)
+            window.add(metrics(self._url))
+            return view(*window.ends, health(self._url).problems)
         except TransportError:
             self._check()  # a router that has ended has better words than a refused connection
             raise

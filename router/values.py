@@ -259,6 +259,17 @@ def float_text(value: float, bits: int, digits: int | None = None) -> str:
     return next(text for p in range(6, 10) if struct.pack("<f", float(text := f"{value:.{p}g}")) == packed)
 
 
+def age_text(seconds: float | None) -> str:
+    """`0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
+    if seconds is None:
+        return "never"
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
 def rate_text(rate: float) -> str:
     """Per second, in at most four characters up to 9999."""
     return f"{rate:.1f}" if 0 < rate < 9.95 else f"{rate:.0f}"

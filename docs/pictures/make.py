@@ -29,7 +29,7 @@ from demo.expected import checked_table, page_of
 from demo.places import alone, free_ros_domain, taken_places
 from router.errors import RouterError, TransportError
 from router.table.model import RouteTable
-from router.tools.running_router import metrics, url_of
+from router.tools.running_router import health, metrics, url_of
 from router.tools.top import Order, View, Window, view
 from router.tools.top_view import Screen
 from tests.gateway.browser import Browser, Page, executable
@@ -150,7 +150,7 @@ class Rover:
 
     def look(self) -> View:
         self._window.add(metrics(self.url))
-        return view(*self._window.ends, time.time())
+        return view(*self._window.ends, health(self.url).problems, time.time())
 
     def until(self, holds: Callable[[View], bool], what: str, patience: float = PATIENCE) -> View:
         limit = time.monotonic() + patience

@@ -274,15 +274,21 @@ class Services:
             from router.observe.foxglove import FoxgloveServer
 
             opening.callback(FoxgloveServer(table.foxglove, running).close)
+        if diagnostics is None and table.http is None:
+            return
+        from router.observe.watch import Health
+
+        health = Health(running)
+        opening.callback(health.close)
         if diagnostics is not None:
             from router.observe.diagnostics import Diagnostics
 
-            opening.callback(Diagnostics(running, *diagnostics).close)
+            opening.callback(Diagnostics(health, *diagnostics).close)
         if table.http is not None:
             from router.observe.http import HttpServer
 
             save = self._recorder.save if self._recorder and table.record and table.record.last else None
-            server = HttpServer(table.http.value, table.http.span, running, save)
+            server = HttpServer(table.http.value, table.http.span, running, health, save)
             opening.callback(server.close)
             self.http_address = server.address
 

@@ -51,12 +51,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_json(url: str, order: Order, interval: float) -> None:
     """The fields of `View`, with all rows, times in seconds; where no router answers, those of `router status`."""
+    from router.tools.running_router import down
     from router.tools.top import ordered
 
     try:
         seen = _look(url, interval)
     except TransportError as error:
-        print(json.dumps({"state": "down", "url": url, "problems": [str(error)]}))
+        print(json.dumps({"state": "down", "url": url, "problems": [down(url, error).json()]}))
         raise
     print(json.dumps(asdict(seen) | {"routes": [asdict(row) for row in ordered(seen.routes, order)]}))
 
@@ -73,12 +74,12 @@ def _show_once(url: str, order: Order, interval: float) -> None:
 
 
 def _look(url: str, interval: float) -> View:
-    from router.tools.running_router import metrics
+    from router.tools.running_router import health, metrics
     from router.tools.top import view
 
     before = metrics(url)
     time.sleep(interval)
-    return view(before, metrics(url))
+    return view(before, metrics(url), health(url).problems)
 
 
 _PLAIN_WIDTH = 160
@@ -90,20 +91,21 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from router.tools.running_router import metrics
+    from router.tools.running_router import health, metrics
     from router.tools.top import Order, Window, view
     from router.tools.top_view import Screen, keys
 
     console, orders = Console(), {each.key: each for each in Order}
     window, note, first = Window(), "", 0
     window.add(metrics(url))
+    problems = health(url).problems
     with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    newest = metrics(url)
+                    newest, problems = metrics(url), health(url).problems
                 except TransportError as error:
                     note = str(error)
                 else:
@@ -111,7 +113,7 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            seen = view(*window.ends, time.time())
+            seen = view(*window.ends, problems, time.time())
             shown = Screen(seen, f"router top {url}", order, console.height, note, first)
             live.update(shown, refresh=True)
             try:

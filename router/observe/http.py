@@ -2,6 +2,7 @@
 
     GET  /             the status page; /status.json and /map.json are what it asks for
     GET  /metrics      for Prometheus
+    GET  /health.json  what is wrong, for `router status`, `top` and doctor
     GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck
     GET  /ready        200 while everything is open
     GET  /tap          what is received (see tap): ?case=NAME&from=ENDPOINT&only=accepted, or rejected
@@ -42,6 +43,7 @@ from router.observe.responses import SAVE, Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
 from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
+from router.observe.watch import Health
 from router.table.addresses import Address
 from router.threads import REST_S, Thread, join_or_leave
 
@@ -81,11 +83,16 @@ class HttpServer:
     """
 
     def __init__(
-        self, address: Address, span: SourceSpan, running: Running, save: Callable[[str], Path] | None
+        self,
+        address: Address,
+        span: SourceSpan,
+        running: Running,
+        health: Health,
+        save: Callable[[str], Path] | None,
     ) -> None:
-        self._status = Status(running, save is not None)
+        self._status = Status(running, health, save is not None)
         try:
-            self._server = _Server(address, Responder(running, self._status, save))
+            self._server = _Server(address, Responder(running, health, self._status, save))
         except OSError as error:
             in_use = error.errno == errno.EADDRINUSE
             why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
@@ -299,8 +306,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._for_own_computer(lambda: self._tap(*asked_for))
         elif path == "/metrics":
             self._respond(self._responder.metrics(self.headers.get("Accept", "")))
-        elif path == "/healthz":
-            self._slow = lambda: self._respond(self._responder.healthz())
         else:
             self._respond(self._responder.get(path, query))
 

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from http import HTTPStatus
 from math import ceil
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any
 
 from prometheus_client import CollectorRegistry, ProcessCollector
@@ -20,16 +20,13 @@ from prometheus_client.exposition import choose_encoder
 from router.assets import page_policy
 from router.clock import wall_ns
 from router.errors import RouterError
+from router.observe.health import Kind
 from router.observe.running import Running
 from router.observe.snapshot import COLLECTED_AT
 from router.observe.status import Status
+from router.observe.watch import Health
 
 PAGE = Path(__file__).with_name("status_page.html")
-
-STUCK_SECONDS = 2.0
-"""The receive thread is stuck when it does not get further for so long; it takes 0.5 s where nothing comes."""
-
-LOOK_SECONDS = 0.05
 
 KEPT_SECONDS = 0.5
 """How long a response that is costly to make is reused for the same request."""
@@ -94,8 +91,9 @@ class _Cache:
 class Responder:
     """Thread-safe. `save` as for HttpServer."""
 
-    def __init__(self, running: Running, status: Status, save: Callable[[str], Path] | None) -> None:
+    def __init__(self, running: Running, health: Health, status: Status, save: Callable[[str], Path] | None) -> None:
         self.running = running
+        self._health = health
         self._status = status
         self._cache = _Cache()
         self._save = save
@@ -111,6 +109,8 @@ class Responder:
             "/": lambda _: self._page,
             "/status.json": lambda _: self._cache.get("status", self._numbers),
             "/map.json": lambda _: self._map(),
+            "/health.json": lambda _: _json(HTTPStatus.OK, self._status.health()),
+            "/healthz": lambda _: self._healthz(),
             "/ready": lambda _: self._ready(),
         }
         self._post = {"/-/reload": self._reload, SAVE: self._save_recording}
@@ -144,13 +144,10 @@ class Responder:
         key = f"map {self.running.program.table.sha256}"
         return self._cache.get(key, lambda: _json(HTTPStatus.OK, self._status.map()))
 
-    def healthz(self) -> Response:
-        before, until = self.running.progress(), monotonic() + STUCK_SECONDS
-        while monotonic() < until:
-            if self.running.progress() != before:
-                return plain(HTTPStatus.OK, "ok")
-            sleep(LOOK_SECONDS)
-        return plain(HTTPStatus.SERVICE_UNAVAILABLE, f"the receive thread is stuck, for {STUCK_SECONDS:g} s at least")
+    def _healthz(self) -> Response:
+        if self._health.is_stuck:
+            return plain(HTTPStatus.SERVICE_UNAVAILABLE, Kind.RECEIVE_STUCK.words)
+        return plain(HTTPStatus.OK, "ok")
 
     def _ready(self) -> Response:
         if self.running.is_ready:

@@ -24,9 +24,6 @@ BUCKETS = "_bucket"
 DELIVERED = ("datagrams_sent", "messages_published", "messages_sent")
 """The metrics that count what targets got; their second label is the target."""
 
-MOST_STALLED = 1.0
-"""Seconds that calls which publish on a topic may last."""
-
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
 
@@ -42,14 +39,10 @@ _EXPORTED = {PREFIX + name: name for name in SERIES} | {
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Values by a name of SERIES and label values, in the metric's order. `at`: seconds of any clock.
-
-    `table_sha256` tells which table ran, empty where that is not known.
-    """
+    """Values by a name of SERIES and label values, in the metric's order. `at`: seconds of any clock."""
 
     at: float
     values: Mapping[str, Counts]
-    table_sha256: str = ""
     _by_first: dict[str, dict[str, dict[Labels, float]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -78,7 +71,6 @@ class Snapshot:
 def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | None = None) -> Snapshot:
     """Read what a collector gives, or the parser of the text format. None: all `metrics`; of others nothing is made."""
     values: dict[str, dict[Labels, float]] = defaultdict(dict)
-    table_sha256 = ""
     for family in families:
         if metrics is not None and family.name.removeprefix(PREFIX) not in metrics:
             continue
@@ -86,9 +78,7 @@ def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | N
             if (name := _EXPORTED.get(sample.name)) is not None:
                 labels = sample.labels
                 values[name][tuple([labels[label] for label in SERIES[name]])] = sample.value
-            elif sample.name == f"{PREFIX}build_info":
-                table_sha256 = sample.labels.get("table_sha256", "")
-    return Snapshot(at, values, table_sha256)
+    return Snapshot(at, values)
 
 
 def parse_metrics(text: str, at: float) -> Snapshot:

@@ -6,10 +6,12 @@ from dataclasses import asdict
 from typing import Any
 
 from router.clock import wall_ns
+from router.compiler.metrics import INTENDED_REASONS
 from router.observe.last_values import LastValues
 from router.observe.route_map import nodes_and_edges
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
+from router.observe.watch import Health
 from router.table.model import RouteTable, Transport
 
 Json = dict[str, Any]
@@ -23,39 +25,24 @@ PATHS = {
     "messages_filtered": "routes {route} targets {target} filtered",
     "messages_collected": "routes {route} targets {target} collected",
     "route_last_message_timestamp_seconds": "routes {route} last",
-    "deadman_active": "routes {route} deadman_active",
     "deadman_trips": "routes {route} deadman_trips",
-    "deadman_send_errors": "routes {route} deadman_errors {destination}",
     "gateway_clients": "routes {route} clients",
     "gateway_topics": "routes {route} topics {state}",
     "client_messages_dropped": "routes {route} clients_missed {reason}",
-    "qos_incompatible": "routes {route} qos {topic} {policy}",
     "endpoint_last_seen_timestamp_seconds": "endpoints {endpoint} seen",
     "datagrams_received": "listeners {listener} received",
     "received_bytes": "listeners {listener} bytes",
     "kernel_drops": "listeners {listener} kernel_drops",
-    "listener_waiting": "listeners {listener} waiting",
     "datagrams_rejected": "listeners {listener} rejected {reason}",
-    "unhandled": "unhandled {payload_case}",
-    "publish_stalled_seconds": "stalled {topic}",
-    "record_dropped": "recording {reason}",
-    "config_last_reload_successful": "reload ok",
-    "config_last_reload_timestamp_seconds": "reload at",
 }
 """Where the values of each metric stand in the numbers: keys, and labels in braces."""
 
 IF_ANY = {
-    "deadman_send_errors",
-    "record_dropped",
     "messages_dropped",
     "messages_filtered",
     "messages_collected",
     "client_messages_dropped",
-    "qos_incompatible",
-    "listener_waiting",
     "datagrams_rejected",
-    "unhandled",
-    "publish_stalled_seconds",
 }
 """Left out where they are 0."""
 
@@ -63,8 +50,9 @@ IF_ANY = {
 class Status:
     """Thread-safe. Times are seconds of the router's wall clock. `can_save`: whether the last datagrams are kept."""
 
-    def __init__(self, running: Running, can_save: bool = False) -> None:
+    def __init__(self, running: Running, health: Health, can_save: bool = False) -> None:
         self._running = running
+        self._health = health
         self._can_save = can_save
         self._started = wall_ns() / 1e9
         self._values = LastValues(running)
@@ -72,32 +60,42 @@ class Status:
     def numbers(self) -> Json:
         """Everything that changes. `map` says to which map it belongs, which changes with the table.
 
-        `started` is different for each run of the router: counters begin again there. `progress` stands still where
-        the receive thread is stuck.
+        `started` is different for each run of the router: counters begin again there.
         """
         running = self._running
         program = running.program
         table = program.table
-        found = numbers(snapshot(running.collect(), wall_ns() / 1e9))
-        for name, endpoint in table.endpoints.items():
-            patience = endpoint.stale_after
-            found["endpoints"].setdefault(name, {})["stale_after"] = None if patience is None else patience / 1e9
         return {
             "at": wall_ns() / 1e9,
             "started": self._started,
             "map": table.sha256,
             "table": table.path.name,
             "ready": running.is_ready,
-            "progress": running.progress(),
-            **found,
+            **numbers(snapshot(running.collect(), wall_ns() / 1e9)),
+            "problems": [problem.json() for problem in self._health.latest.problems],
             "values": self._values.of(program),
         }
 
+    def health(self) -> Json:
+        """What is wrong. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
+        look = self._health.latest
+        return {
+            "table": look.program.table.sha256,
+            "received": look.now.total("datagrams_received"),
+            "problems": [problem.json() for problem in look.problems],
+        }
+
     def map(self) -> Json:
-        """What does not change while a table runs. `keeps`: how many seconds can be saved, None where none."""
+        """What does not change while a table runs. `keeps`: how many seconds can be saved, None where none. `intended`:
+        the reasons of losses that the table asks for."""
         table = self._running.program.table
         kept = table.record.last if self._can_save and table.record is not None else None
-        return {"map": table.sha256, "keeps": None if kept is None else kept / 1e9, **_map_json(table)}
+        return {
+            "map": table.sha256,
+            "keeps": None if kept is None else kept / 1e9,
+            "intended": sorted(INTENDED_REASONS),
+            **_map_json(table),
+        }
 
     def close(self) -> None:
         self._values.close()
@@ -108,7 +106,7 @@ def numbers(now: Snapshot) -> Json:
 
     `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
     """
-    groups = ("routes", "endpoints", "listeners", "unhandled", "stalled", "recording", "reload")
+    groups = ("routes", "endpoints", "listeners")
     found: Json = {group: {} for group in groups}
     for metric, path in _PATHS.items():
         for labels, value in now.counts(metric).items():

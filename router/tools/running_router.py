@@ -1,4 +1,4 @@
-"""The HTTP client of a running router: its metrics, orders to it, and its tap."""
+"""The HTTP client of a running router: its health and metrics, orders to it, and its tap."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from email.message import Message
 from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
+from router.observe.health import Kind, Level, Problem
 from router.observe.snapshot import COLLECTED_AT, Snapshot, parse_metrics
 from router.observe.tap import Lost, StreamReader
 from router.recording.mirror import MirroredDatagram
@@ -29,6 +31,18 @@ class Answer(NamedTuple):
 
     ok: bool
     body: dict[str, Any]
+
+
+class Health(NamedTuple):
+    """What is wrong with a router that runs a table of this SHA-256, and how many datagrams it has received."""
+
+    table_sha256: str
+    received: int
+    problems: tuple[Problem, ...]
+
+    @property
+    def is_degraded(self) -> bool:
+        return any(problem.kind.level is not Level.INFO for problem in self.problems)
 
 
 def url_of(table: RouteTable) -> str:
@@ -55,13 +69,9 @@ def metrics(url: str) -> Snapshot:
 
     Raises TransportError where nobody answers, or something else than a router.
     """
-    with closing(_connection(url, PATIENCE)) as connection:
-        response = _asked(connection, url, "GET", "/metrics")
-        text = _read(response, url)
-        if response.status != http.client.OK:
-            raise TransportError(f"{url}/metrics: {response.status} {_first_line(text)}")
+    text, headers = _got(url, "/metrics")
     try:
-        at = float(response.headers.get(COLLECTED_AT) or time.time())
+        at = float(headers.get(COLLECTED_AT) or time.time())
         found = parse_metrics(text.decode(errors="replace"), at)
     except (ValueError, KeyError) as error:
         raise TransportError(f"what answers at {url}/metrics is no router") from error
@@ -70,10 +80,21 @@ def metrics(url: str) -> Snapshot:
     return found
 
 
-def is_receiving(url: str) -> bool:
-    """Whether the receive thread of a running router gets further. Raises TransportError where no router answers."""
-    with closing(_connection(url, PATIENCE)) as connection:
-        return _asked(connection, url, "GET", "/healthz").status == http.client.OK
+def health(url: str) -> Health:
+    """Return what is wrong with a running router. Raises TransportError as `metrics` does."""
+    text, _ = _got(url, "/health.json")
+    try:
+        found = json.loads(text)
+        return Health(found["table"], found["received"], tuple(map(Problem.of, found["problems"])))
+    except (ValueError, LookupError, TypeError) as error:
+        raise TransportError(f"what answers at {url}/health.json is no router of this version") from error
+
+
+def down(url: str, error: TransportError) -> Problem:
+    """The problem that no router answers."""
+    problem = Problem(Kind.ROUTER_DOWN, {"instance": url})
+    text = str(error)
+    return problem._replace(more=text.removeprefix(problem.words) if text.startswith(problem.words) else f": {text}")
 
 
 @contextmanager
@@ -127,7 +148,16 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
     except (OSError, http.client.HTTPException) as error:
         remedy = "is it running? -t TABLE or --url names another router"
         why = getattr(error, "strerror", None) or error  # without the number that OSError shows
-        raise TransportError(f"no router answers at {url}: {why}", remedy) from error
+        raise TransportError(f"{Problem(Kind.ROUTER_DOWN, {'instance': url}).words}: {why}", remedy) from error
+
+
+def _got(url: str, path: str) -> tuple[bytes, Message]:
+    with closing(_connection(url, PATIENCE)) as connection:
+        response = _asked(connection, url, "GET", path)
+        text = _read(response, url)
+        if response.status != http.client.OK:
+            raise TransportError(f"{url}{path}: {response.status} {_first_line(text)}")
+        return text, response.headers
 
 
 def _read(response: http.client.HTTPResponse, url: str) -> bytes:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.metrics import INTENDED_REASONS
+from router.observe.health import Kind, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
 WINDOW = 3.0
@@ -33,7 +34,7 @@ class Order(enum.Enum):
 class TargetRow:
     """A destination or topic of a route, or the clients of a gateway: delivered messages in all and per second, those
     that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone;
-    `is_losing`: their number grew between the two snapshots.
+    `is_losing`: that is a problem now.
     """
 
     name: str
@@ -88,8 +89,8 @@ class RouteRow:
 class View:
     """All routes, and what no route took, by reason.
 
-    `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints that were heard once, and not
-    for their `stale_after`.
+    `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints of which that is a problem.
+    `problems`: all that is wrong, in words.
     """
 
     routes: tuple[RouteRow, ...]
@@ -99,6 +100,7 @@ class View:
     kernel_drops: int
     silence: Mapping[str, float | None] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
 
 
 class Window:
@@ -132,7 +134,7 @@ def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
     )
 
 
-def view(before: Snapshot, after: Snapshot, now: float | None = None) -> View:
+def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), now: float | None = None) -> View:
     """Totals as of `after`, rates per second and latencies since `before`, routes in the order of the metrics.
 
     `now` for ages, seconds since 1970; without it that of `after`.
@@ -145,15 +147,15 @@ def view(before: Snapshot, after: Snapshot, now: float | None = None) -> View:
         if count:
             rejected[reason] += int(count)
     silence = {endpoint: _age(stamp, now) for (endpoint,), stamp in seen.items()}
-    patience = {endpoint: seconds for (endpoint,), seconds in after.counts("endpoint_stale_after_seconds").items()}
     return View(
-        routes=tuple(_route_row(route, before, after, now) for route in routes),
+        routes=tuple(_route_row(route, before, after, problems, now) for route in routes),
         received=after.total("datagrams_received"),
         rate=_rate(before, after, "datagrams_received"),
         rejected=dict(rejected),
         kernel_drops=after.total("kernel_drops"),
         silence=silence,
-        silent=tuple(name for name, age in silence.items() if age is not None and age > patience.get(name, math.inf)),
+        silent=tuple(name for name in silence if _has(problems, Kind.ENDPOINT_SILENT, endpoint=name)),
+        problems=tuple(problem.text for problem in problems),
     )
 
 
@@ -178,17 +180,27 @@ def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
     return {reason: count for reason, count in reasons.items() if reason not in INTENDED_REASONS}
 
 
-def _route_row(route: str, before: Snapshot, after: Snapshot, now: float) -> RouteRow:
+def _has(problems: Sequence[Problem], kind: Kind, route: str = "", **labels: str) -> bool:
+    """Whether there is one of this kind about this, and about messages of the route."""
+    return any(
+        each.kind is kind and labels.items() <= each.labels.items() and (not route or route in each.routes)
+        for each in problems
+    )
+
+
+def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence[Problem], now: float) -> RouteRow:
     latencies = _new_latencies(_latencies(route, before), _latencies(route, after))
     return RouteRow(
         route=route,
         received=after.total("messages_received", route),
         rate=_rate(before, after, "messages_received", route),
-        targets=tuple(_target_row(metric, route, target, before, after) for metric, target in _targets(route, after)),
+        targets=tuple(
+            _target_row(metric, route, target, before, after, problems) for metric, target in _targets(route, after)
+        ),
         age=_age(after.of("route_last_message_timestamp_seconds", route).get((), 0.0), now),
         median=quantile(latencies, 0.5),
         slowest=quantile(latencies, 0.99),
-        is_tripped=after.total("deadman_active", route) > 0,
+        is_tripped=_has(problems, Kind.DEADMAN_ACTIVE, route),
     )
 
 
@@ -201,16 +213,17 @@ def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, str]]:
                 yield metric, target
 
 
-def _target_row(metric: str, route: str, target: str, before: Snapshot, after: Snapshot) -> TargetRow:
-    dropped = _dropped(route, target, after)
+def _target_row(
+    metric: str, route: str, target: str, before: Snapshot, after: Snapshot, problems: Sequence[Problem]
+) -> TargetRow:
     return TargetRow(
         name=target,
         is_topic=metric == "messages_published",
         delivered=after.total(metric, route, target),
         rate=_rate(before, after, metric, route, target),
-        dropped=dropped,
+        dropped=_dropped(route, target, after),
         filtered=after.total("messages_filtered", route, target),
-        is_losing=sum(unwanted(dropped).values()) > sum(unwanted(_dropped(route, target, before)).values()),
+        is_losing=_has(problems, Kind.MESSAGES_DROPPED, route, target=target),
     )
 
 

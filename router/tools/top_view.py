@@ -18,8 +18,8 @@ from rich.text import Text
 
 from router.tools.top import Order, View, unwanted
 from router.tools.top_table import Column, RouteTable
-from router.tools.top_words import age_text, latency_text, reasons_text
-from router.values import rate_text, shortened
+from router.tools.top_words import latency_text, reasons_text
+from router.values import age_text, rate_text, shortened
 
 _ENDPOINT_LINES = 4
 """At most, on a screen; what is silent is also said above them."""
@@ -137,15 +137,9 @@ def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
     whole = f"{flow}, {losses}"
     totals = [whole] if len(whole) <= width else [flow, losses]
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
-    if warnings := _warnings(view):
-        lines.append(Text("! " + "; ".join(warnings), style="bold red", no_wrap=True, overflow="ellipsis"))
+    if view.problems:
+        lines.append(Text("! " + "; ".join(view.problems), style="bold red", no_wrap=True, overflow="ellipsis"))
     return [*lines, *_last_heard(view, width, endpoint_lines)]
-
-
-def _warnings(view: View) -> list[str]:
-    tripped = [row.route for row in view.routes if row.is_tripped]
-    silent = [f"{name} silent for {age_text(view.silence[name])}" for name in view.silent]
-    return silent + ([f"deadman sends: {', '.join(tripped)}"] if tripped else [])
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:

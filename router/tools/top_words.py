@@ -15,17 +15,6 @@ def reasons_text(dropped: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in by_count)
 
 
-def age_text(seconds: float | None) -> str:
-    """`0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
-    if seconds is None:
-        return "never"
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
-
-
 def latency_text(seconds: float | None) -> str:
     """`35 us`, `1.2 ms`; `-` for None."""
     if seconds is None:

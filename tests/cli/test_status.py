@@ -4,65 +4,49 @@ from __future__ import annotations
 
 import json
 import socket
+from collections.abc import Sequence
 
 import pytest
 
 from router.cli import NETWORK_FAULT, OK, main
-from router.cli.status import DEGRADED, _problems
-from router.observe.snapshot import parse_metrics
+from router.cli.status import DEGRADED
+from router.observe.health import Kind, Problem
 from tests.ports import free_port
-from tests.tools.answering import COLLECTED_AT, answering
+from tests.tools.answering import answering
 
-WELL = f"""\
-router_datagrams_received_total{{listener="rover"}} 7
-router_messages_received_total{{route="imu_info",source="sensor_board"}} 7
-router_messages_received_total{{route="ph_info",source="arm_board"}} 0
-router_endpoint_last_seen_timestamp_seconds{{endpoint="sensor_board"}} {COLLECTED_AT - 1}
-router_endpoint_last_seen_timestamp_seconds{{endpoint="arm_board"}} 0
-router_endpoint_last_seen_timestamp_seconds{{endpoint="laptop"}} 1
-router_endpoint_stale_after_seconds{{endpoint="sensor_board"}} 5
-router_endpoint_stale_after_seconds{{endpoint="arm_board"}} 5
-router_endpoint_stale_after_seconds{{endpoint="laptop"}} 5
-router_deadman_active{{route="drive"}} 0
-router_publish_stalled_seconds{{topic="imu_data"}} 0.9
-router_config_last_reload_successful 1
-router_listener_waiting{{listener="tunnel"}} 0
-"""
-ILL = (
-    WELL.replace(str(COLLECTED_AT - 1), str(COLLECTED_AT - 8))
-    .replace('route="drive"} 0', 'route="drive"} 1')
-    .replace("successful 1", "successful 0")
-    .replace('"tunnel"} 0', '"tunnel"} 1')
-    .replace('"imu_data"} 0.9', '"imu_data"} 7')
-)
-
-TROUBLES = (
-    "its last reload failed; listener tunnel waits for its address or network interface; "
-    "sensor_board is silent for 8 s; the deadman of drive sends; "
-    "publishing on imu_data is stuck in the ROS middleware, for 7 s"
-)
+SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, " for 8 s", "Check power and cable.")
+HELD = Problem(Kind.DEADMAN_ACTIVE, {"route": "drive"}, routes=("drive",))
+SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
 
 
 @pytest.mark.parametrize(
-    ("metrics", "healthz", "code", "line"),
+    ("problems", "code", "line"),
     [
-        (WELL, 200, OK, "running: 7 datagrams received\n"),
-        (WELL.replace('"rover"} 7', '"rover"} 1'), 200, OK, "running: 1 datagram received\n"),
-        (WELL, 503, DEGRADED, "degraded: the receive thread is stuck; 7 datagrams received\n"),
+        ([], OK, "running: 7 datagrams received"),
+        ([SWITCHED_OFF], OK, "running: arm_board was never heard since the router started; 7 datagrams received"),
         (
-            ILL,
-            200,
+            [SILENT, HELD],
             DEGRADED,
-            f"degraded: {TROUBLES}; 7 datagrams received\n",
+            f"degraded: arm_board is silent for 8 s; {HELD.words}; 7 datagrams received",
         ),
     ],
 )
 def test_it_says_in_a_line_what_is_wrong(
-    metrics: str, healthz: int, code: int, line: str, capsys: pytest.CaptureFixture[str]
+    problems: Sequence[Problem], code: int, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with answering(metrics, healthz=healthz) as url:
+    with answering("", problems=problems) as url:
         assert main(["status", "--url", url]) == code
-    assert capsys.readouterr().out == line
+    assert capsys.readouterr().out == f"{line}\n"
+
+
+def test_scripts_get_the_kind_of_each_problem_and_where_to_read_on(capsys: pytest.CaptureFixture[str]) -> None:
+    with answering("", problems=[SILENT]) as url:
+        assert main(["status", "--url", url, "--json"]) == DEGRADED
+    said = json.loads(capsys.readouterr().out)
+    [found] = said["problems"]
+    assert (said["state"], said["received"]) == ("degraded", 7)
+    assert (found["kind"], found["level"], found["words"]) == ("EndpointSilent", "warning", "arm_board is silent")
+    assert found["page"] == "docs/troubleshooting/alerts.md#endpointsilent"
 
 
 def test_where_none_runs_that_is_the_answer(capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,7 +56,10 @@ def test_where_none_runs_that_is_the_answer(capsys: pytest.CaptureFixture[str]) 
     assert main(["status", "--url", url, "--json"]) == NETWORK_FAULT
     told = json.loads(capsys.readouterr().out)
     assert (told["state"], told["url"], told["received"]) == ("down", url, None)
+    assert told["problems"][0]["kind"] == "RouterDown"
 
 
-def test_who_never_sent_is_switched_off() -> None:
-    assert list(_problems(parse_metrics(WELL, COLLECTED_AT))) == []
+def test_something_else_at_the_address_is_no_router(capsys: pytest.CaptureFixture[str]) -> None:
+    with answering("starting", status=503) as url:
+        assert main(["status", "--url", url]) == NETWORK_FAULT
+    assert capsys.readouterr().out.startswith(f"down: no router answers at {url}: {url}/health.json: 503")

@@ -75,7 +75,7 @@ def test_programs_are_told_that_nobody_is_there_as_by_status(capsys: pytest.Capt
     assert main(["top", "--json", "--url", url]) == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["state"], told["url"]) == ("down", url)
-    assert told["problems"][0].startswith(f"no router answers at {url}: ")
+    assert told["problems"][0]["words"] == f"no router answers at {url}"
     assert main(["reload", "--json", "--url", f"{url} "]) == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["ok"], told["text"]) == (False, f"no router answers at {url}: Connection refused")

@@ -11,18 +11,27 @@ from typing import Any
 import pytest
 import yaml
 
+from router.compiler.metrics import INTENDED_REASONS
+from router.observe.health import PAGE as HEALTH_PAGE
+from router.observe.health import Kind
 from tests.deploy.promql import selectors
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "deploy/prometheus"
-PAGE = ROOT / "docs/troubleshooting/alerts.md"
-SECTIONS = re.findall(r"^## (.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+PAGE = ROOT / HEALTH_PAGE
+SECTIONS = dict(re.findall(r"^## (.*)\n\n(\w+):", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
+"""The level by the name of the section."""
 CONFIGURATION = yaml.safe_load((FOLDER / "prometheus.yml").read_text(encoding="utf-8"))
 TESTS = sorted((FOLDER / "tests").glob("*.yml"))
 PROMTOOL = shutil.which("promtool")
 LEVELS = ("instance", "listener", "route", "endpoint", "destination", "topic", "target", "reason", "le")
+
+NOT_EXPORTED = {"ReceiveStuck", "EndpointNeverHeard"}
+"""No metric says so; who never sent may be switched off."""
+OF_PROMETHEUS = {"RouterRestarting", "RouterBusy", "RouteSlow"}
+"""Of minutes, or of the process as a whole, which the router itself does not watch."""
 
 promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed; it comes with Debian's prometheus")
 
@@ -85,11 +94,37 @@ def test_what_rules_ask_of_each_other_is_recorded(name: str) -> None:
     assert {metric for metric in asked if ":" in metric} <= set(RECORDED)
 
 
+def test_there_is_an_alert_for_each_kind_of_problem() -> None:
+    assert ALERTS.keys() - OF_PROMETHEUS == {kind.alert for kind in Kind} - NOT_EXPORTED
+
+
+@pytest.mark.parametrize("kind", [kind for kind in Kind if kind.alert in ALERTS], ids=lambda kind: kind.alert)
+def test_an_alert_has_words_level_metric_and_threshold_of_its_kind_of_problem(kind: Kind) -> None:
+    alert = ALERTS[kind.alert]
+    words = kind.words.format_map({label: f"{{{{ $labels.{label} }}}}" for label in kind.labels})
+    assert alert["annotations"]["summary"].startswith(words)
+    assert alert["labels"] == {"severity": kind.level.value}
+    asked = [RECORDED.get(selector.metric, selector.metric) for selector in selectors(alert["expr"])]
+    assert kind.metric in " ".join(asked)
+    compared = re.search(r"(?:>|==) (\S+)$", alert["expr"])
+    if kind is Kind.ENDPOINT_SILENT:
+        assert alert["expr"].endswith("> on (job, instance, endpoint) router_endpoint_stale_after_seconds")
+    else:
+        assert compared
+        assert float(compared[1]) == kind.threshold
+
+
+@pytest.mark.parametrize("kind", [Kind.MESSAGES_DROPPED, Kind.DATAGRAMS_REJECTED], ids=lambda kind: kind.alert)
+def test_losses_that_the_table_asks_for_raise_no_alert(kind: Kind) -> None:
+    [selector] = selectors(ALERTS[kind.alert]["expr"])
+    assert selector.selects(selector.metric, {"reason": "malformed"})
+    assert not any(selector.selects(selector.metric, {"reason": reason}) for reason in INTENDED_REASONS)
+
+
 @pytest.mark.parametrize("name", ALERTS)
 def test_an_alert_says_how_bad_it_is_what_it_is_and_where_to_read_on(name: str) -> None:
-    alert = ALERTS[name]
-    assert alert["labels"]["severity"] in ("critical", "warning", "info")
-    assert set(alert["annotations"]) == {"summary", "runbook_url"}
+    assert ALERTS[name]["labels"]["severity"] == SECTIONS[name].lower()
+    assert set(ALERTS[name]["annotations"]) == {"summary", "runbook_url"}
 
 
 @pytest.mark.parametrize("name", ALERTS)
@@ -109,5 +144,7 @@ def test_the_documentation_is_found_where_links_are_put_together() -> None:
     assert re.fullmatch(r"https?://.*[^/]", CONFIGURATION["global"]["external_labels"]["docs"])
 
 
-def test_the_page_has_one_section_for_each_alert_that_there_is() -> None:
-    assert sorted(SECTIONS) == sorted(ALERTS)
+def test_the_page_has_one_section_for_each_kind_of_problem_and_alert_with_its_level() -> None:
+    levels = {kind.alert: kind.level.value.capitalize() for kind in Kind}
+    assert {name: level for name, level in SECTIONS.items() if name not in OF_PROMETHEUS} == levels
+    assert SECTIONS.keys() >= OF_PROMETHEUS

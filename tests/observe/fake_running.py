@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
+from typing import cast
 
 from prometheus_client.metrics_core import Metric as Family
 
+from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine.dispatch import Peer
+from router.errors import SourceSpan
+from router.observe.health import Look
+from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
+from router.observe.watch import LAST_SEEN, Health, Watch
 from router.recording.mirror import Classifier, Mirror
+from router.table.addresses import Address
 from router.types.framing import MAX_DATAGRAM
 from tests.tables import ROUTES
 
+SPAN = SourceSpan("routes/sim.yaml", 8, 20, 34)
+LOOPBACK = Address("127.0.0.1", 0)
 RELOADED = ReloadResult(True, (), "nothing has changed")
 
 
@@ -64,3 +75,42 @@ class FakeRunning:
 
     def reload(self) -> ReloadResult:
         return self.reloads
+
+
+class FakeHealth:
+    """Looks when it is asked. What was counted since `begin` is recent, and endpoints are silent since they sent."""
+
+    def __init__(self, running: FakeRunning) -> None:
+        self._running = running
+        self.begin()
+
+    def begin(self) -> None:
+        self._watch, self._began = Watch(self._running), wall_ns()
+        self._first = self._look(self._began)
+
+    @property
+    def is_stuck(self) -> bool:
+        return self._running.is_stuck
+
+    @property
+    def latest(self) -> Look:
+        look = self._look(now := wall_ns())
+        seen = {name: int(stamp * 1e9) for (name,), stamp in look.now.counts(LAST_SEEN).items()}
+        silence = {name: (now - (seen.get(name) or self._began)) / 1e9 for name in look.silence}
+        snapshots = (self._first.now, look.now)
+        return replace(look, snapshots=snapshots, silence=silence, standing=3.0 if self.is_stuck else 0.0)
+
+    def _look(self, wall: int) -> Look:
+        collected = self._running.collected
+        look = self._watch.look(boottime_ns(), wall)
+        self._running.collected = collected
+        return look
+
+
+def served(
+    running: FakeRunning,
+    save: Callable[[str], Path] | None = None,
+    address: Address = LOOPBACK,
+    health: FakeHealth | None = None,
+) -> HttpServer:
+    return HttpServer(address, SPAN, running, cast("Health", health or FakeHealth(running)), save)

@@ -18,6 +18,7 @@ from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import Running
+from router.observe.watch import Health
 from router.table.addresses import Address
 
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
@@ -38,6 +39,8 @@ LABELS = {
     "state": "served",
     "client": "0",
 }
+NO_HEALTH = cast("Health", None)
+"""Nobody asks for it."""
 BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
 
 
@@ -76,7 +79,7 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     collector = CountersCollector(
         counters, lambda: threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD
     )
-    with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
+    with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), NO_HEALTH, None)) as server:
         result.address = server.address
         yield result
 
@@ -136,5 +139,6 @@ def test_the_process_and_what_it_runs_are_described_and_python_is_not(scraped: S
 def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
+        collector = CountersCollector(Counters(), lambda: [[]], {}, BUILD)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
-            HttpServer(taken, SPAN, cast("Running", CountersCollector(Counters(), lambda: [[]], {}, BUILD)), None)
+            HttpServer(taken, SPAN, cast("Running", collector), NO_HEALTH, None)

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import closing
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -14,8 +14,9 @@ from router.compiler.metrics import METRICS
 from router.observe import last_values
 from router.observe.responses import PAGE
 from router.observe.status import IF_ANY, PATHS, Status
+from router.observe.watch import Health
 from tests.acceptance.site import wait_until
-from tests.observe.fake_running import FakeRunning, sim_program
+from tests.observe.fake_running import FakeHealth, FakeRunning, sim_program
 
 PROGRAM = sim_program()
 BOARD, STRANGER = ("127.0.0.30", 25008), ("127.0.0.99", 1)
@@ -31,7 +32,7 @@ def running() -> Iterator[FakeRunning]:
 
 @pytest.fixture
 def shown(running: FakeRunning) -> Iterator[Status]:
-    with closing(Status(running)) as opened:
+    with closing(Status(running, cast("Health", FakeHealth(running)))) as opened:
         yield opened
 
 
@@ -70,7 +71,7 @@ def test_what_is_counted_is_found_by_route_and_target_and_endpoint(running: Fake
     assert route["targets"]["basestation"] == {"delivered": 7, "dropped": {"send_error": 2}}
     assert route["targets"]["imu_data"] == {"delivered": 0, "dropped": {}, "filtered": 9}
     assert (route["last"], route["buckets"][-1]) == (1.5, ["+Inf", 0])
-    assert found["endpoints"]["sensor_board"] == {"seen": 2.0, "stale_after": 5.0}
+    assert found["endpoints"]["sensor_board"] == {"seen": 2.0}
 
 
 def test_every_series_that_the_page_knows_exists() -> None:
@@ -98,14 +99,15 @@ def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Statu
 
 
 def test_the_map_says_how_much_can_be_saved(running: FakeRunning) -> None:
-    with closing(Status(running, can_save=True)) as shown:
+    with closing(Status(running, cast("Health", FakeHealth(running)), can_save=True)) as shown:
         assert shown.map()["keeps"] == 60.0
 
 
-def test_a_stuck_thread_makes_no_progress(running: FakeRunning, shown: Status) -> None:
-    assert shown.numbers()["progress"] != shown.numbers()["progress"]
+def test_what_is_wrong_is_told_in_words(running: FakeRunning, shown: Status) -> None:
+    running.count("config_last_reload_successful", to=1)
+    assert shown.numbers()["problems"] == []
     running.is_stuck = True
-    assert shown.numbers()["progress"] == shown.numbers()["progress"]
+    assert [problem["words"] for problem in shown.numbers()["problems"]] == ["the receive thread is stuck"]
 
 
 def test_a_last_value_comes_from_what_is_received_while_somebody_looks(running: FakeRunning, shown: Status) -> None:

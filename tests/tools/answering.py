@@ -1,11 +1,14 @@
-"""An HTTP server that has /metrics and /healthz, and nothing else."""
+"""An HTTP server that has /metrics and /health.json, and nothing else."""
 
 from __future__ import annotations
 
+import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
+
+from router.observe.health import Problem
 
 COLLECTED_AT = 1_500_000_000.25
 """When its numbers were read, s."""
@@ -13,16 +16,28 @@ COLLECTED_AT = 1_500_000_000.25
 
 @contextmanager
 def answering(
-    text: str, address: tuple[str, int] = ("127.0.0.1", 0), status: int = 200, healthz: int = 200
+    text: str,
+    address: tuple[str, int] = ("127.0.0.1", 0),
+    status: int = 200,
+    problems: Sequence[Problem] = (),
+    table: str = "",
+    health: str | None = None,
 ) -> Iterator[str]:
-    """Yield its URL."""
+    """Yield its URL. `text` is that of /metrics, `table` the SHA-256 of the running table.
+
+    `health` is what /health.json says in place of that and the problems.
+    """
+    if health is None:
+        told = [problem.json() for problem in problems]
+        health = json.dumps({"table": table, "received": 7, "problems": told})
+    answers = {"/metrics": text, "/health.json": health}
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response({"/metrics": status, "/healthz": healthz}.get(self.path, 404))
+            self.send_response(status if self.path in answers else 404)
             self.send_header("X-Collected-At", str(COLLECTED_AT))
             self.end_headers()
-            self.wfile.write(text.encode())
+            self.wfile.write(answers.get(self.path, "").encode())
 
         def log_message(self, *_: object) -> None:
             """Quiet."""

@@ -16,9 +16,10 @@ import pytest
 from router.carrier.library import LibraryError
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.observe.health import Kind, Problem
 from router.table.addresses import Address
 from router.tools import doctor_checks
-from router.tools.doctor import before_start, examine, health
+from router.tools.doctor import before_start, examine
 from router.tools.doctor_checks import (
     CheckResult,
     Grade,
@@ -28,13 +29,15 @@ from router.tools.doctor_checks import (
     listeners,
     open_domain,
     ports,
+    problem,
     receive_buffers,
     recordings,
     ros,
     shared_memory,
+    warning,
 )
 from tests.ports import free_port
-from tests.tools.answering import COLLECTED_AT, answering
+from tests.tools.answering import answering
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -379,84 +382,50 @@ def test_who_answers_a_ping() -> None:
 
 
 @contextmanager
-def serving(program: Program, *samples: str) -> Iterator[None]:
-    """A router that runs the program's table, and has these metrics."""
+def serving(program: Program, *problems: Problem) -> Iterator[None]:
+    """A router that runs the program's table, and in which this is wrong."""
     assert program.table.http is not None
-    build = f'router_build_info{{table_sha256="{program.table.sha256}"}} 1'
-    with answering("\n".join([build, *samples, ""]), program.table.http.value):
+    with answering("", program.table.http.value, problems=problems, table=program.table.sha256):
         yield
 
 
-def seen(endpoint: str, ago: float) -> str:
-    return f'router_endpoint_last_seen_timestamp_seconds{{endpoint="{endpoint}"}} {COLLECTED_AT - ago}'
+def told(table: Path) -> list[CheckResult]:
+    """Of the running router."""
+    return [found for found in examine(table, {}) if found.about == "router"]
 
 
-def diagnosis(table: Path, *samples: str) -> list[CheckResult]:
-    program = compiled(table)
-    with serving(program, *samples):
-        running = health(program)
-    assert running is not None
-    return list(running.findings())
-
-
-@pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])
+@pytest.mark.parametrize("text", ["<html>hello</html>", "", "{}", "[]", '{"table": 1, "problems": 7}'])
 def test_another_program_at_the_routers_address_has_its_port(table: Path, text: str) -> None:
     address = compiled(table).table.http
     assert address is not None
-    with answering(text, address.value):
-        [problem] = texts(list(examine(table, {})), Grade.PROBLEM)
-    assert f"(pid {os.getpid()}) has tcp port" in problem
+    with answering("", address.value, health=text):
+        [taken] = texts(list(examine(table, {})), Grade.PROBLEM)
+    assert f"(pid {os.getpid()}) has tcp port" in taken
 
 
 def test_a_healthy_router_is_fine(table: Path) -> None:
-    assert texts(diagnosis(table, seen("sensor_board", 1)), Grade.FINE)
+    with serving(compiled(table)):
+        assert gist(told(table), "7 datagrams received") == [(Grade.FINE, True)]
 
 
-def test_only_what_sends_and_may_be_stale_is_stale(table: Path) -> None:
-    silent = [seen("sensor_board", 9), seen("arm_board", 9), seen("basestation", 9)]
-    [found] = diagnosis(table, *silent)
-    assert (found.grade, found.about) == (Grade.PROBLEM, "endpoints")
-    assert found.text == "sensor_board is stale: silent for 9 s, and more than 5 s is too long"
-
-
-def test_who_was_never_heard_may_not_have_been_switched_on_yet(table: Path) -> None:
-    [found] = diagnosis(table, 'router_endpoint_last_seen_timestamp_seconds{endpoint="sensor_board"} 0')
-    assert (found.grade, found.text) == (Grade.WARNING, "sensor_board was never heard since the router started")
-
-
-@pytest.mark.parametrize(
-    ("sample", "grade", "text"),
-    [
-        ('router_listener_waiting{listener="rover"} 1', Grade.WARNING, "listener 'rover' waits for its address"),
-        ('router_kernel_drops_total{listener="rover"} 3', Grade.WARNING, "the kernel has dropped 3 datagrams"),
-        (
-            'router_messages_dropped_total{reason="stale",route="ph_info",target="basestation"} 2',
-            Grade.WARNING,
-            "messages lost as stale: 2 of ph_info for basestation",
-        ),
-        (
-            'router_qos_incompatible{policy="reliability",route="ph_info",topic="ph"} 1',
-            Grade.PROBLEM,
-            "topic ph: no exchange with 1 peer of another reliability",
-        ),
-        ('router_deadman_active{route="ph_info"} 1', Grade.WARNING, "the deadman sends"),
-        ("router_config_last_reload_successful 0", Grade.PROBLEM, "its last reload failed"),
-    ],
-)
-def test_what_a_running_router_tells(table: Path, sample: str, grade: Grade, text: str) -> None:
-    [found] = diagnosis(table, seen("sensor_board", 1), sample)
-    assert (found.grade, text in found.text) == (grade, True), found.text
+def test_what_is_wrong_with_a_running_router_is_told_with_its_remedy_and_page(table: Path) -> None:
+    stuck = Problem(Kind.RECEIVE_STUCK, {}, " for 7 s", "Restart it.")
+    silent = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, " for 9 s", "Check its cable.")
+    with serving(compiled(table), stuck, silent):
+        first, second = told(table)
+    page = "docs/troubleshooting/alerts.md"
+    assert first == problem("router", "the receive thread is stuck for 7 s", f"Restart it. See {page}#receivestuck")
+    assert second == warning("router", "sensor_board is silent for 9 s", f"Check its cable. See {page}#endpointsilent")
 
 
 def test_a_router_that_runs_another_table_is_told(table: Path) -> None:
-    with serving(compiled(table), seen("sensor_board", 1)):
-        running = health(rewritten(table, "version: 1", "version: 1  # changed"))
-    assert running is not None
-    assert texts(list(running.findings()), Grade.WARNING) == ["it runs another table than this file"]
+    with serving(compiled(table)):
+        rewritten(table, "version: 1", "version: 1  # changed")
+        assert texts(told(table), Grade.WARNING) == ["it runs another table than this file"]
 
 
 def test_the_ports_of_a_running_router_are_not_a_problem(table: Path) -> None:
-    with serving(compiled(table), seen("sensor_board", 1)):
+    with serving(compiled(table)):
         found = list(examine(table, {}))
     assert texts(found, Grade.PROBLEM) == []
     assert "the running router has them" in texts(found, Grade.FINE)

@@ -1,0 +1,373 @@
+"""What is wrong with a running router, in words: decided here, and shown by all others.
+
+The status page, `/diagnostics`, `router status`, `router top` and doctor show `Look.problems`. An alert of Prometheus
+has the name of its kind; tests compare words, levels and thresholds.
+"""
+
+from __future__ import annotations
+
+import enum
+import string
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from router.compiler.metrics import INTENDED_REASONS
+from router.observe.snapshot import SERIES, Labels, Snapshot
+from router.values import age_text
+
+if TYPE_CHECKING:
+    from router.compiler.program import Program
+
+PERIOD = 1.0
+"""Seconds between two snapshots."""
+
+WINDOW = 10
+"""Seconds: a loss is a problem for so long. One that comes and goes would be overlooked."""
+
+PAGE = "docs/troubleshooting/alerts.md"
+"""It has a section for each kind."""
+
+
+class Level(enum.Enum):
+    """CRITICAL: the rover may not obey. WARNING: something is lost. INFO: something is not as the table has it."""
+
+    CRITICAL = "critical"
+    WARNING = "warning"
+    INFO = "info"
+
+
+class Kind(enum.Enum):
+    """A kind of problem, first those that explain others.
+
+    `words` have labels of `metric`, which is at fault above the `threshold`: losses per second, times in seconds.
+    `remedy` may also have the `{address}` of what the labels name.
+    """
+
+    def __init__(self, level: Level, words: str, remedy: str = "", metric: str = "", threshold: float = 0.0) -> None:
+        self.level, self.words, self.remedy, self.metric, self.threshold = level, words, remedy, metric, threshold
+
+    ROUTER_DOWN = (Level.CRITICAL, "no router answers at {instance}")
+    RECEIVE_STUCK = (
+        Level.CRITICAL,
+        "the receive thread is stuck",
+        "`systemctl restart rover-router`, then report it with its log.",
+        "",
+        2.0,  # without datagrams it makes progress each half second
+    )
+    LISTENER_WAITING = (
+        Level.CRITICAL,
+        "{listener} receives nothing: its address or network interface is not there",
+        "It waits for {address}; `ip -br address` shows what there is.",
+        "listener_waiting",
+    )
+    DEADMAN_CANNOT_SEND = (
+        Level.CRITICAL,
+        "{destination} does not get what the deadman of {route} sends",
+        "Nobody listens at {address}, or the network refuses it. Stop the rover by other means.",
+        "deadman_send_errors",
+    )
+    ENDPOINT_SILENT = (
+        Level.WARNING,
+        "{endpoint} is silent",
+        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what comes.",
+        "endpoint_last_seen_timestamp_seconds",  # the threshold is the endpoint's `stale_after`
+    )
+    DEADMAN_ACTIVE = (
+        Level.WARNING,
+        "commands of {route} stopped coming: its deadman sends in their place",
+        "`router explain` says who sends them. Do they come often enough, from a clock that agrees with this one?",
+        "deadman_active",
+    )
+    PUBLISH_STALLED = (
+        Level.WARNING,
+        "publishing on {topic} is stuck in the ROS middleware",
+        "A subscriber may be stuck, or was killed; forwarding and deadmen go on.",
+        "publish_stalled_seconds",
+        1.0,  # of all calls together
+    )
+    RELOAD_FAILED = (
+        Level.WARNING,
+        "the last reload failed: the table from before it goes on",
+        "`router validate` says what is wrong with the changed table.",
+        "config_last_reload_successful",
+    )
+    MESSAGES_DROPPED = (
+        Level.WARNING,
+        "messages for {target} are dropped: {reason}",
+        "",
+        "messages_dropped",
+        0.05,
+    )
+    MESSAGES_WAITING = (
+        Level.WARNING,
+        "messages wait for a thread that publishes or sends",
+        "The computer is overloaded (`router top`), or the ROS middleware holds a thread.",
+        "messages_waiting",
+        20,  # at all times, of all targets together; a few are there at each look where much is published
+    )
+    KERNEL_DROPS = (
+        Level.WARNING,
+        "the kernel drops datagrams of {listener}",
+        "Raise its `receive_buffer`, or find what takes the processor: `router top --once --sort rate`.",
+        "kernel_drops",
+    )
+    DATAGRAMS_REJECTED = (
+        Level.WARNING,
+        "{listener} rejects datagrams: {reason}",
+        "",
+        "datagrams_rejected",
+        0.05,
+    )
+    UNHANDLED_CASE = (
+        Level.WARNING,
+        "{payload_case} is received, and has no route",
+        "Write a route for it, or `ignore: reason`; `router tap` shows it.",
+        "unhandled",
+    )
+    QOS_INCOMPATIBLE = (
+        Level.WARNING,
+        "nothing passes between {topic} and peers with another {policy}",
+        "`ros2 topic info -v {topic}` shows theirs, `router explain {route}` ours.",
+        "qos_incompatible",
+    )
+    GATEWAY_DISCONNECTED = (
+        Level.WARNING,
+        "gateway {route} is not connected to its Zenoh router",
+        "Check that the hub runs, and that `connect` can be reached; the log says why it cannot.",
+        "gateway_connections",
+    )
+    RECORDING_INCOMPLETE = (
+        Level.WARNING,
+        "recordings or taps lack datagrams",
+        "The disk is full or too slow, or the computer too busy: `df`, `router doctor`.",
+        "record_dropped",  # and mirror_dropped
+    )
+    ENDPOINT_NEVER_HEARD = (
+        Level.INFO,
+        "{endpoint} was never heard since the router started",
+        ENDPOINT_SILENT[2],
+    )
+    GATEWAY_CLIENT_SLOW = (
+        Level.INFO,
+        "client {client} of {route} is behind",
+        "It gets the latest values only. Give its gateway smaller `rates`, or `compression`.",
+        "gateway_client_lag_seconds",
+        5,
+    )
+    GATEWAY_TOPIC_NOT_SERVED = (
+        Level.INFO,
+        "types that {route} would need are not installed",
+        "`router explain {route} --live` names them: source their packages, or exclude them.",
+        "gateway_topics",
+    )
+
+    @property
+    def alert(self) -> str:
+        """The name of its alert and of its section on PAGE, such as `EndpointSilent`."""
+        return self.name.title().replace("_", "")
+
+    @property
+    def labels(self) -> Labels:
+        """Those in its words."""
+        return tuple(label for _, label, *_ in string.Formatter().parse(self.words) if label)
+
+
+class Problem(NamedTuple):
+    """What is wrong (`words`), with labels of its metric; by how much (`more`), which changes; and what to do.
+
+    `routes`: the routes and gateways whose messages it concerns.
+    """
+
+    kind: Kind
+    labels: Mapping[str, str]
+    more: str = ""
+    remedy: str = ""
+    routes: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        return self.kind.words.format_map(self.labels)
+
+    @property
+    def text(self) -> str:
+        return self.words + self.more
+
+    @property
+    def page(self) -> str:
+        return f"{PAGE}#{self.kind.alert.lower()}"
+
+    def json(self) -> dict[str, Any]:
+        own = {**self._asdict(), "kind": self.kind.alert, "level": self.kind.level.value}
+        return {**own, "words": self.words, "page": self.page}
+
+    @classmethod
+    def of(cls, read: Mapping[str, Any]) -> Problem:
+        """The one with this `json()`. Raises KeyError where it is not."""
+        kind = {kind.alert: kind for kind in Kind}[read["kind"]]
+        labels = {label: str(read["labels"][label]) for label in {*kind.labels, *read["labels"]}}
+        return cls(kind, labels, read["more"], read["remedy"], tuple(read["routes"]))
+
+
+REMEDIES: Mapping[str, str] = {
+    "send_error": "The network refuses it, or nobody listens there: check that the receiver runs, and its address.",
+    "send_buffer_full": "The network is slower than what is sent: route less to it.",
+    "queue_full": "It is more than the `bandwidth`, or a thread is behind: route less to it, or raise the bandwidth.",
+    "stale": "It was older than its `ttl`: check the link, and that the clocks of both computers agree.",
+    "publish_error": "The ROS middleware refuses it: the log says why.",
+    "mapping_error": "The mapping fails on these values, as in a division by zero: `router explain` shows it.",
+    "non_finite": "A value is NaN or infinite: check what the sender measures.",
+    "too_large": "It is larger than the receiver takes: the log names the field and its bound.",
+    "incomplete": "Frames are not complete when their time is up: datagrams are lost on the way.",
+    "source_mismatch": "The sender's address is not in the table: `router tap --only rejected` shows it.",
+    "unknown_case": "The sender's protos are newer than the router's: update them.",
+    "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
+    "truncated": "They are longer than the router takes.",
+}
+"""By the reason of a loss."""
+
+_MORE: Mapping[Kind, str] = {
+    Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
+    Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
+    Kind.GATEWAY_TOPIC_NOT_SERVED: ", topics not served: {:.0f}",
+}
+"""By how much a value is too large, where that is of interest."""
+
+_GAUGES = (Kind.LISTENER_WAITING, Kind.DEADMAN_ACTIVE, *_MORE)
+_LOSSES = (
+    Kind.DEADMAN_CANNOT_SEND,
+    Kind.MESSAGES_DROPPED,
+    Kind.KERNEL_DROPS,
+    Kind.DATAGRAMS_REJECTED,
+    Kind.UNHANDLED_CASE,
+    Kind.RECORDING_INCOMPLETE,
+)
+_NO_LOSS = {*INTENDED_REASONS, "unhandled"}
+"""What the table asks for, and what UNHANDLED_CASE says."""
+
+_NAMED = 3
+"""Routes that are named in words."""
+
+_ALL_SILENT = "All endpoints are silent: check this computer's network, its cable, the switch, the radio."
+
+
+@dataclass(frozen=True)
+class Look:
+    """A router at the time of the last of `snapshots`, of the last WINDOW seconds, oldest first.
+
+    `silence`: for how long each endpoint has been silent, or was not heard yet, s. `standing`: for how long the receive
+    thread has made no progress, s.
+    """
+
+    program: Program
+    snapshots: Sequence[Snapshot]
+    silence: Mapping[str, float]
+    standing: float
+
+    @property
+    def now(self) -> Snapshot:
+        return self.snapshots[-1]
+
+    @property
+    def seconds(self) -> float:
+        """Between the first and the last snapshot."""
+        return max(self.now.at - self.snapshots[0].at, 1e-9)
+
+    def grown(self, metric: str) -> Iterator[tuple[Labels, int]]:
+        """The series that have counted in the last seconds, and how much."""
+        earlier = self.snapshots[0].counts(metric)
+        for labels, value in self.now.counts(metric).items():
+            if value > (before := earlier.get(labels, 0)):
+                yield labels, int(value - before)
+
+    @cached_property
+    def problems(self) -> tuple[Problem, ...]:
+        """All that is wrong, in the order of kinds."""
+        found = chain(
+            self._states(), self._silent(), self._waiting(), *map(self._above, _GAUGES), *map(self._lost, _LOSSES)
+        )
+        rank = {kind: place for place, kind in enumerate(Kind)}
+        return tuple(sorted(found, key=lambda problem: rank[problem.kind]))
+
+    def _states(self) -> Iterator[Problem]:
+        if self.standing > Kind.RECEIVE_STUCK.threshold:
+            yield self._problem(Kind.RECEIVE_STUCK, {}, f" for {age_text(self.standing)}")
+        if not self.now.total(Kind.RELOAD_FAILED.metric):
+            yield self._problem(Kind.RELOAD_FAILED, {})
+        for (name, mode), connections in self.now.counts(Kind.GATEWAY_DISCONNECTED.metric).items():
+            if mode == "client" and not connections:
+                yield self._problem(Kind.GATEWAY_DISCONNECTED, {"route": name})
+
+    def _silent(self) -> Iterator[Problem]:
+        """Those whose commands a deadman replaces first."""
+        sources = {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
+        senders = {name for names in sources.values() for name in names}
+        limits = {
+            endpoint.name: endpoint.stale_after / 1e9
+            for endpoint in self.program.table.endpoints.values()
+            if endpoint.stale_after is not None and endpoint.name in senders
+        }
+        silent = {name for name, limit in limits.items() if self.silence.get(name, 0.0) > limit}
+        held = {
+            name for (route,), on in self.now.counts("deadman_active").items() if on for name in sources.get(route, ())
+        }
+        for name in sorted(silent, key=lambda name: (name not in held, name)):
+            kind, more = Kind.ENDPOINT_NEVER_HEARD, ""
+            if self.now.total(Kind.ENDPOINT_SILENT.metric, name):
+                kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[name])}"
+            routes = tuple(route for route, names in sources.items() if name in names and names <= silent)
+            problem = self._problem(kind, {"endpoint": name}, more, routes)
+            yield problem if len(silent) < len(limits) or len(limits) == 1 else problem._replace(remedy=_ALL_SILENT)
+
+    def _waiting(self) -> Iterator[Problem]:
+        """In a publish call, or for a thread."""
+        counts = [snapshot.counts(Kind.PUBLISH_STALLED.metric) for snapshot in self.snapshots]
+        for topic, seconds in counts[-1].items():
+            stalled = max(seconds, sum(min(each.get(topic, 0.0), PERIOD) for each in counts))
+            if stalled > Kind.PUBLISH_STALLED.threshold:
+                yield self._problem(Kind.PUBLISH_STALLED, {"topic": topic[0]}, f" for {age_text(stalled)}")
+        counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]
+        waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
+        if waiting > Kind.MESSAGES_WAITING.threshold:
+            yield self._problem(Kind.MESSAGES_WAITING, {}, f", {waiting:.0f} at least")
+
+    def _above(self, kind: Kind) -> Iterator[Problem]:
+        for values, value in self.now.counts(kind.metric).items():
+            labels = dict(zip(SERIES[kind.metric], values, strict=True))
+            if value > kind.threshold and labels.get("state", "not_installed") == "not_installed":
+                routes = (self._owner(labels["route"]),) if "route" in labels else ()
+                yield self._problem(kind, labels, _MORE.get(kind, "").format(value), routes)
+
+    def _lost(self, kind: Kind) -> Iterator[Problem]:
+        """What was lost in the last seconds and is not meant to be, summed over the labels that its words lack."""
+        sums: dict[Labels, Counter[str]] = defaultdict(Counter)
+        for metric in (kind.metric, *(["mirror_dropped"] if kind is Kind.RECORDING_INCOMPLETE else [])):
+            for values, count in self.grown(metric):
+                labels = dict(zip(SERIES[metric], values, strict=True))
+                if labels.get("reason") not in _NO_LOSS:
+                    route = self._owner(labels.get("route", ""))
+                    sums[tuple(labels[label] for label in kind.labels)][route] += count
+        for values, counts in sums.items():
+            if (count := sum(counts.values())) / self.seconds > kind.threshold:
+                labels = dict(zip(kind.labels, values, strict=True))
+                routes = tuple(route for route, _ in counts.most_common() if route)
+                of = f" of {', '.join(routes[:_NAMED])}" if routes and "route" not in labels else ""
+                others = f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else ""
+                yield self._problem(kind, labels, f", {count}{of}{others} in {max(self.seconds, 1):.0f} s", routes)
+
+    def _owner(self, route: str) -> str:
+        """The gateway that a client's deadman belongs to, which is called GATEWAY:TOPIC; or the route itself."""
+        gateway, _, topic = route.partition(":")
+        return gateway if topic and gateway in self.program.table.gateways else route
+
+    def _problem(self, kind: Kind, labels: Mapping[str, str], more: str = "", routes: tuple[str, ...] = ()) -> Problem:
+        table, address = self.program.table, ""
+        if "listener" in labels and labels["listener"] in table.listeners:
+            address = table.listeners[labels["listener"]].bound_to
+        elif (endpoint := table.endpoints.get(labels.get("endpoint") or labels.get("destination", ""))) is not None:
+            address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
+        remedy = kind.remedy or REMEDIES.get(labels.get("reason", ""), "")
+        return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)

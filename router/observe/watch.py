@@ -1,0 +1,98 @@
+"""A thread that looks at a running router once a second, so that anybody who asks is told what is wrong."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from router.clock import boottime_ns, wall_ns
+from router.log import logger
+from router.observe.health import PERIOD, WINDOW, Kind, Look
+from router.observe.running import Running
+from router.observe.snapshot import DELIVERED, Snapshot, snapshot
+from router.threads import Thread, background_threads, join_or_leave
+
+LAST_SEEN = Kind.ENDPOINT_SILENT.metric
+METRICS = {kind.metric for kind in Kind} | {
+    "datagrams_received",
+    "deadman_datagrams_sent",
+    "gateway_clients",
+    "messages_received",
+    "mirror_dropped",
+    *DELIVERED,
+}
+"""What is read each second. Histograms, which are most of what is counted, are not."""
+
+
+class Watch:
+    """The last snapshots, and since when endpoints are silent and the receive thread stands still. Thread-safe."""
+
+    def __init__(self, running: Running) -> None:
+        self._running = running
+        self._snapshots: deque[Snapshot] = deque(maxlen=int(WINDOW / PERIOD) + 1)
+        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
+        self._progress, self._progressed = -1, 0
+        self._lock = threading.Lock()
+
+    def look(self, now: int, wall: int) -> Look:
+        """Look at it at `now`, of the boot clock, and `wall`, in ns."""
+        with self._lock:
+            program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
+            earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
+            seen = {name: self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
+            self._snapshots.append(latest)
+            snapshots = tuple(self._snapshots)
+        silence = {name: (now - then) / 1e9 for name, then in seen.items()}
+        return Look(program, snapshots, silence, self.standing(now))
+
+    def standing(self, now: int) -> float:
+        """For how long the receive thread has made no progress, s, as far as it was looked at."""
+        progress = self._running.progress()
+        with self._lock:
+            if progress != self._progress:
+                self._progress, self._progressed = progress, now
+            return (now - self._progressed) / 1e9
+
+    def _seen(self, endpoint: str, latest: Snapshot, earlier: int, now: int, wall: int) -> int:
+        """When it was last heard of, or first looked for. Stamps are of the wall clock, which jumps."""
+        stamp = latest.of(LAST_SEEN, endpoint).get((), 0.0)
+        if endpoint not in self._last_seen or self._last_seen[endpoint][0] != stamp:
+            age = min(max(0, wall - int(stamp * 1e9)), now - earlier)
+            self._last_seen[endpoint] = stamp, now - age
+        return self._last_seen[endpoint][1]
+
+
+class Health:
+    """Looks once in PERIOD until it is closed."""
+
+    def __init__(self, running: Running) -> None:
+        self._watch = Watch(running)
+        self.latest = self._look()
+        self._stopping = threading.Event()
+        self._thread = Thread(self._run, "health")
+        with background_threads():
+            self._thread.start()
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether the receive thread is stuck now."""
+        return self._watch.standing(boottime_ns()) > Kind.RECEIVE_STUCK.threshold
+
+    def close(self) -> None:
+        self._stopping.set()
+        join_or_leave(self._thread)
+
+    def _look(self) -> Look:
+        return self._watch.look(boottime_ns(), wall_ns())
+
+    def _run(self) -> None:
+        has_failed = False
+        while not self._stopping.wait(PERIOD):
+            try:
+                self.latest = self._look()
+            except Exception as error:  # noqa: BLE001 routing goes on; what is shown is old
+                if not has_failed:
+                    logger.error("the router's health cannot be determined", problem=repr(error))
+                has_failed = True
+            else:
+                has_failed = False

@@ -1,0 +1,27 @@
+"""A router that only counts."""
+
+from __future__ import annotations
+
+import pytest
+
+from router.compiler import check_table
+from router.compiler.program import Program
+from tests.observe.counting import TABLE, Counting
+from tests.tables import ROUTES
+
+
+@pytest.fixture(scope="session")
+def counted(tmp_path_factory: pytest.TempPathFactory) -> Program:
+    table = tmp_path_factory.mktemp("counted") / "table.yaml"
+    table.write_text(TABLE.format(routes=ROUTES))
+    checked = check_table(table)
+    assert checked.program is not None, [*map(str, checked.diagnostics)]
+    return checked.program
+
+
+@pytest.fixture
+def router(counted: Program) -> Counting:
+    """It has been looked at once."""
+    counting = Counting(counted, counted.counters.fresh_counts())
+    counting.look(0)
+    return counting

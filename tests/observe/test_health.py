@@ -1,0 +1,229 @@
+"""What is wrong with a router, by what it counts; and what is not."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import cast
+
+import pytest
+
+from router.compiler import metrics
+from router.observe import watch
+from router.observe.health import PAGE, PERIOD, REMEDIES, WINDOW, Kind, Level, Problem
+from router.observe.running import Running
+from router.observe.watch import Health
+from tests.observe.counting import SECOND, Counting
+
+
+def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting) -> None:
+    assert router.told(2) == []
+
+
+@pytest.mark.parametrize(
+    ("series", "value", "told"),
+    [
+        ("deadman_active manual_drive", 1, "commands of manual_drive stopped coming: its deadman sends in their place"),
+        (
+            "deadman_active dashboard:/cmd_vel",
+            1,
+            "commands of dashboard:/cmd_vel stopped coming: its deadman sends in their place",
+        ),
+        (
+            "deadman_send_errors manual_drive driving_board",
+            1,
+            "driving_board does not get what the deadman of manual_drive sends, 1 in 2 s",
+        ),
+        ("config_last_reload_successful", 0, "the last reload failed: the table from before it goes on"),
+        (
+            "messages_dropped imu_info basestation send_error",
+            9,
+            "messages for basestation are dropped: send_error, 9 of imu_info in 2 s",
+        ),
+        ("messages_waiting imu_info imu_data", 20, None),
+        ("messages_dropped imu_info imu_data rate_limited", 9, None),
+        ("datagrams_rejected rover malformed", 9, "rover rejects datagrams: malformed, 9 in 2 s"),
+        ("datagrams_rejected rover ignored", 9, None),
+        ("datagrams_rejected rover unhandled", 9, None),  # the next one says it
+        ("unhandled arm_diag", 9, "arm_diag is received, and has no route, 9 in 2 s"),
+        (
+            "qos_incompatible imu_info imu_data reliability",
+            1,
+            "nothing passes between imu_data and peers with another reliability, 1 of them",
+        ),
+        ("record_dropped overflow", 9, "recordings or taps lack datagrams, 9 in 2 s"),
+        ("mirror_dropped", 9, "recordings or taps lack datagrams, 9 in 2 s"),
+        ("gateway_topics dashboard served", 9, None),
+        (
+            "gateway_topics dashboard not_installed",
+            2,
+            "types that dashboard would need are not installed, topics not served: 2",
+        ),
+    ],
+)
+def test_what_is_counted_is_a_problem_unless_the_table_asks_for_it(
+    router: Counting, series: str, value: int, told: str | None
+) -> None:
+    router.set_to(value, *series.split())
+    problems = router.look(2).problems
+    assert [problem.text for problem in problems] == ([told] if told else [])
+    assert all(problem.remedy and problem.page == f"{PAGE}#{problem.kind.alert.lower()}" for problem in problems)
+
+
+def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
+    router.kernel_drops, router.is_waiting, router.is_stuck = 2, True, True
+    router.look(0)
+    assert router.told(2.5) == [
+        "the receive thread is stuck for 2.5 s",
+        "rover receives nothing: its address or network interface is not there",
+        "the kernel drops datagrams of rover, 2 in 2 s",
+    ]
+
+
+def test_a_thread_that_makes_progress_at_times_is_not_stuck(router: Counting) -> None:
+    router.is_stuck = True
+    assert router.told(1.9) == []
+    router.is_stuck = False
+    assert router.told(1) == []
+
+
+def test_a_loss_is_a_problem_for_as_long_as_anybody_may_need_to_look(router: Counting) -> None:
+    router.add(7, "messages_dropped", "imu_info", "imu/mag", "mapping_error")
+    for _ in range(int(WINDOW / PERIOD)):
+        told = "; ".join(router.told(1))
+        assert "messages for imu/mag are dropped: mapping_error, 7 of imu_info in " in told
+    assert "mapping_error" not in "; ".join(router.told(1))
+
+
+def test_losses_of_many_routes_are_one_problem_which_names_those_with_most(router: Counting) -> None:
+    for count, route in enumerate(("imu_info", "gps_info", "ph_info", "pump_info", "arm_diag"), 1):
+        router.add(count, "messages_dropped", route, "basestation", "send_error")
+    [problem] = router.look(1).problems
+    assert problem.text.endswith(", 15 of arm_diag, pump_info, ph_info and 2 more routes in 1 s")
+    assert set(problem.routes) == {"imu_info", "gps_info", "ph_info", "pump_info", "arm_diag"}
+
+
+def test_messages_that_wait_at_all_times_are_a_problem(router: Counting) -> None:
+    router.set_to(30, "messages_waiting", "imu_info", "imu_data")
+    assert router.told(1) == []  # they may just have come
+    router.set_to(25, "messages_waiting", "imu_info", "imu_data")
+    for _ in range(int(WINDOW / PERIOD)):
+        router.hear("sensor_board")
+        told = router.told(1)
+    assert "messages wait for a thread that publishes or sends, 25 at least" in told
+
+
+def test_a_publisher_is_stuck_in_one_call_or_in_many_until_it_goes_on(router: Counting) -> None:
+    router.stalled = {"imu_data": 0.9, "imu/mag": 0.9}
+    assert router.told(1) == []
+    router.stalled = {"imu_data": 61.9, "imu/mag": 0.0}
+    assert router.told(1) == ["publishing on imu_data is stuck in the ROS middleware for 62 s"]
+    router.stalled = {"imu_data": 0.0, "imu/mag": 0.6}
+    [_, other] = router.told(1)
+    assert other == "publishing on imu/mag is stuck in the ROS middleware for 1.5 s"
+    router.stalled = {"imu_data": 0.0, "imu/mag": 0.0}
+    told = [[text for text in router.told(1) if "stuck" in text] for _ in range(int(WINDOW / PERIOD) + 1)]
+    assert (told[0] != [], told[-1]) == (True, [])
+
+
+def test_an_endpoint_is_silent_after_its_own_time_and_with_it_the_routes_that_only_it_feeds(router: Counting) -> None:
+    router.hear("sensor_board")
+    assert router.told(3) == []
+    [problem] = router.look(0.1).problems
+    assert (problem.text, problem.kind.level) == ("sensor_board is silent for 3.1 s", Level.WARNING)
+    assert "imu_info" in problem.routes
+    assert "manual_drive" not in problem.routes
+    assert "ping 192.168.0.30" in problem.remedy
+    router.hear("sensor_board")
+    assert router.told(1) == []
+
+
+def test_who_was_never_heard_may_be_switched_off(router: Counting) -> None:
+    found = router.look(5.1).problems
+    assert {problem.kind for problem in found} == {Kind.ENDPOINT_NEVER_HEARD}
+    assert "basestation was never heard since the router started" in [problem.text for problem in found]
+    silent = {problem.labels["endpoint"] for problem in router.look(1000).problems}
+    assert not silent & {"arm_board", "container_board"}  # `never` is stale; is no source
+
+
+def test_where_all_are_silent_it_is_the_network(router: Counting) -> None:
+    assert {problem.remedy.partition(":")[0] for problem in router.look(1000).problems} == {"All endpoints are silent"}
+
+
+def test_who_is_silent_while_a_deadman_acts_comes_before_others_that_are(router: Counting) -> None:
+    router.hear("sensor_board")
+    router.hear("basestation")
+    router.set_to(1, "deadman_active", "manual_drive")
+    first, second, *_ = router.told(10)
+    assert (first, second) == ("basestation is silent for 10 s", "sensor_board is silent for 10 s")
+
+
+@pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])
+def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Counting, shift: int) -> None:
+    router.hear("sensor_board")
+    router.look(1)
+    router.shift = shift
+    assert router.told(1) == []
+    assert router.told(1.5) == ["sensor_board is silent for 3.5 s"]
+    router.hear("sensor_board")
+    router.look(1)
+    assert router.watch.look(router.now, router.wall).silence["sensor_board"] == 1.0
+
+
+def test_what_explains_other_problems_comes_first(router: Counting) -> None:
+    router.hear("basestation")
+    router.set_to(1, "deadman_active", "manual_drive")
+    router.add(3, "deadman_send_errors", "manual_drive", "driving_board")
+    router.add(3, "messages_dropped", "imu_info", "basestation", "stale")
+    kinds = [problem.kind for problem in router.look(6).problems if problem.kind is not Kind.ENDPOINT_NEVER_HEARD]
+    assert kinds == [Kind.DEADMAN_CANNOT_SEND, Kind.ENDPOINT_SILENT, Kind.DEADMAN_ACTIVE, Kind.MESSAGES_DROPPED]
+
+
+@pytest.mark.parametrize("kind", Kind, ids=lambda kind: kind.alert)
+def test_every_kind_has_words_of_labels_of_its_metric(kind: Kind) -> None:
+    if kind.metric:
+        assert set(kind.labels) <= set(metrics.metric(kind.metric).labels)
+    labels = {label: f"{{{label}}}" for label in kind.labels}
+    problem = Problem(kind, labels, " for 2 s", "wait", ("imu_info",))
+    assert problem.words == kind.words
+    assert Problem.of(json.loads(json.dumps(problem.json()))) == problem
+
+
+def test_remedies_are_of_reasons_that_there_are() -> None:
+    assert REMEDIES.keys() <= {*metrics.DROP_REASONS, *metrics.REJECT_REASONS, *metrics.GATEWAY_REJECT_REASONS}
+
+
+# ---- the thread -----------------------------------------------------------------------------------------------------
+
+
+def test_it_looks_until_it_is_closed(router: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watch, "PERIOD", 0.01)
+    health = Health(cast("Running", router))
+    assert health.latest.problems == ()
+    router.set_to(0, "config_last_reload_successful")
+    deadline = threading.Event()
+    while not health.latest.problems and not deadline.wait(0.01):
+        pass
+    health.close()
+    last = health.latest
+    router.set_to(1, "config_last_reload_successful")
+    assert not deadline.wait(0.05)
+    assert health.latest is last
+
+
+def test_what_fails_is_logged_once_and_tried_again(
+    router: Counting, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(watch, "PERIOD", 0.01)
+    health = Health(cast("Running", router))
+    tries, enough = iter(range(100_000)), threading.Event()
+
+    def collect() -> None:
+        if next(tries) == 3:
+            enough.set()
+        raise RuntimeError("no counters")
+
+    monkeypatch.setattr(router, "collect", collect)
+    assert enough.wait(10)
+    health.close()
+    assert capsys.readouterr().out.count("no counters") == 1
