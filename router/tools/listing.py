@@ -12,7 +12,7 @@ from enum import Enum
 
 from router.compiler.checked import CheckedRoute
 from router.compiler.expressions import tree
-from router.compiler.lowering import Lowered, LoweredElements, LoweredTarget
+from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredTarget
 from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
 from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
 from router.compiler.program import Handler, Program, TargetPlan
@@ -29,9 +29,12 @@ def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
     name = checked.route.name
     for kind, routes in (("destination", lowered.conditions), ("topic", lowered.topics)):
         if name in routes:
-            yield from _layout(routes[name].layout)
-            for target in routes[name].targets.values():
-                yield from _target(kind, target, routes[name].layout)
+            route = routes[name]
+            yield from _layout(route.layout)
+            if route.collect is not None:
+                yield from _collect(route.collect, route.layout, next(iter(route.targets.values())))
+            for target in route.targets.values():
+                yield from _target(kind, target, route.layout)
     for topic, feeds in lowered.from_ros.items():
         for feed in feeds:
             if feed.route == name:
@@ -129,6 +132,17 @@ def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) 
     slots = [_slot(each, layout) for each in (elements.item, elements.index, elements.count) if each != NONE]
     into = [f"node {elements.node}"] * (elements.node != NONE) + slots
     yield f"    each -> {', '.join(into)}" if into else "    each"
+
+
+def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> Iterator[str]:
+    _, _, place, *_ = target.places
+    for what, code in (("frame", collect.by), ("its size", collect.count), ("the place in it", collect.order)):
+        yield ""
+        yield f"  {what}"
+        yield from _listed(code, [place] * len(code), layout)
+    slots = [_slot(each, layout) for each in (collect.items, collect.counted) if each != NONE]
+    if slots:
+        yield f"    all of a frame -> {', '.join(slots)}"
 
 
 def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:

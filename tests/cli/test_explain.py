@@ -119,9 +119,7 @@ def test_what_python_serves_is_told(own: Path, capsys: pytest.CaptureFixture[str
     lines = re.findall(r"^  (?:topic|destination) (\w+)|^    by (.*)$", told, re.MULTILINE)
     assert [name or by for name, by in lines] == [
         "e",
-        "Python: `collect` needs it  (table.yaml:10:5)",
         "radio",
-        "Python: the bandwidth of 'radio' needs it  (table.yaml:6:3)",
         "d",
         "Python: `on_limit: latest` needs it  (table.yaml:15:15)",
         "d",

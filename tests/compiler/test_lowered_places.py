@@ -51,3 +51,18 @@ topic: a
     placed = dict(zip([each.kind for each in target.message], target.places[3:], strict=True))
     assert placed[Op.REAL_DIVIDE] == "table.yaml:13:48: orientation_covariance"
     assert placed[Op.SQRT] == "table.yaml:13:70: orientation_covariance"
+
+
+def test_what_makes_frames_has_a_place(check_text: CheckText) -> None:
+    checked = check_text(
+        """\
+routes:
+  imu_info:
+    source: board
+    collect: {by: 1, count: 2, order: round(accel_x), timeout: 1s}
+    topics: [{topic: a, type: std_msgs/msg/Float32, fields: {data: "items[1].accel_x"}}]
+"""
+    )
+    assert checked.program is not None, checked.diagnostics
+    (target,) = checked.program.lowered.topics["imu_info"].targets.values()
+    assert target.places[2] == "table.yaml:9:5: collect"

@@ -137,3 +137,33 @@ def test_a_message_from_ros_is_listed_with_its_elements(site: Path, capsys: pyte
         "       7  close\n"
         "\n"
     )
+
+
+def test_what_makes_frames_is_listed_in_front_of_what_fills_topics(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The fields of topics are those of the first payload; `items` has slots of its own."""
+    told = listed(
+        capsys,
+        site,
+        "  motor:\n"
+        "    source: board\n"
+        "    collect: {by: name, count: speed, order: 0, timeout: 1s}\n"
+        '    topics: [{topic: b, type: std_msgs/msg/Int32, fields: {data: "items[1].speed"}}]\n',
+    )
+    assert "  reads Motor, node 2\n    field 1: int32 -> slot 7  items[].speed\n" in told
+    assert told[told.index("  frame\n") : told.index("  topic b\n")] == (
+        "  frame\n"
+        "    # collect  (t.yaml:8:5)\n"
+        "       0  load              slot 5  name\n"
+        "\n"
+        "  its size\n"
+        "    # collect  (t.yaml:8:5)\n"
+        "       0  load              slot 6  speed\n"
+        "\n"
+        "  the place in it\n"
+        "    # collect  (t.yaml:8:5)\n"
+        "       0  integer           0\n"
+        "    all of a frame -> slot 2  items\n"
+        "\n"
+    )
