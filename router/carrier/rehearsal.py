@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import socket
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from struct import Struct
 from types import SimpleNamespace
 from typing import NamedTuple, Union
@@ -14,13 +15,13 @@ from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import NativeDeadman, open_deadman
 from router.carrier.events import Changed, EventReader, Told
 from router.carrier.from_ros import NativeFromRos, native_from_ros
+from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.ring import Ring
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine.binding import State
-from router.engine.pacing import RateLimit
 from router.table.model import Endpoint
 
 Peer = tuple[str, int]
@@ -94,10 +95,10 @@ class Stage:
         ended = [each for each in before.values() if each not in running.deadmen.values()]
         for each, replaces in replaced:
             each.succeeds(replaces)
-        pairs = [each.address for pair in replaced for each in pair]
+        addresses = [each.address for pair in replaced for each in pair]
         change = c.Change(
             program=ctypes.pointer(running.native.structure),
-            replaced=(ctypes.c_void_p * len(pairs))(*pairs),
+            replaced=(ctypes.c_void_p * len(addresses))(*addresses),
             ended=(ctypes.c_void_p * len(ended))(*(each.address for each in ended)),
             replaced_count=len(replaced),
             ended_count=len(ended),
@@ -177,7 +178,8 @@ class Stage:
             return [(deadmen[name].address, name != route) for name in names]
 
         def limit(handler: Handler, target: TargetPlan) -> c.Limit:
-            return state.keep(("limit", handler.route, handler.topic, target), lambda: _limit(target))
+            assert target.max_rate is not None  # noqa: S101 - asked for by the caller
+            return state.keep(("limit", handler.route, handler.topic, target), partial(open_limit, target.max_rate))
 
         def parts(handler: Handler) -> Sequence[PartTargets]:
             topics = [target for target in handler.targets if target.is_topic]
@@ -274,12 +276,6 @@ class _Running:
         routes = from_ros.topics.values()
         self.topics = (c.RosTopic * len(routes))(*(c.RosTopic(routes=each, route_count=len(each)) for each in routes))
         self._from_ros = from_ros
-
-
-def _limit(target: TargetPlan) -> c.Limit:
-    assert target.max_rate is not None  # noqa: S101 - asked for by the caller
-    period = RateLimit.period(target.max_rate)
-    return c.Limit(period, period - period // 2, -period)
 
 
 def _number(host: str) -> int:
