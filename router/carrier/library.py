@@ -81,7 +81,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "publish_since": (c_int64, (c_void_p, c_void_p)),
     "publish_stop": (c_bool, (c_void_p,)),
     "rcl_types_differ": (c_bool, ()),
-    "rehearsal_adopt": (None, (c_void_p, c_void_p, c_void_p)),
+    "rehearsal_adopt": (None, (c_void_p, c_void_p, c_void_p, c_void_p)),
     "rehearsal_advance": (None, (c_void_p, c_int64)),
     "rehearsal_close": (None, (c_void_p,)),
     "rehearsal_datagram": (None, (c_void_p, c_uint32, c_uint32, c_uint32, c_void_p, c_size_t, c_int64)),

@@ -13,6 +13,7 @@ from typing import NamedTuple, Union
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import NativeDeadman, open_deadman
+from router.carrier.deferrals import Adoption, Deferrals, timer_change
 from router.carrier.events import Changed, EventReader, Told
 from router.carrier.from_ros import NativeFromRos, native_from_ros
 from router.carrier.limits import open_limit
@@ -89,21 +90,20 @@ class Stage:
         self._generation += 1
         running = self._opened_for(program, state)
         before = earlier.deadmen if earlier else {}
-        replaced = [
-            (each, before[route]) for route, each in running.deadmen.items() if before.get(route, each) is not each
-        ]
-        ended = [each for each in before.values() if each not in running.deadmen.values()]
+        replaced = [(each, before[route]) for route, each in running.deadmen.items() if route in before]
+        replaced = [(each, replaces) for each, replaces in replaced if replaces is not each]
         for each, replaces in replaced:
             each.succeeds(replaces)
         addresses = [each.address for pair in replaced for each in pair]
+        left = [each.address for each in before.values() if each not in running.deadmen.values()]
         change = c.Change(
             program=ctypes.pointer(running.native.structure),
             replaced=(ctypes.c_void_p * len(addresses))(*addresses),
-            ended=(ctypes.c_void_p * len(ended))(*(each.address for each in ended)),
+            timers=running.timer_change(earlier, left, of_topics=False),
             replaced_count=len(replaced),
-            ended_count=len(ended),
         )
-        self._library.rehearsal_adopt(self._address, ctypes.byref(change), running.topics)
+        of_topics = running.timer_change(earlier, (), of_topics=True)
+        self._library.rehearsal_adopt(self._address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
         self._state, self._running = state, running
         state.forget_previous()
 
@@ -186,12 +186,20 @@ class Stage:
             part = PartTargets(self._ring.address, topics, is_always_wanted=False, is_native=True)
             return [part] if topics else []
 
+        publications = {
+            plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
+            for plan in program.publishers
+        }
+        bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
+        deferrals = Deferrals(self._library, state, senders, publications, bandwidths)
+        pacers = [pacer for endpoint in bandwidths if (pacer := deferrals.pacer(endpoint))]
         outlets = Outlets(
             listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
             senders={name: sender.address for name, sender in senders.items()},
-            publications={plan.label: _Publication() for plan in program.publishers},
+            publications=publications,
             feeds=feeds,
             limit=limit,
+            deferral=deferrals.deferral,
             carried=lambda handler: [target for target in handler.targets if not target.is_topic],
             parts=parts,
             names=self._names,
@@ -199,8 +207,9 @@ class Stage:
         )
         native = native_program(program, self._generation, outlets)
         from_ros = native_from_ros(program, self._generation, outlets)
-        native.arrays += [senders, deadmen, outlets]
-        return _Running(program, native, from_ros, deadmen)
+        native.arrays += [senders, deadmen, outlets, pacers]
+        adopted = [*(Adoption(pacer.address) for pacer in pacers), *native.adopted, *from_ros.adopted]
+        return _Running(program, native, from_ros, deadmen, adopted)
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
         return state.keep(("sender", endpoint.name, endpoint.address.value), lambda: _Sender(self._opened))
@@ -268,14 +277,27 @@ class _Running:
     """A program as the stage executes it. Listeners and topics have numbers, which are indexes of its arrays."""
 
     def __init__(
-        self, program: Program, native: NativeProgram, from_ros: NativeFromRos, deadmen: Mapping[str, NativeDeadman]
+        self,
+        program: Program,
+        native: NativeProgram,
+        from_ros: NativeFromRos,
+        deadmen: Mapping[str, NativeDeadman],
+        adopted: Sequence[Adoption],
     ) -> None:
-        self.program, self.native, self.deadmen = program, native, deadmen
+        self.program, self.native, self.deadmen, self.adopted = program, native, deadmen, adopted
         self.listeners = {plan.name: number for number, plan in enumerate(program.listeners)}
         self.topic_numbers = {topic: number for number, topic in enumerate(from_ros.topics)}
         routes = from_ros.topics.values()
         self.topics = (c.RosTopic * len(routes))(*(c.RosTopic(routes=each, route_count=len(each)) for each in routes))
         self._from_ros = from_ros
+
+    def timer_change(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
+        """What timers are to do that hold messages back, for topics or for endpoints; `ended` end as well."""
+        adopted = [each for each in self.adopted if each.is_topic is of_topics]
+        kept = {each.timer for each in adopted}
+        before = [each.timer for each in earlier.adopted if each.is_topic is of_topics] if earlier else []
+        # A deferral ends before its pacer, which was adopted before it.
+        return timer_change(adopted, [*(each for each in reversed(before) if each not in kept), *ended])
 
 
 def _number(host: str) -> int:

@@ -38,15 +38,16 @@ static void append_record(struct rehearsal *rehearsal, const void *record, size_
     rehearsal->size += size;
 }
 
-/* Write down a record, after the events that were reported before. */
+/* Write down a record, after the events that were reported before: at the time of the record before them, which says what
+ * was counted. */
 static void note(struct rehearsal *rehearsal, const void *record, size_t size) {
+    for (size_t taken; (taken = ring_take(rehearsal->events, rehearsal->taken, sizeof rehearsal->taken, 0));)
+        append_record(rehearsal, rehearsal->taken, taken);
     if (rehearsal->noted_at != rehearsal->now) {
         struct time_record time = {.size = sizeof time, .kind = RECORD_TIME, .at = rehearsal->now};
         rehearsal->noted_at = rehearsal->now;
         append_record(rehearsal, &time, sizeof time);
     }
-    for (size_t taken; (taken = ring_take(rehearsal->events, rehearsal->taken, sizeof rehearsal->taken, 0));)
-        append_record(rehearsal, rehearsal->taken, taken);
     append_record(rehearsal, record, size);
 }
 
@@ -146,8 +147,10 @@ static void publish_waiting(struct rehearsal *rehearsal) {
         }
 }
 
-void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct ros_topic *topics) {
+void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct timer_change *published,
+                     const struct ros_topic *topics) {
     route_by(&rehearsal->routing, change);
+    timers_change(rehearsal->holding, published);
     rehearsal->topics = topics;
 }
 
@@ -191,9 +194,8 @@ void rehearsal_advance(struct rehearsal *rehearsal, int64_t to) {
 void rehearsal_set_clock(struct rehearsal *rehearsal, int64_t ahead) { rehearsal->ahead = ahead; }
 
 void rehearsal_end(struct rehearsal *rehearsal) {
-    struct timers *groups[] = {rehearsal->holding, rehearsal->timers};
-    for (size_t index = 0; index < sizeof groups / sizeof *groups; index++)
-        for (struct timer *each = groups[index]->first; each; each = each->next) timer_end(groups[index], each);
+    timers_end(rehearsal->holding);
+    timers_end(rehearsal->timers);
 }
 
 /* ---- what became of it ---- */

@@ -43,8 +43,10 @@ void rehearsal_close(struct rehearsal *rehearsal); /* when it has no timer left 
 /* The timers of destinations: deadmen of its programs are opened there. */
 struct timers *rehearsal_timers(struct rehearsal *rehearsal);
 
-/* Go on with another program, as at a reload, or with the first one. All belongs to the caller. */
-void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct ros_topic *topics);
+/* Go on with another program, as at a reload, or with the first one. `published` is what changes for the timers of topics.
+ * All belongs to the caller. */
+void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct timer_change *published,
+                     const struct ros_topic *topics);
 
 /* Receive a datagram of a listener, or a message of a topic from ROS, by their indexes in the program. A datagram has
  * `arrived_at`, and a message `sent_at` by the wall clock. */
