@@ -119,7 +119,8 @@ EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
 class Rehearsal:
     """One run of a program, from the state of a router that has just started.
 
-    `now` is both clocks, wall and boot clock, in ns. `events` has what happened, in order; the caller may clear it.
+    `now` is the boot clock, in ns, and the wall clock as well, until that is set. `events` has what happened, in order;
+    the caller may clear it.
     The same calls give the same events.
     """
 
@@ -128,6 +129,7 @@ class Rehearsal:
         self.events: list[Event] = []
         self._stage = Stage(library(), start_ns)
         self._at = start_ns
+        self.ahead = 0
         self._data = b""
         self._stage.adopt(program)
         self._series = _series(program)
@@ -136,20 +138,29 @@ class Rehearsal:
     def now(self) -> int:
         return self._stage.now
 
+    @property
+    def _wall(self) -> int:
+        return self.now + self.ahead
+
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
         """Receive a datagram now, which waited in the socket since `arrived_ns`. Raises KeyError for no listener."""
-        self._stage.datagram(listener, peer, data, self.now if arrived_ns is None else arrived_ns)
+        self._stage.datagram(listener, peer, data, self._wall if arrived_ns is None else arrived_ns)
         self._read()
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
         """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        self._stage.message(topic, cdr, self.now if sent_ns is None else sent_ns)
+        self._stage.message(topic, cdr, self._wall if sent_ns is None else sent_ns)
         self._read()
 
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns` and serve the timers that are due by then. Never goes back."""
         self._stage.advance(to_ns)
         self._read()
+
+    def set_clock(self, ahead_ns: int) -> None:
+        """Set the wall clock, to so many ns ahead of the boot clock."""
+        self.ahead = ahead_ns
+        self._stage.set_clock(ahead_ns)
 
     def reload(self, program: Program) -> None:
         """Go on with another program, whose counters continue those of the present one."""

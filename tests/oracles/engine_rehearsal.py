@@ -5,13 +5,13 @@ It makes the events of `router.rehearsal`: each message is served by generated P
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from router.compiler.metrics import Series
-from router.compiler.program import Program
+from router.compiler.program import DeadmanPlan, Program
 from router.engine import InboundEngine, OutboundEngine
-from router.engine.binding import EngineContext, TimerGroup
+from router.engine.binding import EngineContext, State, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import Report
 from router.engine.dispatch import Peer
@@ -22,43 +22,68 @@ from router.rehearsal.rehearsal import EVENTS, START, DeadmanChanged, Dropped, E
 
 
 class EngineRehearsal:
-    """One run of a program, from the state of a router that has just started.
-
-    `now` is both clocks, wall and monotonic, in ns. `events` has what happened, in order; the caller may clear it.
-    The same calls give the same events.
-    """
+    """One run of a program, as `router.rehearsal.rehearsal.Rehearsal`."""
 
     def __init__(self, program: Program, start_ns: int = START) -> None:
         self.now = start_ns
         self.events: list[Event] = []
+        self.ahead = 0
         self._timers: list[Timer] = []
         self._arrived_at: int | None = None
         self._data = b""
-        context = self._context(program)
-        inbound = InboundEngine(program, context, {plan.name: self._arrival for plan in program.listeners}, Freshness())
-        self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
-        outbound = OutboundEngine(program, context, Freshness())
-        self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
+        self._counts = _ObservedCounts(self._count)
+        self._inbound, self._outbound = Freshness(), Freshness()
+        self._state = State()
+        self._deadmen: Mapping[str, Deadman] = {}
+        self.reload(program)
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
-        """Receive a datagram now, which waited in the socket since `arrived_ns`. Raises KeyError for no listener."""
         self._arrived_at = arrived_ns
         self._receive[listener](data, peer)
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
-        """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        self._take[topic](cdr, self.now if sent_ns is None else sent_ns, False)
+        self._take[topic](cdr, self._wall() if sent_ns is None else sent_ns, False)
 
     def advance(self, to_ns: int) -> None:
-        """Let time pass until `to_ns` and serve the timers that are due by then. Never goes back."""
         while (due := self._next_due()) is not None and due <= to_ns:
             self.now = max(self.now, due)
             for timer in reversed(self._timers):  # as a TimerThread: the last may hand on to earlier ones
-                timer.due(self.now)
+                if timer.next_due is not None and timer.next_due <= self.now:
+                    timer.due(self.now)
         self.now = max(self.now, to_ns)
 
+    def set_clock(self, ahead_ns: int) -> None:
+        self.ahead = ahead_ns
+
+    def reload(self, program: Program) -> None:
+        """What the router did with its Python plane: state goes along by key, and what is left ends."""
+        before, state = self._deadmen, State(self._state)
+        self._counts.observe(program)
+        deadmen = {plan.route: self._deadman(plan, program, state) for plan in program.deadmen}
+        pacers = {to.name: self._pacer(to.name, to.bandwidth, state) for to in program.senders if to.bandwidth}
+        context = self._context(program, state, deadmen, pacers)
+        inbound = InboundEngine(
+            program, context, {plan.name: self._arrival for plan in program.listeners}, self._inbound
+        )
+        outbound = OutboundEngine(program, context, self._outbound)
+        for route, deadman in deadmen.items():
+            if before.get(route, deadman) is not deadman:
+                deadman.replace(before[route])
+        left = [timer for timer in reversed(self._timers) if any(timer is each for each in state.left())]
+        for timer in [each for each in left if not isinstance(each, Deadman)] + [
+            each for each in left if isinstance(each, Deadman)
+        ]:
+            self._timers.remove(timer)
+            timer.end(self.now)
+        places = {(each.route, target.label) for each in program.handlers for target in each.targets}
+        for pacer in pacers.values():
+            pacer.keep_only(self.now, places)
+        state.forget_previous()
+        self._state, self._deadmen = state, deadmen
+        self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
+        self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
+
     def close(self) -> None:
-        """Stop as the router does: end frames, send what waits, and let armed deadmen send last."""
         last = [timer for timer in self._timers if isinstance(timer, Deadman)]
         for timer in [each for each in reversed(self._timers) if each not in last] + last[::-1]:
             timer.end(self.now)
@@ -66,33 +91,46 @@ class EngineRehearsal:
     def _next_due(self) -> int | None:
         return min((timer.next_due for timer in self._timers if timer.next_due is not None), default=None)
 
-    def _arrival(self) -> int:
-        return self.now if self._arrived_at is None else self._arrived_at
+    def _wall(self) -> int:
+        return self.now + self.ahead
 
-    def _context(self, program: Program) -> EngineContext:
-        counts = _ObservedCounts(program, self._count)
+    def _arrival(self) -> int:
+        return self._wall() if self._arrived_at is None else self._arrived_at
+
+    def _deadman(self, plan: DeadmanPlan, program: Program, state: State) -> Deadman:
+        send = dict.fromkeys((endpoint for endpoint, _ in plan.datagrams), self._send)
+
+        def deadman() -> Deadman:
+            return Deadman(plan, program.counters, self._counts, send, self._report, self._deadman_changed)
+
+        return state.keep(("deadman", plan), deadman)
+
+    def _pacer(self, endpoint: str, bandwidth: int, state: State) -> Pacer:
+        pacer = state.keep(("pacer", endpoint, bandwidth), lambda: Pacer(bandwidth))
+        if pacer not in self._timers:
+            self._timers.append(pacer)  # before what hands on to it
+        return pacer
+
+    def _context(
+        self, program: Program, state: State, deadmen: Mapping[str, Deadman], pacers: Mapping[str, Pacer]
+    ) -> EngineContext:
         send = {to.name: self._send for to in program.senders}
-        deadmen = {
-            plan.route: Deadman(plan, program.counters, counts, send, self._report, self._deadman_changed)
-            for plan in program.deadmen
-        }
-        pacers = {to.name: Pacer(to.bandwidth) for to in program.senders if to.bandwidth}
-        self._timers += pacers.values()  # before what hands on to them
-        group = TimerGroup(counts, self._locked)
+        group = TimerGroup(self._counts, self._locked)
         return EngineContext(
-            counts=counts,
+            counts=self._counts,
             send=send,
             publish={plan.label: self._publish for plan in program.publishers},
             wanted={plan.label: [True] for plan in program.publishers},
             report=self._report,
             clock_ns=lambda: self.now,
-            wall_ns=lambda: self.now,
+            wall_ns=self._wall,
             pacing=group,
             holding=group,
             collecting=group,
             command=commander(send, deadmen, self._locked, lambda: self.now),
             pacers=pacers,
             boards=program.boards,
+            state=state,
         )
 
     def _locked(self, timer: Timer, call: Callable[P, R]) -> Callable[P, R]:
@@ -122,12 +160,16 @@ class EngineRehearsal:
 
 
 class _ObservedCounts(list[int]):
-    """The counts of a program, with a call for each series of an event that is counted."""
+    """The counts of programs that continue each other, with a call for each series of an event that is counted."""
 
-    def __init__(self, program: Program, counted: Callable[[Series], None]) -> None:
-        super().__init__(program.counters.fresh_counts())
-        self._series = {index: series for series, index in program.counters.series() if series.metric in EVENTS}
+    def __init__(self, counted: Callable[[Series], None]) -> None:
+        super().__init__()
+        self._series: dict[int, Series] = {}
         self._counted = counted
+
+    def observe(self, program: Program) -> None:
+        program.counters.grow(self)
+        self._series |= {index: series for series, index in program.counters.series() if series.metric in EVENTS}
 
     def __setitem__(self, index, value) -> None:  # type: ignore[no-untyped-def]  # it is never a slice
         super().__setitem__(index, value)
