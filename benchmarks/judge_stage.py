@@ -20,7 +20,9 @@ from benchmarks.fuzz_engine import MUTATIONS
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
+from router.errors import Severity
 from router.rehearsal.rehearsal import Dropped, Event, Published, Rehearsal, Rejected, Sent
+from router.table.model import OnLimit
 from router.types.model import MessageType
 from tests.carrier.random_tables import PEERS, RandomTable, Tables, datagram, ros_message
 from tests.oracles.engine_rehearsal import EngineRehearsal
@@ -58,9 +60,13 @@ class Judge:
             self._path.write_text(table.text.replace("PROTOS", str(PROTOS)))
             checked = check_table(self._path, {}, self._definitions)
             program = checked.program_in(self._program.counters.continued()) if previous else checked.program
-            if program is not None:
+            if program is not None and (previous is None or _is_comparable(self._program, program)):
                 return table, checked, program
-            self.fates["refused: " + str(checked.diagnostics[0].message)[:60]] += 1
+            if program is not None:
+                self.fates["not comparable"] += 1
+                continue
+            first = next(each for each in checked.diagnostics if each.severity is Severity.ERROR)
+            self.fates[f"refused: {first.message[:60]}"] += 1
 
     def run(self, steps: int) -> str | None:
         """Returns the first difference."""
@@ -147,6 +153,20 @@ class Judge:
         if counts[0] != counts[1]:
             found.append(f"only Python: {counts[0] - counts[1]}, only the library: {counts[1] - counts[0]}")
         return "\n".join(found) or None
+
+
+def _is_comparable(earlier: Program, later: Program) -> bool:
+    """Whether both keep the same state at a reload.
+
+    The library keeps what is held for a target by its name, Python by all that the table says of it.
+    """
+    before, after = ({(each.route, each.topic, target.label): target for each in program.handlers
+                      for target in each.targets} for program in (earlier, later))  # fmt: skip
+    return all(
+        target == after.get(place, target) or target.max_rate != after[place].max_rate
+        for place, target in before.items()
+        if target.on_limit is OnLimit.LATEST
+    )
 
 
 def _without_detail(event: Event) -> Event:

@@ -180,17 +180,17 @@ class Rehearsal:
                     self._at = at
                 case Left(_, data):
                     self._data = data
-                case Counted(counter, amount):
-                    self._count(counter, amount)
+                case Counted(counter, _):
+                    self._count(counter)
                 case Changed(route, is_tripped):
                     self.events.append(DeadmanChanged(self._at, route, is_tripped))
                 case Told(_, report):
                     self._report(report.detail or str(report.error or ""))
 
-    def _count(self, counter: int, amount: int) -> None:
+    def _count(self, counter: int) -> None:
         """Make an event of what is counted: only the counters have both the route and the target."""
         if (series := self._series.get(counter)) is not None:
-            self.events += [EVENTS[series.metric](self._at, series.labels, self._data)] * amount
+            self.events.append(EVENTS[series.metric](self._at, series.labels, self._data))
 
     def _report(self, detail: str) -> None:
         """Add to the event of the last count what is reported about it."""

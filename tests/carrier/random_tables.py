@@ -34,6 +34,7 @@ PEERS = (
     ("192.168.0.60", 8003), ("192.168.0.81", 9000), ("192.168.0.99", 1), ("0.0.0.0", 0), ("255.255.255.255", 65535),
 )  # fmt: skip
 
+COLLECTS = False
 _SENDERS = ("sensor_board", "basestation", "left_tool", "right_tool", "picky", "recorder")
 _BOARDS = ("driving_board", "arm_board")
 _OTHERS = ("basestation", "recorder", "left_tool", "right_tool", "picky")
@@ -115,7 +116,7 @@ class Tables:
         for case in _FROM_ROS:
             if self._chance(0.5):
                 yield f"{case} from ROS", self._from_ros(case)
-        if self._chance(0.4):
+        if COLLECTS and self._chance(0.4):
             yield "collected", self._collected()
         if self._chance(0.2):
             yield "ignored", "  arm_diag: {ignore: nobody wants it}\n"
@@ -184,7 +185,7 @@ class Tables:
         numbers = _FIELDS.get(case, ())
         if case not in _FIELDS:
             numbers = (_FROM_ROS[case][2],)
-        conditions = ['source == "left_tool"', "received_at > 0.0"] if case in _FIELDS else []
+        conditions = ['source == "left_tool"'] if case in _FIELDS else []
         for each in numbers:
             conditions += [f"{each} > 1", f"1 / {each} > 0.5", f"{each} != 0 or {each} > -5"]
         return f", when: {self._noise.choice(conditions)!s}" if conditions else ""
@@ -197,7 +198,7 @@ class Tables:
     def _value(self, case: str, kind: str) -> str:
         number = self._noise.choice(_FIELDS[case] or ("3",))
         if kind == "String":
-            return self._noise.choice(("source", f"text({number}, 1)"))
+            return self._noise.choice(("source", f"'text(float64({number}), 1)'"))
         if kind == "Float32":
             return self._noise.choice(
                 (f"{number}", f"1 / {number}", f"{number} * 2", f"{number} if {number} > 1 else 7")

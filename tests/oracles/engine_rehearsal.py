@@ -66,6 +66,8 @@ class EngineRehearsal:
             program, context, {plan.name: self._arrival for plan in program.listeners}, self._inbound
         )
         outbound = OutboundEngine(program, context, self._outbound)
+        self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
+        self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
         for route, deadman in deadmen.items():
             if before.get(route, deadman) is not deadman:
                 deadman.replace(before[route])
@@ -80,8 +82,6 @@ class EngineRehearsal:
             pacer.keep_only(self.now, places)
         state.forget_previous()
         self._state, self._deadmen = state, deadmen
-        self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
-        self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
 
     def close(self) -> None:
         last = [timer for timer in self._timers if isinstance(timer, Deadman)]
