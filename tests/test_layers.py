@@ -29,14 +29,14 @@ IMPORTS = {
     "gateway": f"{GROUND} {LANGUAGE} engine net carrier ros",
     "recording": f"{GROUND} {LANGUAGE} engine net",
     "observe": f"{GROUND} {LANGUAGE} values engine net recording",
-    "rehearsal": f"{LANGUAGE} values engine recording",
+    "rehearsal": f"{LANGUAGE} values engine carrier recording",
     "tools": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe rehearsal",
     "app": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe",
     "cli": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal tools carrier app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"errors", "table", "types", "values", "compiler", "engine", "rehearsal"}
+PURE = {"errors", "table", "types", "values", "compiler", "engine"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

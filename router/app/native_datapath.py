@@ -38,30 +38,28 @@ from router.carrier.carrier import Carrier
 from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.deferrals import Adoption, Deferrals, NativeDeferral, NativePacer, timer_change
-from router.carrier.events import EventThread
+from router.carrier.events import EventReader, EventThread
 from router.carrier.from_ros import native_from_ros
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets, PartTargets
 from router.carrier.program import NativeProgram, native_program
+from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker
 from router.clock import boottime_ns
-from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import OutboundEngine, PartEngine
 from router.engine.binding import State
 from router.engine.deadman import feeder
 from router.engine.freshness import Freshness
-from router.engine.slow_path import Rejected, SlowPath
 from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Mirror, Mirrored
 from router.table import model
-from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:
     from router.ros.endpoints import RosChange
@@ -138,11 +136,9 @@ class NativeDatapath:
                 (braked, _as_list(deadman_counts)),
                 (published, _as_list(publish_counts)),
             ],
-            self._names,
+            EventReader(self._names, self._why_rejected, self._where_refused),
             report,
             context.deadman_changed,
-            self._why_rejected,
-            self._where_refused,
             self._pulse,
         )
 
@@ -451,38 +447,14 @@ class NativeDatapath:
         self._carrier.close()
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
-        """Say in words why the carrier rejected a datagram, of which `data` may be the beginning."""
-        if length > MAX_DATAGRAM:
-            return f"{length} bytes"
-        wiring = self._wiring
-        if wiring is None or all(plan.name != listener for plan in wiring.program.listeners):
-            return ""
-        program = wiring.program
-        routed = {number: handlers[0].case.name for number, handlers in program.inbound.items()}
-        try:
-            case, _, _ = SlowPath(program, program.counters.fresh_counts(), listener, routed).parse(data)
-        except Rejected as rejected:
-            return str(rejected)
-        return case
+        return why_rejected(self._wiring.program, listener, data, length) if self._wiring else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
-        """Say which place of the table refused a message of `topic`, None for a datagram.
-
-        Nothing if it is not of the program that runs.
-        """
+        """Nothing if it is not of the program that runs."""
         wiring = self._wiring
         if wiring is None or wiring.native.generation != generation:
             return ""
-        return _lowered_target(wiring.program.lowered, route, topic, target).places[place]
-
-
-def _lowered_target(lowered: Lowered, route: str, topic: str | None, target: str) -> LoweredTarget:
-    """What was lowered of a target, for messages from `topic`, None for datagrams."""
-    if topic is not None:
-        serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
-    else:
-        serving = [by_route[route] for by_route in (lowered.topics, lowered.conditions) if route in by_route]
-    return next(each.targets[target] for each in serving if target in each.targets)
+        return where_refused(wiring.program.lowered, route, topic, target, place)
 
 
 def _fixed_counts() -> ctypes.Array[ctypes.c_int64]:

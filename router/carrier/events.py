@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from socket import inet_ntoa
 from struct import Struct
 
@@ -28,31 +28,88 @@ _LOSS = Struct("@IIIIIIiIII")
 _PULSE_MS = 5000
 
 
-class EventThread:
-    """Reads the events of `rings`, and calls `pulse` every few seconds to say that Python is alive.
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """The deadman of a route has tripped, or was released."""
 
-    Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
-    that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
+    route: str
+    is_tripped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A loss, by the counter of such losses."""
+
+    counter: int
+    report: Report
+
+
+class EventReader:
+    """Puts records of `native/events.h` into words.
+
     `detail(listener, data, length)` returns in words why a datagram was rejected. `place(route, topic, target,
     generation, place)` returns which place of the table refused a message of `topic`, None of a datagram; or "".
     """
 
     def __init__(
         self,
-        rings: Sequence[tuple[Ring, Sequence[int]]],
         names: Names,
-        report: Callable[[Report], None],
-        changed: Callable[[str, bool], None],
         detail: Callable[[str, bytes, int], str],
         place: Callable[[str, str | None, str, int, int], str],
+    ) -> None:
+        self._name = names.name
+        self._detail = detail
+        self._place = place
+
+    def read(self, kind: int, record: memoryview) -> Changed | Told:
+        if kind in {_TRIPPED, _RELEASED}:
+            _, _, route, _, _, _ = _DEADMAN.unpack_from(record)
+            return Changed(self._name(route), kind == _TRIPPED)
+        if kind == _REJECTED:
+            return self._rejected(record)
+        if kind == _LOST:
+            return self._lost(record)
+        _, _, route, target, number, counter = _DEADMAN.unpack_from(record)
+        error = _error(number) or OSError(f"it cannot be published: {_text(record[_DEADMAN.size :])}")
+        return Told(counter, Report("deadman", self._name(route), self._name(target), "send_error", error))
+
+    def _rejected(self, record: memoryview) -> Told:
+        _, _, listener, reason, address, port, length, counter = _REJECT.unpack_from(record)
+        place, data = self._name(listener), bytes(record[_REJECT.size : _REJECT.size + length])
+        sender = f"from {inet_ntoa(address.to_bytes(4, 'big'))}:{port}"
+        what = self._detail(place, data, length)
+        detail = f"{sender}: {what}" if what else sender
+        return Told(counter, Report("reject", place, "", _REASONS[reason], None, detail))
+
+    def _lost(self, record: memoryview) -> Told:
+        _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
+        route, target = self._name(of_route), self._name(of_target)
+        detail = _text(record[_LOSS.size :])
+        if generation:  # a program of the table refused the message
+            topic = self._name(of_topic) if of_topic != NO_NAME else None
+            detail = ": ".join(filter(None, (self._place(route, topic, target, generation, place), detail)))
+        return Told(counter, Report("drop", route, target, LOSSES[loss], _error(number), detail))
+
+
+class EventThread:
+    """Reads the events of `rings`, and calls `pulse` every few seconds to say that Python is alive.
+
+    Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
+    that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
+    """
+
+    def __init__(
+        self,
+        rings: Sequence[tuple[Ring, Sequence[int]]],
+        reader: EventReader,
+        report: Callable[[Report], None],
+        changed: Callable[[str, bool], None],
         pulse: Callable[[], None],
     ) -> None:
         self._rings = rings
-        self._name = names.name
+        self._reader = reader
         self._report = report
         self._changed = changed
-        self._detail = detail
-        self._place = place
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in rings]
@@ -92,30 +149,11 @@ class EventThread:
     def _tell(
         self, kind: int, record: memoryview, counters: Sequence[int], last: dict[int, tuple[int, Report]]
     ) -> None:
-        if kind in {_TRIPPED, _RELEASED}:
-            _, _, route, _, _, _ = _DEADMAN.unpack_from(record)
-            self._changed(self._name(route), kind == _TRIPPED)
-        elif kind == _REJECTED:
-            _, _, listener, reason, address, port, length, counter = _REJECT.unpack_from(record)
-            place, data = self._name(listener), bytes(record[_REJECT.size : _REJECT.size + length])
-            sender = f"from {inet_ntoa(address.to_bytes(4, 'big'))}:{port}"
-            what = self._detail(place, data, length)
-            detail = f"{sender}: {what}" if what else sender
-            self._count(counter, Report("reject", place, "", _REASONS[reason], None, detail), counters, last)
-        elif kind == _LOST:
-            _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
-            route, target = self._name(of_route), self._name(of_target)
-            detail = _text(record[_LOSS.size :])
-            if generation:  # a program of the table refused the message
-                topic = self._name(of_topic) if of_topic != NO_NAME else None
-                detail = ": ".join(filter(None, (self._place(route, topic, target, generation, place), detail)))
-            lost = Report("drop", route, target, LOSSES[loss], _error(number), detail)
-            self._count(counter, lost, counters, last)
-        else:
-            _, _, route, target, number, counter = _DEADMAN.unpack_from(record)
-            error = _error(number) or OSError(f"it cannot be published: {_text(record[_DEADMAN.size :])}")
-            failed = Report("deadman", self._name(route), self._name(target), "send_error", error)
-            self._count(counter, failed, counters, last)
+        match self._reader.read(kind, record):
+            case Changed(route, is_tripped):
+                self._changed(route, is_tripped)
+            case Told(counter, report):
+                self._count(counter, report, counters, last)
 
     def _count(
         self, counter: int, report: Report, counters: Sequence[int], last: dict[int, tuple[int, Report]]

@@ -9,6 +9,7 @@ import ctypes
 import os
 from collections.abc import Iterator, Mapping
 from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
+from functools import cache
 from pathlib import Path
 
 from router.assets import asset, is_installed
@@ -80,6 +81,16 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "publish_since": (c_int64, (c_void_p, c_void_p)),
     "publish_stop": (c_bool, (c_void_p,)),
     "rcl_types_differ": (c_bool, ()),
+    "rehearsal_adopt": (None, (c_void_p, c_void_p, c_void_p, c_void_p)),
+    "rehearsal_advance": (None, (c_void_p, c_int64)),
+    "rehearsal_close": (None, (c_void_p,)),
+    "rehearsal_datagram": (None, (c_void_p, c_uint32, c_uint32, c_uint32, c_void_p, c_size_t, c_int64)),
+    "rehearsal_end": (None, (c_void_p,)),
+    "rehearsal_message": (None, (c_void_p, c_uint32, c_void_p, c_size_t, c_int64)),
+    "rehearsal_open": (c_void_p, (c_void_p, c_void_p, c_int64)),
+    "rehearsal_records": (c_void_p, (c_void_p, c_void_p)),
+    "rehearsal_set_clock": (None, (c_void_p, c_int64)),
+    "rehearsal_timers": (c_void_p, (c_void_p,)),
     "ring_close": (None, (c_void_p,)),
     "ring_drop": (c_bool, (c_void_p, c_void_p, c_size_t)),
     "ring_open": (c_void_p, (c_size_t,)),
@@ -180,6 +191,15 @@ def chosen_library(variables: Mapping[str, str] = os.environ) -> ctypes.CDLL | N
             raise StartError(f"{VARIABLE} is '{choice}', but {error}") from None
         logger.warning("the carrier's library cannot be used: Python does its work, and more slowly", why=str(error))
         return None
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The library, loaded once. Raises StartError where it cannot be used."""
+    try:
+        return load()
+    except LibraryError as error:
+        raise StartError(f"the carrier's library cannot be used: {error}") from None
 
 
 def load(path: Path = LIBRARY) -> ctypes.CDLL:

@@ -106,6 +106,7 @@ enum { BRAKE_LATER = -1 };
 
 /* What a thread needs to deliver messages. */
 struct stage {
+    struct rehearsal *rehearsal; /* that the functions belong to; NULL in flight */
     counter *counters;
     struct reporter reporter;
     struct timers *timers; /* in which its commands feed deadmen */

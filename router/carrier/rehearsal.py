@@ -1,0 +1,304 @@
+"""The stage (`native/rehearsal.c`): programs without threads, sockets and ROS, on a clock that is told."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from struct import Struct
+from types import SimpleNamespace
+from typing import NamedTuple, Union
+
+from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
+from router.carrier.deadmen import NativeDeadman, open_deadman
+from router.carrier.deferrals import Adoption, Deferrals, timer_change
+from router.carrier.events import Changed, EventReader, Told
+from router.carrier.from_ros import NativeFromRos, native_from_ros
+from router.carrier.limits import open_limit
+from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.program import NativeProgram, native_program
+from router.carrier.reasons import where_refused, why_rejected
+from router.carrier.ring import Ring
+from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
+from router.engine.binding import State
+from router.table.model import Endpoint
+
+Peer = tuple[str, int]
+
+_MOST_COUNTERS = 1 << 18
+_WAITING = 1 << 16
+"""Bytes in the ring for topics, from which each message is taken at once."""
+
+_TIME, _COUNTED, _SENT, _BRAKED, _PUBLISHED = range(32, 37)
+"""`enum record_kind` in rehearsal.h."""
+
+_HEAD = Struct("@II")
+_TIME_RECORD, _COUNTED_RECORD, _LEFT_RECORD = Struct("@IIq"), Struct("@IIqII"), Struct("@IIII")
+
+
+class Time(NamedTuple):
+    """What follows was at this time of the boot clock, ns."""
+
+    at: int
+
+
+class Counted(NamedTuple):
+    """A counter was added to."""
+
+    counter: int
+    amount: int
+
+
+class Left(NamedTuple):
+    """A datagram for an endpoint, or a message for a topic; it is counted afterwards."""
+
+    target: str
+    data: bytes
+
+
+Record = Union[Time, Counted, Left, Changed, Told]
+
+
+class Stage:
+    """Rehearses programs. `records` says what became of all that was handed in, and of what was due.
+
+    A wall clock is `ahead` of the boot clock, by 0 ns at first. All times in ns.
+    """
+
+    def __init__(self, library: ctypes.CDLL, now: int = 0) -> None:
+        """Raises MemoryError."""
+        self.now = now
+        self._library = library
+        self._names = Names()
+        self._ring = Ring(library, _WAITING)
+        self._opened = _Opened(library, self._ring, now)
+        self._address = self._opened.address
+        self._reader = EventReader(self._names, self._why_rejected, self._where_refused)
+        self._state = State()
+        self._running: _Running | None = None
+        self._generation = 0
+
+    def counters(self, count: int) -> list[int]:
+        """The first counters."""
+        return self._opened.counters[:count]
+
+    def adopt(self, program: Program) -> None:
+        """Go on with a program, which takes over what has the same key, as at a reload. Raises CannotCarry."""
+        earlier, state = self._running, State(self._state)
+        self._generation += 1
+        running = self._opened_for(program, state)
+        before = earlier.deadmen if earlier else {}
+        replaced = [(each, before[route]) for route, each in running.deadmen.items() if route in before]
+        replaced = [(each, replaces) for each, replaces in replaced if replaces is not each]
+        for each, replaces in replaced:
+            each.succeeds(replaces)
+        addresses = [each.address for pair in replaced for each in pair]
+        left = [each.address for each in before.values() if each not in running.deadmen.values()]
+        change = c.Change(
+            program=ctypes.pointer(running.native.structure),
+            replaced=(ctypes.c_void_p * len(addresses))(*addresses),
+            timers=running.timer_change(earlier, left, of_topics=False),
+            replaced_count=len(replaced),
+        )
+        of_topics = running.timer_change(earlier, (), of_topics=True)
+        self._library.rehearsal_adopt(self._address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
+        self._state, self._running = state, running
+        state.forget_previous()
+
+    def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
+        """Receive a datagram. `arrived_at` is of the wall clock. Raises KeyError for no listener."""
+        host, port = peer
+        number = self._in_use.listeners[listener]
+        self._library.rehearsal_datagram(self._address, number, _number(host), port, data, len(data), arrived_at)
+
+    def message(self, topic: str, data: bytes, sent_at: int) -> None:
+        """Take a message from ROS. `sent_at` is of the wall clock. Raises KeyError for a topic without a route."""
+        number = self._in_use.topic_numbers[topic]
+        self._library.rehearsal_message(self._address, number, data, len(data), sent_at)
+
+    def advance(self, to: int) -> None:
+        """Let time pass, and serve what is due until then. Never goes back."""
+        self._library.rehearsal_advance(self._address, to)
+        self.now = max(self.now, to)
+
+    def set_clock(self, ahead: int) -> None:
+        """Set the wall clock."""
+        self._library.rehearsal_set_clock(self._address, ahead)
+
+    def end(self) -> None:
+        """Stop as the router does."""
+        self._library.rehearsal_end(self._address)
+
+    def records(self) -> Iterator[Record]:
+        """What became of it since the last call. Raises MemoryError."""
+        size = ctypes.c_size_t()
+        address = self._library.rehearsal_records(self._address, ctypes.byref(size))
+        if size.value and not address:
+            raise MemoryError("there is no room for what becomes of messages")
+        records = memoryview(ctypes.string_at(address, size.value) if address else b"")
+        at = 0
+        while at < len(records):
+            length, kind = _HEAD.unpack_from(records, at)
+            yield self._record(kind, records[at : at + length])
+            at += length
+
+    def _record(self, kind: int, record: memoryview) -> Record:
+        if kind == _TIME:
+            return Time(_TIME_RECORD.unpack(record)[2])
+        if kind == _COUNTED:
+            _, _, amount, counter, _ = _COUNTED_RECORD.unpack(record)
+            return Counted(counter, amount)
+        if kind in {_SENT, _BRAKED, _PUBLISHED}:
+            _, _, target, length = _LEFT_RECORD.unpack_from(record)
+            return Left(self._names.name(target), bytes(record[_LEFT_RECORD.size : _LEFT_RECORD.size + length]))
+        return self._reader.read(kind, record)
+
+    @property
+    def _in_use(self) -> _Running:
+        assert self._running is not None  # noqa: S101 - a program was adopted
+        return self._running
+
+    def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
+        return why_rejected(self._in_use.program, listener, data, length)
+
+    def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
+        """Nothing for what was held since an earlier program."""
+        is_current = generation == self._generation
+        return where_refused(self._in_use.program.lowered, route, topic, target, place) if is_current else ""
+
+    # programs
+
+    def _opened_for(self, program: Program, state: State) -> _Running:
+        senders = {each.name: self._sender(each, state) for each in program.senders}
+        deadmen = {plan.route: self._deadman(plan, program, senders, state) for plan in program.deadmen}
+
+        def feeds(route: str, names: Sequence[str]) -> Sequence[tuple[int, bool]]:
+            return [(deadmen[name].address, name != route) for name in names]
+
+        def limit(handler: Handler, target: TargetPlan) -> c.Limit:
+            assert target.max_rate is not None  # noqa: S101 - asked for by the caller
+            return state.keep(("limit", handler.route, handler.topic, target), partial(open_limit, target.max_rate))
+
+        def parts(handler: Handler) -> Sequence[PartTargets]:
+            topics = [target for target in handler.targets if target.is_topic]
+            part = PartTargets(self._ring.address, topics, is_always_wanted=False, is_native=True)
+            return [part] if topics else []
+
+        publications = {
+            plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
+            for plan in program.publishers
+        }
+        bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
+        deferrals = Deferrals(self._library, state, senders, publications, bandwidths)
+        pacers = [pacer for endpoint in bandwidths if (pacer := deferrals.pacer(endpoint))]
+        outlets = Outlets(
+            listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
+            senders={name: sender.address for name, sender in senders.items()},
+            publications=publications,
+            feeds=feeds,
+            limit=limit,
+            deferral=deferrals.deferral,
+            carried=lambda handler: [target for target in handler.targets if not target.is_topic],
+            parts=parts,
+            names=self._names,
+            boards=NativeBoards(program.boards),
+        )
+        native = native_program(program, self._generation, outlets)
+        from_ros = native_from_ros(program, self._generation, outlets)
+        native.arrays += [senders, deadmen, outlets, pacers]
+        adopted = [*(Adoption(pacer.address) for pacer in pacers), *native.adopted, *from_ros.adopted]
+        return _Running(program, native, from_ros, deadmen, adopted)
+
+    def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
+        return state.keep(("sender", endpoint.name, endpoint.address.value), lambda: _Sender(self._opened))
+
+    def _deadman(
+        self, plan: DeadmanPlan, program: Program, senders: Mapping[str, _Sender], state: State
+    ) -> NativeDeadman:
+        fed = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
+
+        def deadman() -> NativeDeadman:
+            group, outlets = self._opened.timers, {name: {"sender": sender.address} for name, sender in fed.items()}
+            address = open_deadman(self._library, group, self._names, program.counters, plan, outlets)
+            return NativeDeadman(self._library, group, address, plan, fed)
+
+        return state.keep(("deadman", plan, tuple(fed.values())), deadman)
+
+
+class _Opened:
+    """The stage in C. It stays open as long as anything of it is."""
+
+    def __init__(self, library: ctypes.CDLL, ring: Ring, now: int) -> None:
+        self.library = library
+        self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
+        self._ring = ring
+        self.address: int = library.rehearsal_open(self.counters, ring.address, now)
+        if not self.address:
+            raise MemoryError("the stage cannot be opened")
+        self.timers: int = library.rehearsal_timers(self.address)
+
+    def __del__(self) -> None:
+        if self.address:
+            self.library.rehearsal_close(self.address)
+
+
+class _Sender:
+    """A sender without a socket."""
+
+    def __init__(self, opened: _Opened) -> None:
+        self._opened = opened
+        self.address = int(opened.library.sender_open(-1, -1, 0, 0) or 0)
+        if not self.address:
+            raise MemoryError("a sender of the stage cannot be opened")
+
+    def __del__(self) -> None:
+        if self.address:
+            self._opened.library.sender_close(self.address)
+
+
+class _Listener:
+    """A listener without a socket, as `net.udp.Listener`."""
+
+    is_inherited = False
+    socket = SimpleNamespace(fileno=lambda: -1)
+
+
+class _Publication:
+    """A topic that somebody subscribes to, as `ros.endpoints.Publication`."""
+
+    def __init__(self) -> None:
+        self.address = 0
+        self.wanted = (ctypes.c_uint8 * 1)(1)
+
+
+class _Running:
+    """A program as the stage executes it. Listeners and topics have numbers, which are indexes of its arrays."""
+
+    def __init__(
+        self,
+        program: Program,
+        native: NativeProgram,
+        from_ros: NativeFromRos,
+        deadmen: Mapping[str, NativeDeadman],
+        adopted: Sequence[Adoption],
+    ) -> None:
+        self.program, self.native, self.deadmen, self.adopted = program, native, deadmen, adopted
+        self.listeners = {plan.name: number for number, plan in enumerate(program.listeners)}
+        self.topic_numbers = {topic: number for number, topic in enumerate(from_ros.topics)}
+        routes = from_ros.topics.values()
+        self.topics = (c.RosTopic * len(routes))(*(c.RosTopic(routes=each, route_count=len(each)) for each in routes))
+        self._from_ros = from_ros
+
+    def timer_change(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
+        """What timers are to do that hold messages back, for topics or for endpoints; `ended` end as well."""
+        adopted = [each for each in self.adopted if each.is_topic is of_topics]
+        kept = {each.timer for each in adopted}
+        before = [each.timer for each in earlier.adopted if each.is_topic is of_topics] if earlier else []
+        # A deferral ends before its pacer, which was adopted before it.
+        return timer_change(adopted, [*(each for each in reversed(before) if each not in kept), *ended])
+
+
+def _number(host: str) -> int:
+    return int.from_bytes(socket.inet_aton(host), "big")
