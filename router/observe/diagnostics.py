@@ -67,7 +67,7 @@ class Diagnostics:
         has_failed = False
         while not self._stopping.wait(PERIOD):
             try:
-                report = Report(self._health.latest)
+                report = Report(self._health.look())
                 self._publish(diagnostic_array(wall_ns(), self._node, report.statuses()))
             except Exception as error:  # noqa: BLE001 routing goes on without diagnostics
                 if not has_failed:

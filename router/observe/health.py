@@ -12,7 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from router.compiler.metrics import INTENDED_REASONS
@@ -324,9 +324,10 @@ class Look:
 
     def _waiting(self) -> Iterator[Problem]:
         """In a publish call, or for a thread."""
-        counts = [snapshot.counts(Kind.PUBLISH_STALLED.metric) for snapshot in self.snapshots]
-        for topic, seconds in counts[-1].items():
-            stalled = max(seconds, sum(min(each.get(topic, 0.0), PERIOD) for each in counts))
+        stalls = [(each.at, each.counts(Kind.PUBLISH_STALLED.metric)) for each in self.snapshots]
+        for topic, seconds in stalls[-1][1].items():
+            between = (min(counts.get(topic, 0.0), at - before) for (before, _), (at, counts) in pairwise(stalls))
+            stalled = max(seconds, sum(between))
             if stalled > Kind.PUBLISH_STALLED.threshold:
                 yield self._problem(Kind.PUBLISH_STALLED, {"topic": topic[0]}, f" for {age_text(stalled)}")
         counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]

@@ -109,7 +109,7 @@ class Responder:
             "/": lambda _: self._page,
             "/status.json": lambda _: self._cache.get("status", self._numbers),
             "/map.json": lambda _: self._map(),
-            "/health.json": lambda _: _json(HTTPStatus.OK, self._status.health()),
+            "/health.json": lambda _: self._cache.get("health", lambda: _json(HTTPStatus.OK, self._status.health())),
             "/healthz": lambda _: self._healthz(),
             "/ready": lambda _: self._ready(),
         }

@@ -72,13 +72,13 @@ class Status:
             "table": table.path.name,
             "ready": running.is_ready,
             **numbers(snapshot(running.collect(), wall_ns() / 1e9)),
-            "problems": [problem.json() for problem in self._health.latest.problems],
+            "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }
 
     def health(self) -> Json:
         """What is wrong. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
-        look = self._health.latest
+        look = self._health.look()
         return {
             "table": look.program.table.sha256,
             "received": look.now.total("datagrams_received"),

@@ -1,4 +1,4 @@
-"""A thread that looks at a running router once a second, so that anybody who asks is told what is wrong."""
+"""Looks at a running router once a second, so that whoever asks is told what was lost in the last seconds."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ class Watch:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._snapshots: deque[Snapshot] = deque(maxlen=int(WINDOW / PERIOD) + 1)
+        self._snapshots: deque[Snapshot] = deque(maxlen=int(WINDOW / PERIOD))
         self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
     def look(self, now: int, wall: int) -> Look:
-        """Look at it at `now`, of the boot clock, and `wall`, in ns."""
+        """Look at it at `now`, of the boot clock, and `wall`, in ns. One snapshot in PERIOD is kept for later looks."""
         with self._lock:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
             earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
             seen = {name: self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
-            self._snapshots.append(latest)
-            snapshots = tuple(self._snapshots)
+            snapshots = (*self._snapshots, latest)
+            if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
+                self._snapshots.append(latest)
         silence = {name: (now - then) / 1e9 for name, then in seen.items()}
         return Look(program, snapshots, silence, self.standing(now))
 
@@ -63,11 +64,10 @@ class Watch:
 
 
 class Health:
-    """Looks once in PERIOD until it is closed."""
+    """Thread-safe. A thread looks once in PERIOD until it is closed."""
 
     def __init__(self, running: Running) -> None:
         self._watch = Watch(running)
-        self.latest = self._look()
         self._stopping = threading.Event()
         self._thread = Thread(self._run, "health")
         with background_threads():
@@ -82,15 +82,15 @@ class Health:
         self._stopping.set()
         join_or_leave(self._thread)
 
-    def _look(self) -> Look:
+    def look(self) -> Look:
         return self._watch.look(boottime_ns(), wall_ns())
 
     def _run(self) -> None:
         has_failed = False
         while not self._stopping.wait(PERIOD):
             try:
-                self.latest = self._look()
-            except Exception as error:  # noqa: BLE001 routing goes on; what is shown is old
+                self.look()
+            except Exception as error:  # noqa: BLE001 routing goes on without health
                 if not has_failed:
                     logger.error("the router's health cannot be determined", problem=repr(error))
                 has_failed = True

@@ -22,6 +22,6 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Program:
 @pytest.fixture
 def router(counted: Program) -> Counting:
     """It has been looked at once."""
-    counting = Counting(counted, counted.counters.fresh_counts())
+    counting = Counting(counted)
     counting.look(0)
     return counting

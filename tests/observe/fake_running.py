@@ -52,9 +52,11 @@ class FakeRunning:
         self.counts = program.counters.fresh_counts()
         self._turns = 0
 
-    def count(self, metric: str, *labels: str, to: int) -> None:
+    def count(self, metric: str, *labels: str, to: float) -> None:
         """Times are in ns, as in the counters."""
-        self.counts[self.program.counters.index(metric, *labels)] = to
+        index = self.program.counters.index(metric, *labels)
+        self.program.counters.grow(self.counts)
+        self.counts[index] = to  # type: ignore[call-overload]  # what is asked for may be no integer
 
     def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
         """`reason`: why no route takes it."""
@@ -92,8 +94,7 @@ class FakeHealth:
     def is_stuck(self) -> bool:
         return self._running.is_stuck
 
-    @property
-    def latest(self) -> Look:
+    def look(self) -> Look:
         look = self._look(now := wall_ns())
         seen = {name: int(stamp * 1e9) for (name,), stamp in look.now.counts(LAST_SEEN).items()}
         silence = {name: (now - (seen.get(name) or self._began)) / 1e9 for name in look.silence}

@@ -94,14 +94,14 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
 def test_a_problem_is_told_where_it_belongs(
     router: Counting, series: str, name: str, level: Level, message: str
 ) -> None:
-    router.add(9, *series.split())
+    router.count(*series.split(), to=9)
     status = reported(router, 1)[name]
     assert (status.level, message in status.message) == (level, True), status.message
 
 
 def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Counting) -> None:
-    router.set_to(1, "deadman_active", "manual_drive")
-    router.add(3, "deadman_send_errors", "manual_drive", "driving_board")
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("deadman_send_errors", "manual_drive", "driving_board", to=3)
     status = reported(router, 6)["route/manual_drive"]
     assert status.level == Level.ERROR
     assert status.message == (
@@ -112,12 +112,13 @@ def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Count
 
 
 def test_every_problem_is_told_somewhere(router: Counting) -> None:
-    router.stalled = {"imu_data": 7.0}
-    router.kernel_drops, router.is_waiting, router.is_stuck = 2, True, True
-    router.set_to(0, "config_last_reload_successful")
-    router.add(9, "unhandled", "arm_diag")
-    router.add(30, "messages_waiting", "imu_info", "imu_data")
-    router.add(1, "qos_incompatible", "imu_info", "imu_data", "reliability")
+    router.is_stuck = True
+    for series in ("publish_stalled_seconds imu_data", "kernel_drops rover", "listener_waiting rover"):
+        router.count(*series.split(), to=7)
+    router.count("config_last_reload_successful", to=0)
+    router.count("unhandled", "arm_diag", to=9)
+    router.count("messages_waiting", "imu_info", "imu_data", to=30)
+    router.count("qos_incompatible", "imu_info", "imu_data", "reliability", to=1)
     look = router.look(6)
     messages = " ".join(status.message for status in Report(look).statuses())
     assert len(look.problems) > 8
@@ -126,7 +127,7 @@ def test_every_problem_is_told_somewhere(router: Counting) -> None:
 
 def test_numbers_are_told_with_their_reasons(router: Counting) -> None:
     for route in ("imu_info", "gps_info"):
-        router.add(2, "messages_dropped", route, "basestation", "send_error")
+        router.count("messages_dropped", route, "basestation", "send_error", to=2)
     told = reported(router, 1)
     assert ("dropped: send_error", "4") in told["endpoint/basestation"].values
     assert ("dropped for basestation: send_error", "2") in told["route/imu_info"].values
@@ -134,7 +135,7 @@ def test_numbers_are_told_with_their_reasons(router: Counting) -> None:
 
 def test_rates_are_of_the_last_seconds(router: Counting) -> None:
     router.look(3)
-    router.add(10, "messages_received", "imu_info", "sensor_board")
+    router.count("messages_received", "imu_info", "sensor_board", to=10)
     assert ("received per second", "2.0") in reported(router, 2)["route/imu_info"].values
 
 
@@ -181,7 +182,7 @@ class Looked:
     """Health, as far as it is read."""
 
     def __init__(self, router: Counting) -> None:
-        self.latest = router.look(1)
+        self.look = lambda: router.look(1)
 
 
 def published(router: Counting, monkeypatch: pytest.MonkeyPatch, publish: Callable[[bytes], None]) -> Diagnostics:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import threading
-from typing import cast
 
 import pytest
 
 from router.compiler import metrics
 from router.observe import watch
 from router.observe.health import PAGE, PERIOD, REMEDIES, WINDOW, Kind, Level, Problem
-from router.observe.running import Running
 from router.observe.watch import Health
+from tests.acceptance.site import wait_until
 from tests.observe.counting import SECOND, Counting
+
+STALLED = Kind.PUBLISH_STALLED.metric
 
 
 def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting) -> None:
@@ -64,14 +65,16 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
 def test_what_is_counted_is_a_problem_unless_the_table_asks_for_it(
     router: Counting, series: str, value: int, told: str | None
 ) -> None:
-    router.set_to(value, *series.split())
+    router.count(*series.split(), to=value)
     problems = router.look(2).problems
     assert [problem.text for problem in problems] == ([told] if told else [])
     assert all(problem.remedy and problem.page == f"{PAGE}#{problem.kind.alert.lower()}" for problem in problems)
 
 
 def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
-    router.kernel_drops, router.is_waiting, router.is_stuck = 2, True, True
+    router.count("kernel_drops", "rover", to=2)
+    router.count("listener_waiting", "rover", to=1)
+    router.is_stuck = True
     router.look(0)
     assert router.told(2.5) == [
         "the receive thread is stuck for 2.5 s",
@@ -88,25 +91,33 @@ def test_a_thread_that_makes_progress_at_times_is_not_stuck(router: Counting) ->
 
 
 def test_a_loss_is_a_problem_for_as_long_as_anybody_may_need_to_look(router: Counting) -> None:
-    router.add(7, "messages_dropped", "imu_info", "imu/mag", "mapping_error")
+    router.count("messages_dropped", "imu_info", "imu/mag", "mapping_error", to=7)
     for _ in range(int(WINDOW / PERIOD)):
         told = "; ".join(router.told(1))
         assert "messages for imu/mag are dropped: mapping_error, 7 of imu_info in " in told
     assert "mapping_error" not in "; ".join(router.told(1))
 
 
+def test_who_looks_often_does_not_shorten_the_time(router: Counting) -> None:
+    router.count("kernel_drops", "rover", to=9)
+    told = [router.told(0.1) for _ in range(100)]
+    assert "the kernel drops datagrams of rover, 9 in 10 s" in told[-1]
+    router.count(STALLED, "imu_data", to=0.6)
+    assert not any("stuck" in text for _ in range(5) for text in router.told(0.1))
+
+
 def test_losses_of_many_routes_are_one_problem_which_names_those_with_most(router: Counting) -> None:
     for count, route in enumerate(("imu_info", "gps_info", "ph_info", "pump_info", "arm_diag"), 1):
-        router.add(count, "messages_dropped", route, "basestation", "send_error")
+        router.count("messages_dropped", route, "basestation", "send_error", to=count)
     [problem] = router.look(1).problems
     assert problem.text.endswith(", 15 of arm_diag, pump_info, ph_info and 2 more routes in 1 s")
     assert set(problem.routes) == {"imu_info", "gps_info", "ph_info", "pump_info", "arm_diag"}
 
 
 def test_messages_that_wait_at_all_times_are_a_problem(router: Counting) -> None:
-    router.set_to(30, "messages_waiting", "imu_info", "imu_data")
+    router.count("messages_waiting", "imu_info", "imu_data", to=30)
     assert router.told(1) == []  # they may just have come
-    router.set_to(25, "messages_waiting", "imu_info", "imu_data")
+    router.count("messages_waiting", "imu_info", "imu_data", to=25)
     for _ in range(int(WINDOW / PERIOD)):
         router.hear("sensor_board")
         told = router.told(1)
@@ -114,14 +125,18 @@ def test_messages_that_wait_at_all_times_are_a_problem(router: Counting) -> None
 
 
 def test_a_publisher_is_stuck_in_one_call_or_in_many_until_it_goes_on(router: Counting) -> None:
-    router.stalled = {"imu_data": 0.9, "imu/mag": 0.9}
+    router.count(STALLED, "imu_data", to=0.9)
+    router.count(STALLED, "imu/mag", to=0.9)
     assert router.told(1) == []
-    router.stalled = {"imu_data": 61.9, "imu/mag": 0.0}
+    router.count(STALLED, "imu_data", to=61.9)
+    router.count(STALLED, "imu/mag", to=0.0)
     assert router.told(1) == ["publishing on imu_data is stuck in the ROS middleware for 62 s"]
-    router.stalled = {"imu_data": 0.0, "imu/mag": 0.6}
+    router.count(STALLED, "imu_data", to=0.0)
+    router.count(STALLED, "imu/mag", to=0.6)
     [_, other] = router.told(1)
     assert other == "publishing on imu/mag is stuck in the ROS middleware for 1.5 s"
-    router.stalled = {"imu_data": 0.0, "imu/mag": 0.0}
+    router.count(STALLED, "imu_data", to=0.0)
+    router.count(STALLED, "imu/mag", to=0.0)
     told = [[text for text in router.told(1) if "stuck" in text] for _ in range(int(WINDOW / PERIOD) + 1)]
     assert (told[0] != [], told[-1]) == (True, [])
 
@@ -153,7 +168,7 @@ def test_where_all_are_silent_it_is_the_network(router: Counting) -> None:
 def test_who_is_silent_while_a_deadman_acts_comes_before_others_that_are(router: Counting) -> None:
     router.hear("sensor_board")
     router.hear("basestation")
-    router.set_to(1, "deadman_active", "manual_drive")
+    router.count("deadman_active", "manual_drive", to=1)
     first, second, *_ = router.told(10)
     assert (first, second) == ("basestation is silent for 10 s", "sensor_board is silent for 10 s")
 
@@ -172,9 +187,9 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
 
 def test_what_explains_other_problems_comes_first(router: Counting) -> None:
     router.hear("basestation")
-    router.set_to(1, "deadman_active", "manual_drive")
-    router.add(3, "deadman_send_errors", "manual_drive", "driving_board")
-    router.add(3, "messages_dropped", "imu_info", "basestation", "stale")
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("deadman_send_errors", "manual_drive", "driving_board", to=3)
+    router.count("messages_dropped", "imu_info", "basestation", "stale", to=3)
     kinds = [problem.kind for problem in router.look(6).problems if problem.kind is not Kind.ENDPOINT_NEVER_HEARD]
     assert kinds == [Kind.DEADMAN_CANNOT_SEND, Kind.ENDPOINT_SILENT, Kind.DEADMAN_ACTIVE, Kind.MESSAGES_DROPPED]
 
@@ -198,24 +213,21 @@ def test_remedies_are_of_reasons_that_there_are() -> None:
 
 def test_it_looks_until_it_is_closed(router: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "PERIOD", 0.01)
-    health = Health(cast("Running", router))
-    assert health.latest.problems == ()
-    router.set_to(0, "config_last_reload_successful")
-    deadline = threading.Event()
-    while not health.latest.problems and not deadline.wait(0.01):
-        pass
+    health, looks = Health(router), router.collected
+    wait_until(lambda: router.collected > looks + 1, "the second look")
+    router.count("kernel_drops", "rover", to=9)
+    assert [problem.kind for problem in health.look().problems] == [Kind.KERNEL_DROPS]
     health.close()
-    last = health.latest
-    router.set_to(1, "config_last_reload_successful")
-    assert not deadline.wait(0.05)
-    assert health.latest is last
+    looks = router.collected
+    assert not threading.Event().wait(0.05)
+    assert router.collected == looks
 
 
 def test_what_fails_is_logged_once_and_tried_again(
     router: Counting, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(watch, "PERIOD", 0.01)
-    health = Health(cast("Running", router))
+    health = Health(router)
     tries, enough = iter(range(100_000)), threading.Event()
 
     def collect() -> None:

@@ -103,7 +103,10 @@ def test_health_is_that_the_receive_thread_gets_further(server: HttpServer, runn
     assert (stuck.status, stuck.text) == (503, "the receive thread is stuck\n")
 
 
-def test_what_is_wrong_is_told_in_words_and_for_programs(server: HttpServer, running: FakeRunning) -> None:
+def test_what_is_wrong_is_told_in_words_and_for_programs(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(responses, "KEPT_SECONDS", 0)
     running.count("config_last_reload_successful", to=1)
     running.count("datagrams_received", "rover", to=7)
     sound = ask(server, "/health.json").json
