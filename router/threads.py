@@ -1,4 +1,4 @@
-"""Threads that never delay the end of the process; wake-up events, pauses, and stops with deadlines."""
+"""Threads that never delay the end of the process; wake-up events, and stops with deadlines."""
 
 from __future__ import annotations
 
@@ -21,10 +21,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _LONGEST_WAIT_MS = 3_600_000
-
-PAUSE_TIMEOUT_S = 1.0
-"""Seconds within which a thread has to pause. No datagram is routed meanwhile, and the watchdog is not fed."""
-
 
 START_S = 2.0
 """Seconds within which a started thread has to run."""
@@ -287,25 +283,4 @@ class _Steps:
 
 
 class StuckError(RuntimeError):
-    """A thread did not pause in time, and nothing was changed."""
-
-
-@contextmanager
-def paused(submit: Callable[[Callable[[], None]], None]) -> Iterator[None]:
-    """Pause a thread between two iterations of its loop, to change what it uses. Raises StuckError after a timeout.
-
-    `submit(task)` makes the thread call `task` between two iterations, and returns at once.
-    """
-    has_paused, resume = threading.Event(), threading.Event()
-
-    def pause() -> None:
-        has_paused.set()
-        resume.wait()
-
-    try:
-        submit(pause)
-        if not has_paused.wait(PAUSE_TIMEOUT_S):
-            raise StuckError("a thread of the router is stuck, or has too much to do: try again")
-        yield
-    finally:
-        resume.set()
+    """A thread did not answer in time, and nothing was changed."""

@@ -14,9 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from router.app.timers import TimerThread
-from router.clock import boottime_ns, monotonic_ns
-from router.engine.timers import Timer
+from router.clock import monotonic_ns
 from router.log import logger
 from router.net.udp import inherited
 
@@ -33,27 +31,21 @@ _REMEDY = "ListenDatagram= in rover-router.socket says something else than the t
 
 
 @contextmanager
-def supervised(progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda *_: False) -> Iterator[None]:
+def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[None]:
     """Notify that the router is ready inside, and stops at the end.
 
-    The service manager's watchdog is fed while `progress()` changes, which it has to do at least every half second. If
-    the router is stuck, it ends it with SIGABRT, and the log shows where each thread stood. `feed(socket, interval)`
-    has it fed by native threads instead, every `interval` ns, or returns False.
+    `feed(socket, interval)` has native threads feed the service manager's watchdog every `interval` ns, while they make
+    progress; a socket of -1 ends that. If the router is stuck, the service manager ends it with SIGABRT, and the log
+    shows where each thread stood.
     """
     for address in inherited().unclaimed():
         logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
         notify("READY=1")
-        if (limit := _watchdog_ns()) is not None:
+        if (limit := _watchdog_ns()) is not None and (notifying := _notify_socket()) is not None:
             faulthandler.enable()
-            notifying = _notify_socket()
-            if notifying is None or not feed(ending.enter_context(notifying).fileno(), limit // _CHECKS):
-                thread = TimerThread("watchdog", _log_fault)
-                thread.add(Watchdog(progress, limit // _CHECKS, boottime_ns()))
-                thread.start()
-                ending.callback(thread.stop)
-            else:
-                ending.callback(feed, -1, 0)
+            feed(ending.enter_context(notifying).fileno(), limit // _CHECKS)
+            ending.callback(feed, -1, 0)
         ending.callback(notify, "STOPPING=1", "WATCHDOG=1")  # the service manager's stop timeout starts here
         yield
 
@@ -66,25 +58,6 @@ def reloading() -> Iterator[None]:
         yield
     finally:
         notify("READY=1")
-
-
-class Watchdog(Timer):
-    """Feeds the watchdog every `interval` ns, if `progress()` has changed since."""
-
-    def __init__(self, progress: Callable[[], int], interval: int, now: int) -> None:
-        self.next_due: int | None = now + interval
-        self._progress = progress
-        self._interval = interval
-        self._seen: int | None = None
-
-    def due(self, now: int) -> None:
-        self.next_due = now + self._interval
-        if (reached := self._progress()) != self._seen:
-            self._seen = reached
-            notify("WATCHDOG=1")
-
-    def end(self, now: int) -> None:
-        self.next_due = None
 
 
 def notify(*lines: str) -> None:
@@ -119,10 +92,6 @@ def _watchdog_ns() -> int | None:
     microseconds = os.environ.get("WATCHDOG_USEC", "")
     is_ours = os.environ.get("WATCHDOG_PID") in (None, str(os.getpid()))
     return int(microseconds) * 1000 if is_ours and microseconds.isdecimal() and int(microseconds) else None
-
-
-def _log_fault(error: Exception) -> None:
-    logger.error("the watchdog cannot be fed", error=str(error))
 
 
 def tune_interpreter() -> None:

@@ -16,18 +16,23 @@ from router.errors import StartError
 class Carrier:
     """Receives datagrams and executes programs, in native threads that never wait for Python.
 
-    `counters` is the array of the receive thread, which writes losses and rejections to `events`. Deadmen are served
-    when they are due.
+    `counters` is the array of the receive thread, which writes losses and rejections to `events`, and what topics get
+    to `published`. Deadmen are served when they are due.
     """
 
     def __init__(
-        self, library: ctypes.CDLL, deadmen: int, counters: ctypes.Array[ctypes.c_int64], events: Ring
+        self,
+        library: ctypes.CDLL,
+        deadmen: int,
+        counters: ctypes.Array[ctypes.c_int64],
+        events: Ring,
+        published: Ring,
     ) -> None:
         """Raises MemoryError."""
         self._library = library
-        self._counters, self._events = counters, events
+        self._counters, self._keep = counters, (events, published)
         self._in_use = Lock()  # for those who may call while the carrier is closed
-        self._carrier: int = library.carrier_open(deadmen, counters, events.address)
+        self._carrier: int = library.carrier_open(deadmen, counters, events.address, published.address)
         self._running: tuple[object, ...] = ()
         if not self._carrier:
             raise MemoryError("the carrier cannot be opened")
@@ -54,28 +59,19 @@ class Carrier:
             raise StartError(f"the carrier's threads cannot be started: {os.strerror(error)}")
         self._running = program, change
 
-    def change(
-        self, program: NativeProgram, replaced: Sequence[tuple[int, int]], ended: Sequence[int], *, holds: bool
-    ) -> None:
-        """Execute another program from the next datagram on.
+    def change(self, program: NativeProgram, replaced: Sequence[tuple[int, int]]) -> None:
+        """Execute another program from the next datagram on. Listeners that it does not have are emptied before.
 
-        `replaced` has deadmen with those that they take over from, `ended` those that no deadman replaces. With
-        `holds`, nothing is received until `resume` is called, or for a second.
+        `replaced` has deadmen with those that they take over from.
         """
         pairs = [deadman for pair in replaced for deadman in pair]
         change = c.Change(
             program=ctypes.pointer(program.structure),
             replaced=(ctypes.c_void_p * len(pairs))(*pairs),
-            ended=(ctypes.c_void_p * len(ended))(*ended),
             replaced_count=len(replaced),
-            ended_count=len(ended),
-            holds=holds,
         )
         self._library.carrier_change(self._carrier, ctypes.byref(change))
         self._running = program, change
-
-    def resume(self) -> None:
-        self._library.carrier_resume(self._carrier)
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
         """Write what is received to `ring` from now on. `lost` is the counter of what had no room there.

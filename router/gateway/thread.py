@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import boottime_ns, wall_ns
-from router.compiler.metrics import Counters
+from router.compiler.metrics import Counters, Report
 from router.compiler.program import GatewayPlan, Program
-from router.engine import Report
 from router.engine.deadman import FeedMaker
 from router.errors import StartError
 from router.gateway.clients import ClientQueue

@@ -15,7 +15,8 @@ from google.protobuf.message import Message
 
 from router.clock import wall_ns
 from router.compiler.network import recognisers
-from router.engine.dispatch import Peer, Receive
+from router.datagrams import Peer
+from router.engine.dispatch import Receive
 from router.table.model import Framing, RouteTable
 from router.threads import Thread, join_or_leave
 from router.types.framing import MAX_DATAGRAM, restored

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from router.compiler.metrics import Series
+from router.compiler.metrics import Report, Series
 from router.compiler.program import Program
+from router.datagrams import Peer
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
-from router.engine.delivery import Report
-from router.engine.dispatch import Peer
 from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import P, R, Timer

@@ -10,8 +10,8 @@ from typing import Any
 from google.protobuf.message import Message
 
 from router.compiler.program import DeadmanPlan
+from router.datagrams import Decoded, Wire
 from router.engine.collecting import Collector, PartOutcome
-from router.engine.wire import Decoded, Wire
 from router.errors import DecodeError, MappingError
 from router.table.model import EndpointKind, Priority, RouteTable
 from router.types.model import MessageType

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import signal
 import socket
 import struct
@@ -15,11 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
-if os.environ.get("ROUTER_CARRIER") == "python":
-    pytest.skip("is about the carrier", allow_module_level=True)
 
-from router.app import Router
-from router.app.native_datapath import NativeWiring
 from router.carrier.from_ros import FromRosThread
 from router.threads import StuckError
 from tests.app.conftest import BRAKE, Site
@@ -43,7 +38,7 @@ def drive(
 """
 
 
-IN_PYTHON = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
+HELD = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
 CALCULATED = drive(
     fields='{distance_to_go: "float32(round(clamp(100 * distance_to_go, -700, 700)) // 100)"}',
     more=", when: turning_radius > 0.5",
@@ -65,12 +60,6 @@ def numbers(site: Site, until: int) -> list[int]:
     return got
 
 
-def is_carried(router: Router) -> bool:
-    wiring = router._runtime.wiring
-    assert isinstance(wiring, NativeWiring)
-    return "drive_motor" not in wiring.take
-
-
 def thread_names() -> list[str]:
     return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
 
@@ -86,7 +75,6 @@ def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher
     python, process = ctypes.PyDLL(None), publisher.process  # calls through PyDLL keep the interpreter lock
     buffer, at_start = ctypes.create_string_buffer(1000), len(BRAKE)
     with site.router(table) as router:
-        assert is_carried(router)
         assert "ros commands" in thread_names()
         assert publisher.line() == "matched"
         assert len(site.basestation.recv(1000)) == at_start
@@ -107,10 +95,10 @@ def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher
 def test_commands_stay_whole_and_in_order_while_tables_change(site: Site, publisher: Publisher) -> None:
     tables = [
         drive(),
-        IN_PYTHON,
+        HELD,
         drive(more=", max_rate: 1000000 Hz"),
         drive(timeout="40s"),
-        IN_PYTHON.replace("30s", "20s"),
+        HELD.replace("30s", "20s"),
         drive(),
     ]
     with site.router(drive()) as router:
@@ -122,7 +110,6 @@ def test_commands_stay_whole_and_in_order_while_tables_change(site: Site, publis
             site.write(table)
             result = router.reload()
             assert result.ok, result
-            assert is_carried(router) == ("latest" not in table)
         assert numbers(site, sent) == list(range(1, sent + 1))
         wait_until(lambda: router.total("datagrams_sent") == sent)
         assert router.total("messages_received") == sent
@@ -134,7 +121,7 @@ def test_none_is_lost_where_another_subscription_takes_over(site: Site, publishe
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
         sent = 0
-        for table in (drive(depth=900), IN_PYTHON, drive(depth=900), drive(depth=800)):
+        for table in (drive(depth=900), HELD, drive(depth=900), drive(depth=800)):
             publisher.publish(map(command, range(sent + 1, sent + COUNT + 1)))
             sent += COUNT
             site.write(table)
@@ -172,15 +159,13 @@ def test_a_reload_is_refused_while_the_middleware_holds_the_thread(
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
         monkeypatch.setattr(FromRosThread, "serve", stuck_once)
-        site.write(IN_PYTHON)
+        site.write(HELD)
         result = router.reload()
         assert not result.ok
         assert result.text.endswith("try again")
-        assert is_carried(router)
         publisher.publish([command(1)])
         assert numbers(site, 1) == [1]
         assert router.reload().ok
-        assert not is_carried(router)
 
 
 def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(

@@ -146,8 +146,6 @@ class Commanding:
             publications={},
             feeds=lambda route, names: [(self.by_route[name].address, name != route) for name in names],
             limit=self._limit,
-            carried=lambda _: (),
-            parts=lambda _: (),
             names=self.names,
             boards=NativeBoards(program.boards),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from ctypes import c_int64, c_void_p
 from struct import Struct
@@ -12,12 +12,11 @@ from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router.app.parts import Part, divided
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
 from router.carrier.limits import open_limit
-from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
@@ -74,7 +73,7 @@ class Publishing:
         self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
         self._peer = stack.enter_context(_bound())
         self._limits: dict[object, c.Limit] = {}
-        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16))
+        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
         self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
         self.thread = PublishThread(library, self._ring, self._published, self._events, cast("Any", addresses))
@@ -92,7 +91,7 @@ class Publishing:
     def change(self, generation: int, program: Program | None = None) -> None:
         """Receive with another program from now on; the thread goes on to it."""
         self._programs.append(self._made(program or self.program, generation))
-        self._carrier.change(self._programs[-1], (), (), holds=False)
+        self._carrier.change(self._programs[-1], ())
         self.thread.advance(generation)
 
     def stop_receiving(self) -> None:
@@ -132,13 +131,6 @@ class Publishing:
         return (self._names.name(stalled[0]), stalled[1]) if stalled else None
 
     def _made(self, program: Program, generation: int) -> NativeProgram:
-        parts = divided(program, publishes=True)
-        assert not any(parts[part] for part in Part if part is not Part.PUBLISHED)
-
-        def parts_of(handler: Handler) -> Sequence[PartTargets]:
-            targets = parts[Part.PUBLISHED].get(handler.route, ())
-            return [PartTargets(self._ring.address, targets, is_always_wanted=False, is_native=True)] if targets else ()
-
         listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         outlets = Outlets(
             listeners=cast("Any", listening),
@@ -146,8 +138,6 @@ class Publishing:
             publications=self.publishers,
             feeds=lambda _route, _names: (),
             limit=self._limit,
-            carried=lambda _: (),
-            parts=parts_of,
             names=self._names,
         )
         return native_program(program, generation, outlets)

@@ -97,8 +97,6 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
             publications={},
             feeds=lambda *_: [(deadman.address, False)],
             limit=lambda *_: pytest.fail("no target has one"),
-            carried=lambda _: (),
-            parts=lambda _: (),
             names=names,
         )
         (plan,) = made.subscriptions

@@ -17,9 +17,8 @@ from router.carrier.from_ros import NativeFromRos
 from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
-from tests.carrier.building import MEMORY, RACES, run_program
+from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
-from tests.carrier.whole import library as clocked_library
 from tests.engine.rig import Ledger, Rig, program
 
 ROUTES = """\

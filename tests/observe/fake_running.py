@@ -9,7 +9,7 @@ from prometheus_client.metrics_core import Metric as Family
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
 from router.recording.mirror import Classifier, Mirror

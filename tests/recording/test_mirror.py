@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from router.engine.dispatch import Peer, Receive
+from router.datagrams import Peer
+from router.engine.dispatch import Receive
 from router.recording.mirror import MOST_WAITING, Consumer, Mirror, Mirrored, MirroredDatagram
 
 PEER, STRANGER = ("127.0.0.2", 8), ("127.0.0.9", 8)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from router.compiler.program import DeadmanPlan
-from router.engine.wire import Decoded, Wire, wire_of_protos
+from router.datagrams import Decoded, Wire, wire_of_protos
 from router.table.model import RouteTable
 from router.tools.board import FRAME_TIMEOUT, Board, Change, Frames, State, Stop, boards, is_part
 from router.values import payload

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from router.engine.wire import Wire, framed, wire_of_protos
+from router.datagrams import Wire, framed, wire_of_protos
 from router.errors import DecodeError, UsageError
 from router.values import payload
 

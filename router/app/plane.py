@@ -1,0 +1,304 @@
+"""The native threads, and the program that they execute.
+
+`build` makes arrays of a compiled program and of what is open for it; `adopt` has each thread change to them between
+two messages. What a thread has received before, it serves by the earlier program. What a program keeps from one message
+to the next goes along by key.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from time import sleep
+
+from router.app.counts import ThreadCounts
+from router.app.from_ros import FromRos, RosTopics
+from router.app.publishing import Publishing
+from router.app.state import State
+from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
+from router.carrier.carrier import Carrier
+from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.events import EventThread
+from router.carrier.from_ros import Subscription, native_from_ros
+from router.carrier.limits import open_limit
+from router.carrier.mirror import MirrorRing
+from router.carrier.outlets import Names, Outlets, Publication
+from router.carrier.program import NativeProgram, native_program
+from router.carrier.ring import Ring
+from router.carrier.schema import CannotCarry
+from router.carrier.sender import NativeSender
+from router.clock import boottime_ns
+from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget
+from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
+from router.datagrams import why_rejected
+from router.errors import StartError
+from router.log import logger
+from router.net.udp import Listener
+from router.observe.reports import Reporter
+from router.recording.mirror import Mirror
+from router.table.model import Framing
+
+_PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
+"""Bytes that may wait: messages for topics, received datagrams for observers, and events of a thread."""
+
+_PATIENCE_S = 1.0
+"""How long a reload waits for a thread that may be stuck in the middleware."""
+
+_TURN_S = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """What is open for a program, and what it keeps. Publications and subscriptions are by topic."""
+
+    listeners: Mapping[str, Listener]
+    senders: Mapping[str, NativeSender]
+    publications: Mapping[str, Publication]
+    subscriptions: Mapping[str, Subscription]
+    state: State
+
+
+@dataclass(frozen=True, slots=True)
+class Built:
+    """A program as the threads execute it. `deadmen` are those of routes."""
+
+    program: Program
+    state: State
+    native: NativeProgram
+    topics: RosTopics
+    deadmen: Mapping[str, NativeDeadman]
+
+
+class Plane:
+    """Receives, forwards, publishes and brakes. `changed` is called with a route and whether its deadman is tripped."""
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        counts: ThreadCounts,
+        mirror: Mirror,
+        reporter: Reporter,
+        changed: Callable[[str, bool], None],
+    ) -> None:
+        self.now: Built | None = None
+        """What runs."""
+        self._library = library
+        self._counters = counts
+        self._names = Names()
+        self._generations = count(1)
+        self._is_running = self._has_stopped = False
+        braking, publishing, receiving, *from_ros = (ThreadCounts.fixed() for _ in range(5))
+        braked, published, received, *taken = (Ring(library, _EVENTS) for _ in range(5))
+        self._deadmen = Deadmen(library, braking, braked, self._names)
+        self._publishing = Publishing(library, Ring(library, _PUBLISHED), publishing, published, self._names)
+        self._carrier = Carrier(library, self._deadmen.address, receiving, received, self._publishing.ring)
+        self._from_ros = [
+            FromRos(library, self._deadmen.address, counted, events, is_urgent=is_urgent)
+            for is_urgent, counted, events in zip((True, False), from_ros, taken, strict=True)
+        ]
+        told = [
+            (braked, counts.add_fixed(braking)),
+            # Before those of the receive thread: what was published was received, so no less than 0 waits.
+            (published, counts.add_fixed(publishing, self._publishing.counters)),
+            (received, counts.add_fixed(receiving, self._carrier.counters)),
+        ]
+        for thread, counted, events in zip(self._from_ros, from_ros, taken, strict=True):
+            told.append((events, counts.add_fixed(counted, thread.counters)))
+        self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
+        mirror.drain_by(self._mirrored.take)
+        self._events = EventThread(
+            told, self._names, reporter.report, changed, self._why_rejected, self._where_refused, self._pulse
+        )
+
+    @property
+    def turns(self) -> int:
+        """A number that grows unless the receive thread is stuck, even if nothing comes."""
+        return self._carrier.turns
+
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher the publish thread is now, and for how many seconds."""
+        return self._publishing.stalled()
+
+    def _pulse(self) -> None:
+        self._carrier.pulse()
+        for thread in self._from_ros:
+            thread.report_failures()
+
+    # a program
+
+    def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
+        """Have deadmen send at the start of the router. That needs sockets only: ROS takes seconds to open."""
+        for plan in program.deadmen:
+            log_start(plan.route, self._deadman(plan, program, senders, state).start(boottime_ns()))
+
+    def build(self, program: Program, opened: Opened) -> Built:
+        """Make the arrays of a program. Raises StartError."""
+        deadmen = {plan.route: self._deadman(plan, program, opened.senders, opened.state) for plan in program.deadmen}
+        generation = next(self._generations)
+        if program.publishers:
+            self._publishing.open()
+        try:
+            outlets = Outlets(
+                listeners=opened.listeners,
+                senders={endpoint: sender.address for endpoint, sender in opened.senders.items()},
+                publications=opened.publications,
+                feeds=lambda route, names: [(deadmen[name].address, name != route) for name in names],
+                limit=partial(_limit, opened.state),
+                names=self._names,
+                boards=NativeBoards(program.boards),
+            )
+            native = native_program(program, generation, outlets)
+        except CannotCarry as error:
+            raise StartError(f"the carrier cannot take these messages: {error}") from error
+        messages = native_from_ros(program, generation, outlets)
+        for arrays in (native.arrays, messages.arrays):
+            arrays += [opened.senders, deadmen]
+        for thread in self._from_ros:
+            thread.open(messages)
+        return Built(program, opened.state, native, RosTopics(messages, opened.subscriptions), deadmen)
+
+    def _deadman(
+        self, plan: DeadmanPlan, program: Program, senders: Mapping[str, NativeSender], state: State
+    ) -> NativeDeadman:
+        used = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
+        key = "deadman", plan, tuple(used.values())
+        return state.keep(key, lambda: self._deadmen.add(plan, program.counters, used))
+
+    # running it
+
+    def adopt(self, built: Built, left: Sequence[Listener] = ()) -> None:
+        """Execute a program from now on; the first one starts the threads. Listeners that are `left` are emptied.
+
+        Raises StuckError or StartError, with nothing changed. Until `has_passed`, threads may use the earlier program.
+        """
+        with ExitStack() as undo:
+            for thread in self._from_ros:
+                thread.leave(built.topics)
+                undo.callback(thread.stay)
+            if self.now is None:
+                self._carrier.start(built.native)
+                self._is_running = True
+            undo.pop_all()
+        if self.now is not None:
+            for listener in left:
+                listener.end_input()
+            self._change(built, self.now)
+        self._publishing.advance(built.native.generation)
+        for thread in self._from_ros:  # after deadmen were replaced: a feed of the earlier ones acts on the next ones
+            thread.serve(built.topics)
+        self.now = built
+
+    def _change(self, built: Built, earlier: Built) -> None:
+        """Have the receive thread execute another program; deadmen inherit the state of those that they replace."""
+        before = earlier.deadmen
+        replaced = [
+            (each, before[route])
+            for route, each in built.deadmen.items()
+            if route in before and before[route] is not each
+        ]
+        for next_one, replaced_one in replaced:
+            next_one.succeeds(replaced_one)
+        self._carrier.change(built.native, [(next_one.address, each.address) for next_one, each in replaced])
+
+    def has_passed(self) -> bool:
+        """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
+        if not self._is_running or self.now is None:
+            return True
+        if not self._publishing.wait_for(self.now.native.generation, _PATIENCE_S):
+            logger.error("a thread is stuck, and what it uses stays open", threads=["publish"])
+            return False
+        return self._has_turned() and all(thread.has_passed for thread in self._from_ros)
+
+    def _has_turned(self) -> bool:
+        """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
+        turns = self._carrier.turns
+        for _ in range(int(_PATIENCE_S / _TURN_S)):
+            if self._carrier.turns != turns:
+                return True
+            sleep(_TURN_S)
+        return False
+
+    def end(self, earlier: Built) -> None:
+        """End the deadmen that only an earlier program had, once no thread feeds them any more: they send if armed."""
+        kept = self.now.deadmen.values() if self.now else ()
+        for deadman in earlier.deadmen.values():
+            if deadman not in kept:
+                deadman.end()
+
+    def observe(self, *, is_observed: bool) -> None:
+        """Begin or cease to show received datagrams to the mirror."""
+        lost = self._counters.counters.index("mirror_dropped")
+        self._carrier.mirror(self._mirrored.ring if is_observed else None, lost)
+
+    def feed_watchdog(self, notify: int, interval: int) -> None:
+        """Feed a watchdog by a connected socket, every `interval` ns; -1 for none."""
+        self._carrier.watchdog(notify, interval)
+
+    # the end
+
+    def stop(self, listeners: Sequence[Listener]) -> bool:
+        """End all input, serve what the kernel holds and what waits, and end the threads; deadmen go on.
+
+        What is in an inherited socket stays there, for the next process. Return False if a thread is stuck in the
+        middleware: then subscriptions and publishers have to stay open.
+        """
+        for listener in listeners:
+            listener.end_input()
+        self._carrier.stop_receiving()
+        self._is_running = False
+        have_ended = [self._publishing.stop(), *(thread.stop() for thread in self._from_ros)]
+        self._has_stopped = True
+        return all(have_ended)
+
+    def close(self) -> None:
+        """Have deadmen send a last time. Nothing is sent afterwards."""
+        for deadman in self.now.deadmen.values() if self.now else ():
+            deadman.end()
+        if self._has_stopped:  # else `stop` is stuck, and its threads use what would be freed
+            self._events.close()
+            self._carrier.close()
+
+    # for events
+
+    def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
+        """Say in words why a datagram was rejected, of which `data` may be the beginning."""
+        program = self.now.program if self.now else None
+        plan = next((each for each in program.listeners if each.name == listener), None) if program else None
+        if program is None or plan is None:
+            return ""
+        return why_rejected(program.envelope, data, length, repairs=plan.framing is Framing.ZERO_TRIMMED)
+
+    def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
+        """Say which place of the table refused a message of `topic`, None for a datagram.
+
+        Nothing if it is not of the program that runs.
+        """
+        if self.now is None or self.now.native.generation != generation:
+            return ""
+        return _lowered_target(self.now.program.lowered, route, topic, target).places[place]
+
+
+def _lowered_target(lowered: Lowered, route: str, topic: str | None, target: str) -> LoweredTarget:
+    """What was lowered of a target, for messages from `topic`, None for datagrams."""
+    if topic is not None:
+        serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
+    else:
+        serving = [by_route[route] for by_route in (lowered.topics, lowered.conditions) if route in by_route]
+    return next(each.targets[target] for each in serving if target in each.targets)
+
+
+def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
+    """The limit of a target with `max_rate`, which lives as long as programs have the target."""
+    rate = target.max_rate
+    assert rate is not None  # noqa: S101 - asked for by the caller
+    return state.keep(("limit", handler.route, handler.topic, target), lambda: open_limit(rate))
+
+
+def log_start(route: str, sent_to: Sequence[str]) -> None:
+    if sent_to:
+        logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
