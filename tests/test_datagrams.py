@@ -11,7 +11,7 @@ from router.values import payload
 
 @pytest.fixture(scope="module")
 def wire() -> Wire:
-    return wire_of_protos(Path(__file__).parents[1] / "protos")
+    return wire_of_protos(Path(__file__).parent / "protos")
 
 
 def test_an_envelope_comes_back_as_it_was_built(wire: Wire) -> None:

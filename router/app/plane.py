@@ -110,7 +110,7 @@ class Plane:
         for thread, counted, events in zip(self._from_ros, from_ros, taken, strict=True):
             told.append((events, counts.add_fixed(counted, thread.counters)))
         self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
-        mirror.drain_by(self._mirrored.take)
+        mirror.show(self._mirrored.take, lambda: counts.total("mirror_dropped"))
         self._events = EventThread(
             told, self._names, reporter.report, changed, self._why_rejected, self._where_refused, self._pulse
         )

@@ -25,7 +25,6 @@ from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, StopStack, background_threads
-from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
     from prometheus_client.metrics_core import Metric as Family
@@ -58,7 +57,7 @@ class Router:
         self._first = program
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
-        self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
+        self.mirror = Mirror(self._observers_changed, self._reporter.failed)
         self._runtime = Runtime(load(), self._counts, self.mirror, self._reporter, self._deadman_changed, ros_args)
         self._services = Services(self)
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
@@ -197,7 +196,7 @@ class Router:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
 
         return {
-            "mirror_dropped": lambda: [((), self.mirror.lost + self.total("mirror_dropped"))],
+            "mirror_dropped": lambda: [((), self.mirror.lost)],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],

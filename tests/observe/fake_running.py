@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 
 from prometheus_client.metrics_core import Metric as Family
 
+from router.clock import wall_ns
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
-from router.recording.mirror import Classifier, Mirror
-from router.types.framing import MAX_DATAGRAM
+from router.recording.mirror import Classifier, Mirror, Mirrored
 from tests.tables import ROUTES
 
 RELOADED = ReloadResult(True, (), "nothing has changed")
@@ -37,7 +38,10 @@ class FakeRunning:
         self.reloads = RELOADED
         self.failures: list[Exception] = []
         self.collected = 0
-        self.mirror = Mirror(MAX_DATAGRAM, lambda: None, self.failures.append)
+        self.mirror = Mirror(lambda: None, self.failures.append)
+        self.lost = 0
+        self.waiting: deque[Mirrored] = deque()
+        self.mirror.show(lambda: [self.waiting.popleft() for _ in range(len(self.waiting))], lambda: self.lost)
         self.counts = program.counters.fresh_counts()
         self._turns = 0
 
@@ -48,7 +52,8 @@ class FakeRunning:
     def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
         """`reason`: why no route takes it."""
         known = Classifier(self.program.envelope, self.program.table)
-        self.mirror.tee(listener, lambda *_: reason, partial(known.sender, listener))(data, peer)
+        if self.mirror.is_observed:
+            self.waiting.append((wall_ns(), listener, peer, known.sender(listener, peer), reason, data))
 
     def collect(self) -> Iterator[Family]:
         self.collected += 1
