@@ -6,8 +6,9 @@ import ctypes
 import signal
 import socket
 import struct
+import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,63 @@ def test_none_is_lost_where_another_subscription_takes_over(site: Site, publishe
             site.write(table)
             assert router.reload().ok
         assert sorted(set(numbers(site, sent))) == list(range(1, sent + 1))
+
+
+@contextmanager
+def commands_coming(publisher: Publisher) -> Iterator[list[int]]:
+    """Commands with their numbers come all the time; yields those that were published."""
+    ended, sent = threading.Event(), list[int]()
+
+    def publish() -> None:
+        while not ended.wait(0.001):
+            sent.append(len(sent) + 1)
+            publisher.publish([command(sent[-1])])
+
+    publishing = threading.Thread(target=publish)
+    publishing.start()
+    try:
+        yield sent
+    finally:
+        ended.set()
+        publishing.join()
+
+
+def test_each_is_sent_once_and_in_order_while_subscriptions_take_over(site: Site, publisher: Publisher) -> None:
+    """Both subscriptions receive what comes meanwhile."""
+    with site.router(drive()) as router:
+        assert publisher.line() == "matched"
+        with commands_coming(publisher) as sent:
+            for depth in (900, 1000, 900, 1000):
+                site.write(drive(depth=depth))
+                assert router.reload().ok
+        assert numbers(site, sent[-1]) == sent
+
+
+def test_a_deadman_that_goes_while_commands_come_has_the_last_word_and_then_none(
+    site: Site, publisher: Publisher
+) -> None:
+    with site.router(drive(timeout="200ms") + NOBODY) as router:
+        assert publisher.line() == "matched"
+        with commands_coming(publisher):
+            for turn in range(3):
+                assert site.basestation.recv(1000)
+                site.write(NOBODY)
+                assert router.reload().ok
+                site.basestation.settimeout(0.4)  # longer than a deadman waits that was fed once more
+                got = list(iter(lambda: _received(site), None))
+                site.basestation.settimeout(10)
+                assert got[-1] == BRAKE, turn
+                assert got[:-1].count(BRAKE) <= (turn == 0)  # that of the start
+                site.write(drive(timeout="200ms") + NOBODY)
+                assert router.reload().ok
+        assert router.total("deadman_trips") == 0
+
+
+def _received(site: Site) -> bytes | None:
+    try:
+        return site.basestation.recv(1000)
+    except TimeoutError:
+        return None
 
 
 def test_a_topic_comes_and_goes(site: Site) -> None:
