@@ -114,7 +114,7 @@ def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Si
         first = router.listeners["rover"].socket
         with site.under_load():
             for _ in range(25):
-                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, coalesce: never}}"])
+                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, receive_buffer: 2MiB}}"])
                 routes = choice.choice([PH, TOPIC, PH + turns("1s"), PH.replace("}", ", ttl: 5s}")])
                 site.write(routes, listen=listen, endpoints=choice.choice(["", tool]))
                 assert router.reload().ok

@@ -23,11 +23,10 @@ from router.table.model import EndpointKind, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000
-COALESCE = 1_000_000
 
 
 def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> model.Listener:
-    return model.Listener(name, SPAN, Located(Address(host, port), SPAN), Framing.EXACT, receive_buffer, COALESCE)
+    return model.Listener(name, SPAN, Located(Address(host, port), SPAN), Framing.EXACT, receive_buffer)
 
 
 def endpoint(name: str, address: Address) -> model.Endpoint:

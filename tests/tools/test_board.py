@@ -92,6 +92,14 @@ def counts(frames: Frames) -> tuple[int, int, int]:
     return frames.complete, frames.incomplete, frames.astray
 
 
+def test_copies_of_parts_make_no_frame() -> None:
+    frames = Frames()
+    for index in (0, 0, 1, 1, 0):
+        frames.take(0, part(7, 2, index))
+    frames.advance(FRAME_TIMEOUT)
+    assert counts(frames) == (1, 0, 0)
+
+
 def test_frames_are_counted_when_their_last_part_comes_or_it_is_too_late() -> None:
     frames = Frames()
     for index in (2, 0, 0, 1):
