@@ -24,9 +24,6 @@ _CHECKS = 4
 NOTIFY_TIMEOUT = 5.0
 """Seconds for which a notification waits for a busy service manager, and so the longest delay of a reload or stop."""
 
-_BACKGROUND_SWITCH_INTERVAL = 0.00005
-"""Seconds after which a compiling thread yields to the receive thread, which needs that after each system call."""
-
 _REMEDY = "ListenDatagram= in rover-router.socket says something else than the table: install the service anew"
 
 
@@ -100,15 +97,4 @@ def tune_interpreter() -> None:
     may_open, may_request = resource.getrlimit(resource.RLIMIT_NOFILE)
     if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few for as many clients of a gateway
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
-    sys.setswitchinterval(0.0005)  # the longest that the receive thread waits for a busy thread
-
-
-@contextmanager
-def beside_traffic() -> Iterator[None]:
-    """Let this thread compute for long without delaying others: it yields more often."""
-    usual = sys.getswitchinterval()
-    sys.setswitchinterval(min(usual, _BACKGROUND_SWITCH_INTERVAL))
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(usual)
+    sys.setswitchinterval(0.0005)  # the longest that gateways wait for a busy thread

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from router.app.counts import ThreadCounts
-from router.app.process import beside_traffic, reloading
+from router.app.process import reloading
 from router.app.runtime import Runtime
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
 from router.clock import monotonic_ns, wall_ns
@@ -57,7 +57,7 @@ class Reloader:
             if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
-            with background_threads(), beside_traffic(), reloading():
+            with background_threads(), reloading():
                 kind, result = self._attempt(self._runtime.program)
             self._count(kind)
             self._remember(is_good=result.ok)
