@@ -23,9 +23,9 @@ class ThreadCounts:
         self.counters = counters
         self.lists: list[list[int]] = []
         self._copies: list[Callable[[int], list[int]]] = []
-        for _ in range(4):
+        for _ in range(3):
             self._add(counters.fresh_counts(), None)
-        self.gateway_deadmen, self.gateways, self.events, self.own = self.lists
+        self.gateways, self.events, self.own = self.lists
 
     @staticmethod
     def fixed() -> ctypes.Array[ctypes.c_int64]:

@@ -8,20 +8,21 @@ to the next goes along by key.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from time import sleep
+from time import monotonic, sleep
 
 from router.app.counts import ThreadCounts
 from router.app.from_ros import FromRos, RosTopics
-from router.app.publishing import Publishing
+from router.app.publishing import Publishing, functions_of_rcl
 from router.app.state import State
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
+from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.from_ros import Subscription, native_from_ros
@@ -65,13 +66,14 @@ class Opened:
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """A program as the threads execute it. `deadmen` are those of routes."""
+    """A program as the threads execute it. `deadmen` are those of routes, others those of clients, by name."""
 
     program: Program
     state: State
     native: NativeProgram
     topics: RosTopics
     deadmen: Mapping[str, NativeDeadman]
+    client_deadmen: Mapping[str, ClientDeadman]
 
 
 class Plane:
@@ -92,9 +94,10 @@ class Plane:
         self._names = Names()
         self._generations = count(1)
         self._is_running = self._has_stopped = False
-        braking, publishing, receiving, *from_ros = (ThreadCounts.fixed() for _ in range(5))
-        braked, published, received, *taken = (Ring(library, _EVENTS) for _ in range(5))
+        braking, guarding, publishing, receiving, *from_ros = (ThreadCounts.fixed() for _ in range(6))
+        braked, guarded, published, received, *taken = (Ring(library, _EVENTS) for _ in range(6))
         self._deadmen = Deadmen(library, braking, braked, self._names)
+        self._client_deadmen = ClientDeadmen(library, guarding, guarded, self._names)
         self._publishing = Publishing(library, Ring(library, _PUBLISHED), publishing, published, self._names)
         self._carrier = Carrier(library, self._deadmen.address, receiving, received, self._publishing.ring)
         self._from_ros = [
@@ -103,6 +106,7 @@ class Plane:
         ]
         told = [
             (braked, counts.add_fixed(braking)),
+            (guarded, counts.add_fixed(guarding)),
             # Before those of the receive thread: what was published was received, so no less than 0 waits.
             (published, counts.add_fixed(publishing, self._publishing.counters)),
             (received, counts.add_fixed(receiving, self._carrier.counters)),
@@ -120,9 +124,9 @@ class Plane:
         """A number that grows unless the receive thread is stuck, even if nothing comes."""
         return self._carrier.turns
 
-    def stalled(self) -> tuple[str, float] | None:
-        """The topic in whose publisher the publish thread is now, and for how many seconds."""
-        return self._publishing.stalled()
+    def stalled(self) -> Iterator[tuple[str, float]]:
+        """The topics in whose publishers native threads are now, each with seconds."""
+        return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
     def _pulse(self) -> None:
         self._carrier.pulse()
@@ -160,7 +164,8 @@ class Plane:
             arrays += [opened.senders, deadmen]
         for thread in self._from_ros:
             thread.open(messages)
-        return Built(program, opened.state, native, RosTopics(messages, opened.subscriptions), deadmen)
+        topics = RosTopics(messages, opened.subscriptions)
+        return Built(program, opened.state, native, topics, deadmen, self._deadmen_of_clients(program, opened))
 
     def _deadman(
         self, plan: DeadmanPlan, program: Program, senders: Mapping[str, NativeSender], state: State
@@ -168,6 +173,33 @@ class Plane:
         used = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
         key = "deadman", plan, tuple(used.values())
         return state.keep(key, lambda: self._deadmen.add(plan, program.counters, used))
+
+    def _deadmen_of_clients(self, program: Program, opened: Opened) -> dict[str, ClientDeadman]:
+        """Their thread serves them from now on: clients may publish before the program runs. Raises StartError."""
+        made = {plan.route: self._client_deadman(plan, program, opened) for plan in program.client_deadmen}
+        if made:
+            try:
+                self._client_deadmen.start(functions_of_rcl(self._library))
+            except OSError as error:
+                raise StartError(str(error)) from error
+        if self.now is None:
+            for deadman in made.values():
+                deadman.await_subscribers(boottime_ns())
+        return made
+
+    def _client_deadman(self, plan: DeadmanPlan, program: Program, opened: Opened) -> ClientDeadman:
+        used = {topic: opened.publications[topic] for topic, _ in plan.datagrams}
+        key = "client deadman", plan, tuple(used.values())
+        return opened.state.keep(key, lambda: self._client_deadmen.add(plan, program.counters, used))
+
+    def subscriber_joined(self, topic: str) -> None:
+        """Shortly after the start, have deadmen of the topic publish to a subscriber that was discovered."""
+        if (now := self.now) is None:
+            return
+        for plan in now.program.client_deadmen:
+            if topic in dict(plan.datagrams) and now.client_deadmen[plan.route].greet(boottime_ns()):
+                what = "the deadman publishes its payload to a new subscriber, since the router starts"
+                logger.info(what, route=plan.route, topic=topic)
 
     # running it
 
@@ -188,6 +220,8 @@ class Plane:
             for listener in left:
                 listener.end_input()
             self._change(built, self.now)
+        clients = self.now.client_deadmen if self.now else {}
+        self._client_deadmen.adopt(clients, built.client_deadmen, built.native.generation)
         self._publishing.advance(built.native.generation)
         for thread in self._from_ros:  # after deadmen were replaced: a feed of the earlier ones acts on the next ones
             thread.serve(built.topics)
@@ -209,8 +243,12 @@ class Plane:
         """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
         if not self._is_running or self.now is None:
             return True
-        if not self._publishing.wait_for(self.now.native.generation, _PATIENCE_S):
-            logger.error("a thread is stuck, and what it uses stays open", threads=["publish"])
+        generation = self.now.native.generation
+        waits = {"publish": self._publishing.wait_for, "client deadmen": self._client_deadmen.wait_for}
+        until = monotonic() + _PATIENCE_S
+        late = [name for name, wait_for in waits.items() if not wait_for(generation, max(until - monotonic(), _TURN_S))]
+        if late:
+            logger.error("a thread is stuck, and what it uses stays open", threads=late)
             return False
         return self._has_turned() and all(thread.has_passed for thread in self._from_ros)
 
@@ -255,13 +293,20 @@ class Plane:
         self._has_stopped = True
         return all(have_ended)
 
-    def close(self) -> None:
-        """Have deadmen send a last time. Nothing is sent afterwards."""
+    def close(self) -> bool:
+        """Have deadmen send a last time. Nothing is sent afterwards.
+
+        Return False if the thread of clients' deadmen is stuck in the middleware: then publishers have to stay open.
+        """
         for deadman in self.now.deadmen.values() if self.now else ():
             deadman.end()
+        has_ended = self._client_deadmen.stop()
+        if not has_ended:
+            logger.error("a thread is stuck, and the router ends without it", threads=["client deadmen"])
         if self._has_stopped:  # else `stop` is stuck, and its threads use what would be freed
             self._events.close()
             self._carrier.close()
+        return has_ended
 
     # for events
 

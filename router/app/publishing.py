@@ -29,14 +29,7 @@ class Publishing:
         """Start the thread, for a program that has topics. Raises StartError."""
         if self._thread is not None:
             return
-        from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
-
-        functions = None if self._library.rcl_types_differ() else publish_functions()
-        if functions is None:
-            raise StartError(
-                "rcl, by which ROS publishes, has other structures than the carrier expects",
-                "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
-            )
+        functions = functions_of_rcl(self._library)
         try:
             self._thread = PublishThread(self._library, self.ring, self._counts, self._events, functions)
         except MemoryError as error:
@@ -69,3 +62,16 @@ class Publishing:
         if not has_ended:
             logger.error("a thread is stuck, and the router ends without it", threads=["publish"])
         return has_ended
+
+
+def functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
+    """Addresses of what publishes, and of what says and forgets why it could not. Raises StartError."""
+    from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
+
+    functions = None if library.rcl_types_differ() else publish_functions()
+    if functions is None:
+        raise StartError(
+            "rcl, by which ROS publishes, has other structures than the carrier expects",
+            "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
+        )
+    return functions

@@ -19,7 +19,6 @@ from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.app.state import State
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
-from router.engine.deadman import Deadman
 from router.errors import SourceSpan, StartError
 from router.log import fault
 from router.observe.reports import Reporter
@@ -28,7 +27,6 @@ from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
 if TYPE_CHECKING:
-    from router.app.gateway_deadmen import GatewayDeadmen
     from router.gateway.thread import GatewayChange, GatewayThread
     from router.ros.endpoints import RosChange
     from router.ros.router_node import RouterNode
@@ -45,7 +43,6 @@ class Change:
     topics: RosChange | None
     built: Built
     gateways: GatewayChange | None
-    gateway_deadmen: Mapping[str, Deadman]
     undo: ExitStack
 
     @property
@@ -73,10 +70,8 @@ class Runtime:
         self.drops = KernelDrops()
         self.sockets = Sockets(self.drops, library)
         self.gateways: GatewayThread | None = None
-        self._gateway_deadmen: GatewayDeadmen | None = None
         self._counts = counts
         self._reporter = reporter
-        self._deadman_changed = deadman_changed
         self._ros_args = ros_args
         self._ros: RouterNode | None = None
         self._unfinished: list[Callable[[], None]] = []
@@ -94,8 +89,7 @@ class Runtime:
     def stalled(self) -> dict[str, float]:
         """For how many seconds a call that publishes on a topic has been in the middleware, by topic; 0 if in none."""
         stalled = dict.fromkeys((plan.label for plan in self.program.publishers) if self.program else (), 0.0)
-        ros, native = self._ros, self.plane.stalled()
-        for topic, seconds in (*(ros.stalled() if ros else ()), *([native] if native else ())):
+        for topic, seconds in (*(self._ros.stalled() if self._ros else ()), *self.plane.stalled()):
             if seconds >= _STALLED_S:
                 stalled[topic] = max(seconds, stalled.get(topic, 0.0))
         return stalled
@@ -114,7 +108,7 @@ class Runtime:
 
     def end_with(self, closing: ExitStack) -> None:
         """Have `closing` stop threads, then gateways, then deadmen, which send once more."""
-        closing.callback(self.plane.close)
+        closing.callback(self._close_plane)
         closing.callback(self._stop_gateways)
         closing.callback(self._stop_plane)
 
@@ -148,15 +142,12 @@ class Runtime:
                 state,
             )
             built = self.plane.build(program, opened)
-            deadmen = self._prepare_gateway_deadmen(program, state, undo)
-            gateways = self._prepare_gateways(program, deadmen, undo)
-            return Change(sockets, topics, built, gateways, deadmen, undo.pop_all())
+            gateways = self._prepare_gateways(built, undo)
+            return Change(sockets, topics, built, gateways, undo.pop_all())
 
     def adopt(self, change: Change) -> None:
         """Have all threads change to the prepared program. Raises StuckError or StartError, with nothing changed."""
         try:
-            if self._gateway_deadmen is not None:
-                self._gateway_deadmen.check(change.gateway_deadmen)
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
             self.plane.adopt(change.built, self.sockets.left(change.sockets))
@@ -166,8 +157,6 @@ class Runtime:
         self.sockets.apply(change.sockets)
         if self._ros is not None and change.topics is not None:
             self._ros.apply(change.topics)
-        if self._gateway_deadmen is not None:
-            self._gateway_deadmen.adopt(change.gateway_deadmen, list(change.built.state.left()))
 
     def finish(self, change: Change, earlier: Built | None) -> None:
         """Watch the peers of new topics, and close what only the earlier program used.
@@ -234,26 +223,8 @@ class Runtime:
         undo.callback(self._ros.abandon, change)
         return change
 
-    def _prepare_gateway_deadmen(self, program: Program, state: State, undo: ExitStack) -> Mapping[str, Deadman]:
-        if self._ros is None:
-            return {}
-        if self._gateway_deadmen is None:
-            from router.app.gateway_deadmen import GatewayDeadmen, inbound_deadmen
-
-            if not inbound_deadmen(program):
-                return {}
-            self._gateway_deadmen = GatewayDeadmen(self._counts, self._reporter, self._deadman_changed)
-        release = self._gateway_deadmen.release
-        undo.callback(lambda: release(list(state.added())))
-        deadmen = self._gateway_deadmen.build(program, self._ros, state)
-        if self.plane.now is None:
-            self._gateway_deadmen.start(deadmen)
-        return deadmen
-
-    def _prepare_gateways(
-        self, program: Program, deadmen: Mapping[str, Deadman], undo: ExitStack
-    ) -> GatewayChange | None:
-        if self._ros is None or not (program.gateways or self.gateways):
+    def _prepare_gateways(self, built: Built, undo: ExitStack) -> GatewayChange | None:
+        if self._ros is None or not (built.program.gateways or self.gateways):
             return None
         if self.gateways is None:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
@@ -261,8 +232,8 @@ class Runtime:
             reporter, counts = self._reporter, self._counts.gateways
             self.gateways = GatewayThread(self._ros, self._library, counts, reporter.report, reporter.failed)
             undo.callback(self._stop_gateways)
-        feed = self._gateway_deadmen.feed(deadmen) if self._gateway_deadmen else _feeds_nothing
-        change = self.gateways.prepare(program, feed)
+        feed = {name: deadman.feed for name, deadman in built.client_deadmen.items()}
+        change = self.gateways.prepare(built.program, feed)
         undo.callback(self.gateways.abandon, change)
         return change
 
@@ -282,8 +253,7 @@ class Runtime:
             self._counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
 
     def _subscriber_joined(self, topic: str) -> None:
-        if self._gateway_deadmen is not None and self.program is not None:
-            self._gateway_deadmen.subscriber_joined(self.program, topic)
+        self.plane.subscriber_joined(topic)
 
     # the end
 
@@ -291,22 +261,19 @@ class Runtime:
         if self.gateways is not None:
             self.gateways.stop()
             self.gateways = None
-        if self._gateway_deadmen is not None:
-            self._gateway_deadmen.stop()
 
     def _stop_plane(self) -> None:
         if not self.plane.stop(list(self.sockets.listeners.values())) and self._ros is not None:
+            self._ros.leave_open()
+
+    def _close_plane(self) -> None:
+        if not self.plane.close() and self._ros is not None:
             self._ros.leave_open()
 
     def _close_ros(self) -> None:
         if self._ros is not None:
             self._ros.close()
             self._ros = None
-
-
-def _feeds_nothing(route: str, names: Sequence[str]) -> Callable[[int], None]:
-    """Without deadmen nobody asks for what feeds one."""
-    raise AssertionError(route)
 
 
 def _needs_ros(program: Program) -> bool:

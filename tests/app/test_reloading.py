@@ -443,59 +443,66 @@ def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) ->
         assert router.total("deadman_datagrams_sent") == 1
 
 
+TRUE = b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n'
+
+
 def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
     gateway = operator(port, "10ms")
-    with site.router(turns("500ms") + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
-        is_in, go_on = threading.Event(), threading.Event()
-
-        def blocked(_: bytes) -> None:
-            is_in.set()
-            go_on.wait()
-
-        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
-        wait_until(lambda: router.total("messages_published") == 1)
-        assert router._runtime._ros is not None
-        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
+    is_in, _ = stuck
+    site.basestation.settimeout(20)
+    with site.router(turns("500ms") + gateway), socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(TRUE)
         assert is_in.wait(20)
         site.send(DRIVE)
-        site.basestation.settimeout(20)
-        try:
-            assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
-        finally:
-            go_on.set()
+        assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
 
 
-def test_a_reload_is_refused_while_the_deadman_of_a_gateway_that_it_replaces_is_stuck(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+def test_neither_clients_nor_a_reload_wait_for_the_deadman_of_a_gateway_that_is_stuck(
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
+    is_in, goes_on = stuck
     with (
+        capture_logs() as logged,
         site.router(PH + operator(port, "10ms")) as router,
         socket.create_connection(("127.0.0.1", port)) as client,
     ):
-        is_in, go_on = threading.Event(), threading.Event()
-
-        def blocked(_: bytes) -> None:
-            is_in.set()
-            go_on.wait(20)
-
-        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
-        wait_until(lambda: router.total("messages_published") == 1)
-        assert router._runtime._ros is not None
-        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
-        try:
-            assert is_in.wait(20)
-            site.write(PH + operator(port, "20ms"))
-            result = router.reload()
-            assert (result.ok, "stuck" in result.text) == (False, True)
-        finally:
-            go_on.set()
+        client.sendall(TRUE)
+        assert is_in.wait(20)
+        wait_until(lambda: router.total("deadman_active") == 1)
+        site.write(PH + operator(port, "1h"))
         assert router.reload().ok
+        assert [entry["threads"] for entry in logged if "stays open" in entry["event"]] == [["client deadmen"]]
+        with socket.create_connection(("127.0.0.1", port)) as another:
+            another.sendall(TRUE)
+            wait_until(lambda: router.total("messages_published") == 2)
+            wait_until(lambda: router.total("deadman_active") == 0)
+        goes_on.set()
+        assert router.reload().ok
+        assert (router.total("deadman_trips"), router.total("deadman_datagrams_sent")) == (1, 1)
+    assert router.total("deadman_datagrams_sent") == 2  # at the stop, as a client had published
+
+
+def test_a_stop_leaves_the_deadman_of_a_gateway_that_is_stuck(
+    site: Site, stuck: tuple[threading.Event, threading.Event]
+) -> None:
+    port = free_port(kind=socket.SOCK_STREAM)
+    is_in, _ = stuck
+    with (
+        capture_logs() as logged,
+        site.router(turns("1h") + operator(port, "10ms")),
+        socket.create_connection(("127.0.0.1", port)) as client,
+    ):
+        site.send(DRIVE)
+        assert site.basestation.recv(64) == DRIVE
+        client.sendall(TRUE)
+        assert is_in.wait(20)
+    assert site.basestation.recv(64) == BRAKE
+    left = [entry["threads"] for entry in logged if "the router ends without it" in entry["event"]]
+    assert left == [["client deadmen"]]
 
 
 @pytest.mark.parametrize("late", ["router.app.counts.Counters.settle", "router.app.router.Router._watch"])

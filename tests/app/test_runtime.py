@@ -272,7 +272,7 @@ def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypat
             return {sample.labels["topic"]: sample.value for sample in samples}
 
         assert stalled() == {"ph": 0, "other": 0}
-        monkeypatch.setattr(runtime.plane, "stalled", lambda: ("ph", 2.5))
+        monkeypatch.setattr(runtime.plane, "stalled", lambda: iter([("ph", 2.5)]))
         monkeypatch.setattr(runtime._ros, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
         assert stalled() == {"ph": 2.5, "other": 0}
 
