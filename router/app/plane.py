@@ -18,12 +18,13 @@ from time import monotonic, sleep
 from router.app.counts import ThreadCounts
 from router.app.from_ros import FromRos, RosTopics
 from router.app.publishing import Publishing, functions_of_rcl
-from router.app.state import State
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
+from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deferrals import Adoption, Deferrals, NativeDeferral, NativePacer, timer_change
 from router.carrier.events import EventThread
 from router.carrier.from_ros import Subscription, native_from_ros
 from router.carrier.limits import open_limit
@@ -33,6 +34,7 @@ from router.carrier.program import NativeProgram, native_program
 from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
+from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
@@ -66,12 +68,16 @@ class Opened:
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """A program as the threads execute it. `deadmen` are those of routes, others those of clients, by name."""
+    """A program as the threads execute it. `deadmen` are those of routes, others those of clients, by name.
+
+    `adopted` is what holds messages back, and collects them.
+    """
 
     program: Program
     state: State
     native: NativeProgram
     topics: RosTopics
+    adopted: Sequence[Adoption]
     deadmen: Mapping[str, NativeDeadman]
     client_deadmen: Mapping[str, ClientDeadman]
 
@@ -146,6 +152,8 @@ class Plane:
         generation = next(self._generations)
         if program.publishers:
             self._publishing.open()
+        bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
+        deferrals = Deferrals(self._library, opened.state, opened.senders, opened.publications, bandwidths)
         try:
             outlets = Outlets(
                 listeners=opened.listeners,
@@ -153,6 +161,8 @@ class Plane:
                 publications=opened.publications,
                 feeds=lambda route, names: [(deadmen[name].address, name != route) for name in names],
                 limit=partial(_limit, opened.state),
+                deferral=deferrals.deferral,
+                collector=partial(kept_collector, self._library, opened.state),
                 names=self._names,
                 boards=NativeBoards(program.boards),
             )
@@ -165,7 +175,10 @@ class Plane:
         for thread in self._from_ros:
             thread.open(messages)
         topics = RosTopics(messages, opened.subscriptions)
-        return Built(program, opened.state, native, topics, deadmen, self._deadmen_of_clients(program, opened))
+        pacers = [Adoption(pacer.address) for pacer in deferrals.pacers()]
+        adopted = [*pacers, *native.adopted, *messages.adopted]
+        clients = self._deadmen_of_clients(program, opened)
+        return Built(program, opened.state, native, topics, adopted, deadmen, clients)
 
     def _deadman(
         self, plan: DeadmanPlan, program: Program, senders: Mapping[str, NativeSender], state: State
@@ -212,8 +225,9 @@ class Plane:
             for thread in self._from_ros:
                 thread.leave(built.topics)
                 undo.callback(thread.stay)
+            self._change_topics(built)
             if self.now is None:
-                self._carrier.start(built.native)
+                self._carrier.start(built.native, _change_of_destinations(built))
                 self._is_running = True
             undo.pop_all()
         if self.now is not None:
@@ -237,7 +251,20 @@ class Plane:
         ]
         for next_one, replaced_one in replaced:
             next_one.succeeds(replaced_one)
-        self._carrier.change(built.native, [(next_one.address, each.address) for next_one, each in replaced])
+        pairs = [(next_one.address, each.address) for next_one, each in replaced]
+        self._carrier.change(built.native, pairs, _change_of_destinations(built))
+
+    def _change_topics(self, built: Built) -> None:
+        """Post what changes in the timers of the publish thread, before it gets a message of this program."""
+        adopted = [each for each in built.adopted if each.is_topic]
+        left = [
+            each.address
+            for each in built.state.left()
+            if isinstance(each, NativeCollector) or (isinstance(each, NativeDeferral) and each.is_topic)
+        ]
+        change = c.PublishChange(timers=timer_change(adopted, left), generation=built.native.generation)
+        built.native.arrays.append(change)
+        self._publishing.change(change)
 
     def has_passed(self) -> bool:
         """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
@@ -294,12 +321,11 @@ class Plane:
         return all(have_ended)
 
     def close(self) -> bool:
-        """Have deadmen send a last time. Nothing is sent afterwards.
+        """Send what waits, then have deadmen send a last time. Nothing is sent afterwards.
 
         Return False if the thread of clients' deadmen is stuck in the middleware: then publishers have to stay open.
         """
-        for deadman in self.now.deadmen.values() if self.now else ():
-            deadman.end()
+        self._deadmen.end()
         has_ended = self._client_deadmen.stop()
         if not has_ended:
             logger.error("a thread is stuck, and the router ends without it", threads=["client deadmen"])
@@ -326,6 +352,14 @@ class Plane:
         if self.now is None or self.now.native.generation != generation:
             return ""
         return _lowered_target(self.now.program.lowered, route, topic, target).places[place]
+
+
+def _change_of_destinations(built: Built) -> c.TimerChange:
+    """What changes in the timers of endpoints. What only the earlier program had sends what it holds."""
+    left = list(built.state.left())
+    ended = [each.address for each in left if isinstance(each, NativeDeferral) and not each.is_topic]
+    ended += [each.address for each in left if isinstance(each, NativePacer)]
+    return timer_change([each for each in built.adopted if not each.is_topic], ended)
 
 
 def _lowered_target(lowered: Lowered, route: str, topic: str | None, target: str) -> LoweredTarget:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
+from router.carrier import structures as c
 from router.carrier.outlets import Names
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
@@ -38,6 +39,11 @@ class Publishing:
     def counters(self, count: int) -> list[int]:
         """Return the first counters, as they are between two messages."""
         return self._thread.counters(count) if self._thread else list(self._counts[:count])
+
+    def change(self, change: c.PublishChange) -> None:
+        """Make a change of timers when its generation is reached. It stays the caller's until then."""
+        if self._thread is not None:
+            self._thread.change(change)
 
     def advance(self, generation: int) -> None:
         """Go on to that generation once all earlier messages are published: none of them can come any more."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from router.app.counts import ThreadCounts
 from router.app.plane import Built, Opened, Plane
 from router.app.sockets import KernelDrops, SocketChange, Sockets
-from router.app.state import State
+from router.carrier.state import State
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import SourceSpan, StartError

@@ -52,22 +52,23 @@ class Carrier:
             self._library.carrier_counters(self._carrier, copy, count)
         return list(copy)
 
-    def start(self, program: NativeProgram) -> None:
-        """Start the threads. Raises StartError."""
-        change = c.Change(program=ctypes.pointer(program.structure))
+    def start(self, program: NativeProgram, timers: c.TimerChange) -> None:
+        """Start the threads, with the timers of the program. Raises StartError."""
+        change = c.Change(program=ctypes.pointer(program.structure), timers=timers)
         if error := self._library.carrier_start(self._carrier, ctypes.byref(change)):
             raise StartError(f"the carrier's threads cannot be started: {os.strerror(error)}")
         self._running = program, change
 
-    def change(self, program: NativeProgram, replaced: Sequence[tuple[int, int]]) -> None:
+    def change(self, program: NativeProgram, replaced: Sequence[tuple[int, int]], timers: c.TimerChange) -> None:
         """Execute another program from the next datagram on. Listeners that it does not have are emptied before.
 
-        `replaced` has deadmen with those that they take over from.
+        `replaced` has deadmen with those that they take over from; `timers` says what other timers are to do.
         """
         pairs = [deadman for pair in replaced for deadman in pair]
         change = c.Change(
             program=ctypes.pointer(program.structure),
             replaced=(ctypes.c_void_p * len(pairs))(*pairs),
+            timers=timers,
             replaced_count=len(replaced),
         )
         self._library.carrier_change(self._carrier, ctypes.byref(change))

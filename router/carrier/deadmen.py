@@ -58,6 +58,10 @@ class Deadmen:
         if not self.address:
             raise MemoryError("the deadmen of the carrier cannot be opened")
 
+    def end(self) -> None:
+        """Send what waits, then have deadmen send a last time. Nothing waits afterwards."""
+        self._library.timers_end(self.address)
+
     def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, NativeSender]) -> NativeDeadman:
         """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
         outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}

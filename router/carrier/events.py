@@ -107,7 +107,7 @@ class EventThread:
             detail = _text(record[_LOSS.size :])
             if generation:  # a program of the table refused the message
                 topic = self._name(of_topic) if of_topic != NO_NAME else None
-                detail = self._place(route, topic, target, generation, place)
+                detail = ": ".join(filter(None, (self._place(route, topic, target, generation, place), detail)))
             lost = Report("drop", route, target, LOSSES[loss], _error(number), detail)
             self._count(counter, lost, counters, last)
         else:

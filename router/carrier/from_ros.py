@@ -12,6 +12,7 @@ from time import sleep
 from typing import Protocol
 
 from router.carrier import structures as c
+from router.carrier.deferrals import Adoption
 from router.carrier.lowered import Programs
 from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
@@ -49,6 +50,8 @@ class NativeFromRos:
     topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)
     urgent: set[str] = field(default_factory=set)
     arrays: list[object] = field(default_factory=list)
+    adopted: Sequence[Adoption] = ()
+    """The deferrals of its targets."""
 
     def only(self, *, urgent: bool) -> NativeFromRos:
         """Those for the thread of urgent messages, or those for the other one."""
@@ -66,6 +69,7 @@ def native_from_ros(program: Program, generation: int, outlets: Outlets) -> Nati
         made.topics[topic] = (c.RosRoute * len(routes))(*routes)
         if any(feed.is_urgent for feed in feeds):
             made.urgent.add(topic)
+    made.adopted = writer.adopted
     return made
 
 

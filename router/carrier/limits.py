@@ -52,5 +52,10 @@ class RateLimit:
 
 def open_limit(hertz: float) -> c.Limit:
     """Return a limit of which nothing was used: a whole period ago at any time, as the boot clock is not negative."""
-    period = ceil(_NS / hertz)
-    return c.Limit(period, period - period // 2, -period)
+    between = period(hertz)
+    return c.Limit(between, between - between // 2, -between)
+
+
+def period(hertz: float) -> int:
+    """The time between two messages of `max_rate`, in ns."""
+    return ceil(_NS / hertz)

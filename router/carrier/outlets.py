@@ -9,6 +9,8 @@ from typing import Any, Protocol
 
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
+from router.carrier.collectors import NativeCollector
+from router.carrier.deferrals import NativeDeferral
 from router.compiler.program import Handler, TargetPlan
 from router.net.udp import Listener
 
@@ -45,7 +47,8 @@ class Outlets:
     """What is open for a program. Pointers are addresses of C structures.
 
     `senders` are by endpoint, `publications` by topic. `feeds(route, names)` returns the deadmen that a command feeds
-    (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`. Without `boards`,
+    (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`, `deferral(handler,
+    target)` what may hold its messages back, `collector(handler)` what makes frames for its topics. Without `boards`,
     endpoints that are boards get everything.
     """
 
@@ -54,5 +57,7 @@ class Outlets:
     publications: Mapping[str, Publication]
     feeds: Callable[[str, Sequence[str]], Sequence[tuple[int, bool]]]
     limit: Callable[[Handler, TargetPlan], c.Limit]
+    deferral: Callable[[Handler, TargetPlan], NativeDeferral | None]
+    collector: Callable[[Handler], NativeCollector]
     names: Names
     boards: NativeBoards | None = None

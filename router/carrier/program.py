@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
+from router.carrier.deferrals import Adoption
 from router.carrier.outlets import Outlets
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetWriter
@@ -23,9 +24,10 @@ from router.table.model import Framing
 
 @dataclass(slots=True)
 class NativeProgram:
-    """`struct program` with all that it refers to."""
+    """`struct program` with all that it refers to. `adopted` are the deferrals and collectors of its targets."""
 
     generation: int
+    adopted: Sequence[Adoption] = ()
     arrays: list[object] = field(default_factory=list)
     structure: c.Program = field(default_factory=c.Program)
 
@@ -34,7 +36,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
     """Make the arrays of a program; `generation` numbers the programs of the process. Raises CannotCarry."""
     schema = wire_schema(program.envelope, program.inbound.keys())
     handlers = [handler for several in program.inbound.values() for handler in several]
-    made = NativeProgram(generation, [schema])
+    made = NativeProgram(generation, arrays=[schema])
     targets = TargetWriter(program, outlets, generation, made.arrays)
     numbers = {handler.route: number for number, handler in enumerate(handlers)}
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
@@ -49,6 +51,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         cases=writer.array(c.Case, writer.cases()),
         routes=writer.array(c.Route, [writer.route(handler) for handler in handlers]),
     )
+    made.adopted = targets.adopted
     return made
 
 

@@ -6,6 +6,7 @@ import ctypes
 from threading import Lock
 from time import sleep
 
+from router.carrier import structures as c
 from router.carrier.ring import Ring
 from router.clock import monotonic_ns
 
@@ -43,6 +44,12 @@ class PublishThread:
                 return list(self._counters[:count])
             self._library.publish_counters(self._address, copy, count)
         return list(copy)
+
+    def change(self, change: c.PublishChange) -> None:
+        """Make a change of timers when its generation is reached: to be called before a message of that comes."""
+        with self._in_use:
+            if self._address:
+                self._library.publish_change(self._address, ctypes.byref(change))
 
     def advance(self, generation: int) -> None:
         """Go on to that generation once all earlier messages are served: none of them can come any more."""

@@ -18,6 +18,7 @@ LOSSES = (
     "send_error",
     "publish_error",
     "too_large",
+    "incomplete",
 )
 """`enum loss` in events.h, as DROP_REASONS names them."""
 
@@ -195,18 +196,39 @@ class Target(ctypes.Structure):
         ("condition", Code),
         ("message", Code),
         ("limit", POINTER(Limit)),
+        ("deferral", c_void_p),
+        ("period", c_int64),
         ("topic", POINTER(Topic)),
         ("sender", c_void_p),
         ("board", POINTER(Board)),
         ("feeds", POINTER(Feed)),
         ("feed_count", c_uint32),
         ("trims", c_uint32),
+        ("priority", c_uint32),
         ("id", c_uint32),
         ("waiting", c_uint32),
         ("filtered", c_uint32),
+        ("collected", c_uint32),
         ("delivered", c_uint32),
         ("delivered_bytes", c_uint32),
         ("dropped", c_uint32 * len(LOSSES)),
+    )
+
+
+class Collect(ctypes.Structure):
+    """`struct collect` in collect.h."""
+
+    _fields_ = (
+        ("collector", c_void_p),
+        ("by", Code),
+        ("count", Code),
+        ("order", Code),
+        ("senders", POINTER(c_uint32)),
+        ("is_text", c_uint32),
+        ("signs", c_uint32),
+        ("items", c_uint16),
+        ("counted", c_uint16),
+        ("reserved", c_uint32),
     )
 
 
@@ -217,6 +239,7 @@ class Targets(ctypes.Structure):
         ("ttl", c_int64),
         ("layout", POINTER(Layout)),
         ("sources", POINTER(Value)),
+        ("collect", POINTER(Collect)),
         ("targets", POINTER(Target)),
         ("count", c_uint32),
         ("route", c_uint32),
@@ -295,16 +318,39 @@ class Program(ctypes.Structure):
     )
 
 
+class Adoption(ctypes.Structure):
+    """`struct adoption` in timers.h."""
+
+    _fields_ = (("timer", c_void_p), ("to", c_void_p), ("target", c_void_p))
+
+
+class TimerChange(ctypes.Structure):
+    """`struct timer_change` in timers.h."""
+
+    _fields_ = (
+        ("adopted", POINTER(Adoption)),
+        ("ended", POINTER(c_void_p)),
+        ("adopted_count", c_uint32),
+        ("ended_count", c_uint32),
+    )
+
+
 class Change(ctypes.Structure):
     """`struct change` in carrier.h."""
 
     _fields_ = (
         ("program", POINTER(Program)),
         ("replaced", POINTER(c_void_p)),
-        ("ended", POINTER(c_void_p)),
+        ("timers", TimerChange),
         ("replaced_count", c_uint32),
-        ("ended_count", c_uint32),
+        ("reserved", c_uint32),
     )
+
+
+class PublishChange(ctypes.Structure):
+    """`struct publish_change` in publish.h."""
+
+    _fields_ = (("timers", TimerChange), ("next", c_void_p), ("generation", c_uint32), ("reserved", c_uint32))
 
 
 class ForEach(ctypes.Structure):
@@ -420,6 +466,7 @@ __all__ = [
     "LOSSES",
     "NO_NAME",
     "REASONS",
+    "Adoption",
     "Board",
     "BoardField",
     "BoardMessage",
@@ -428,6 +475,7 @@ __all__ = [
     "Change",
     "ClosedEnum",
     "Code",
+    "Collect",
     "DeadmanDestination",
     "Entry",
     "Feed",
@@ -443,6 +491,7 @@ __all__ = [
     "Operation",
     "Peer",
     "Program",
+    "PublishChange",
     "ReadOperation",
     "RosRoute",
     "RosSet",
@@ -452,6 +501,7 @@ __all__ = [
     "Setting",
     "Target",
     "Targets",
+    "TimerChange",
     "Topic",
     "Value",
     "WireField",

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.carrier import structures as c
+from router.carrier.collectors import native_collect
+from router.carrier.deferrals import PRIORITIES, Adoption, held_period
 from router.carrier.lowered import Programs, native_values
 from router.carrier.outlets import Outlets
 from router.compiler.lowering import LoweredRoute, LoweredTarget
@@ -21,6 +23,8 @@ class TargetWriter:
     outlets: Outlets
     generation: int
     arrays: list[object]
+    adopted: list[Adoption] = field(default_factory=list)
+    """Deferrals and collectors, for a `struct timer_change`."""
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
 
@@ -30,6 +34,10 @@ class TargetWriter:
             return self.targets(handler, plans, {}, None)
         programs = Programs(lowered.layout, self.arrays)
         made = self.targets(handler, plans, lowered.targets, programs)
+        if lowered.collect is not None:
+            collector = self.outlets.collector(handler)
+            made.collect = ctypes.pointer(native_collect(lowered.collect, programs, collector, self._ids_of_senders()))
+            self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
         made.layout, made.sources = programs.layout(), self._names_of_senders()
         return made
 
@@ -50,14 +58,21 @@ class TargetWriter:
             self._complete(target, handler, plan)
             targets.append(target)
         number = self.outlets.names.number
-        return c.Targets(
+        array = (c.Target * len(targets))(*targets)
+        made = c.Targets(
             ttl=handler.ttl or 0,
-            targets=(c.Target * len(targets))(*targets),
+            targets=array,
             count=len(targets),
             route=number(handler.route),
             topic=c.NO_NAME if handler.topic is None else number(handler.topic),
             generation=self.generation,
         )
+        for target, plan in zip(array, plans, strict=True):
+            if target.deferral:
+                to = ctypes.addressof(made), ctypes.addressof(target)
+                self.adopted.append(Adoption(target.deferral, plan.is_topic, *to))
+        self.arrays.append(made)
+        return made
 
     def _complete(self, made: c.Target, handler: Handler, plan: TargetPlan) -> None:
         """Add what all targets have."""
@@ -65,11 +80,17 @@ class TargetWriter:
         made.id = self.outlets.names.number(plan.label)
         made.waiting = counters.index("messages_waiting", *place)
         made.filtered = counters.index("messages_filtered", *place)
+        if plan.is_topic and handler.collect_timeout is not None:
+            made.collected = counters.index("messages_collected", *place)
         made.delivered = counters.index("messages_published" if plan.is_topic else "datagrams_sent", *place)
         made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in c.LOSSES]
         if not plan.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
-        if plan.max_rate is not None:
+        made.period, made.priority = held_period(plan), PRIORITIES.index(plan.priority)
+        if (deferral := self.outlets.deferral(handler, plan)) is not None:
+            made.deferral = deferral.address
+            self.arrays.append(deferral)
+        if plan.max_rate is not None and not made.period:
             limit = self.outlets.limit(handler, plan)
             made.limit = ctypes.pointer(limit)
             self.arrays.append(limit)
@@ -99,9 +120,15 @@ class TargetWriter:
             self.arrays.append(publication)
         return c.Target(topic=ctypes.pointer(self._topics[plan.label]))
 
+    def _ids_of_senders(self) -> list[int]:
+        """By column."""
+        return [self.outlets.names.number(label) for label in self._labels_of_senders()]
+
+    def _labels_of_senders(self) -> list[str]:
+        return [*self.program.table.endpoints, source_label(STRANGER)]
+
     def _names_of_senders(self) -> ctypes.Array[c.Value]:
         """By column."""
         if self._sources is None:
-            labels = *self.program.table.endpoints, source_label(STRANGER)
-            self._sources = native_values([label.encode() for label in labels], self.arrays)
+            self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources

@@ -1,4 +1,4 @@
-"""Which targets Python serves: those that hold messages back or collect them, and what shares its order with one.
+"""Which targets Python serves: those that hold messages back, and what shares its order with one.
 
 The carrier serves all others. An endpoint gets datagrams in the order of their arrival, whatever routes they take, and
 a topic its messages: so all that goes from UDP to one endpoint or topic has one executor. So has all that one topic of
@@ -49,7 +49,7 @@ def _in_one_order(
     targets: Sequence[tuple[CheckedRoute, CheckedTarget]],
 ) -> Iterator[tuple[str, str, Executor]]:
     """The executors by route and label: Python's, if it serves one target of that label."""
-    own = [(checked.route.name, target, _own_executor(checked, target)) for checked, target in targets]
+    own = [(checked.route.name, target, _own_executor(target)) for checked, target in targets]
     needs_python: dict[str, tuple[str, SourceSpan]] = {}  # the first route that does, and its target
     for route, target, executor in own:
         if not executor.is_carrier:
@@ -69,7 +69,7 @@ def _of_topics(
             topics.setdefault(feed.topic.topic.value, []).append((checked, feed))
     for topic, feeds in topics.items():
         targets = [(checked, target) for checked, feed in feeds for target in feed.targets]
-        own = (_own_executor(checked, target) for checked, target in targets)
+        own = (_own_executor(target) for _, target in targets)
         executor = next((each for each in own if not each.is_carrier), CARRIER)
         if not executor.is_carrier and any(is_urgent(checked.route, feed) for checked, feed in feeds):
             executor = Executor(f"{executor.reason}; its freshness is Python's", executor.span)
@@ -82,14 +82,10 @@ def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
     return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
-def _own_executor(checked: CheckedRoute, target: CheckedTarget) -> Executor:
+def _own_executor(target: CheckedTarget) -> Executor:
     """The executor of a target, without regard to others."""
-    if target.topic and checked.collect is not None:
-        return Executor("`collect` needs it", checked.collect.span)
-    if target.declared.on_limit is OnLimit.LATEST:
+    if target.topic and target.declared.on_limit is OnLimit.LATEST:
         return Executor("`on_limit: latest` needs it", target.span)
-    if target.endpoint is not None and target.endpoint.bandwidth is not None:
-        return Executor(f"the bandwidth of '{target.label}' needs it", target.endpoint.span)
     return CARRIER
 
 

@@ -12,15 +12,19 @@ from pathlib import Path
 from struct import Struct
 from typing import Any, cast
 
+import pytest
+
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deferrals import Adoption, Deferrals, timer_change
 from router.carrier.from_ros import FromRosThread, native_from_ros
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
+from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
 from tests.engine.rig import Ledger
 
@@ -140,16 +144,23 @@ class Commanding:
             plan.route: self.deadmen.add(plan, program.counters, senders) for plan in program.deadmen
         }
         self._limits: dict[object, c.Limit] = {}
+        bandwidths = {plan.name: plan.bandwidth for plan in program.senders if plan.bandwidth is not None}
+        self._deferrals = Deferrals(library, State(), senders, {}, bandwidths)
         outlets = Outlets(
             listeners={},
             senders={endpoint: board.address for endpoint, board in self.boards.items()},
             publications={},
             feeds=lambda route, names: [(self.by_route[name].address, name != route) for name in names],
             limit=self._limit,
+            deferral=self._deferrals.deferral,
+            collector=lambda _: pytest.fail("no route from ROS has one"),
             names=self.names,
             boards=NativeBoards(program.boards),
         )
         self.messages = native_from_ros(program, 1, outlets)
+        pacers = [Adoption(pacer.address) for pacer in self._deferrals.pacers()]
+        timers = timer_change([*pacers, *self.messages.adopted], ())
+        library.timers_change(self.deadmen.address, ctypes.byref(timers))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
         assert take

@@ -12,6 +12,7 @@ from router.carrier.build import LIBRARY, build, is_current
 from router.carrier.library import load
 from router.compiler.lookup import Definitions
 from tests.carrier import building
+from tests.carrier import deferring as of_deferrals
 from tests.carrier import delivering as of_delivery
 from tests.carrier import evaluating as of_machine
 from tests.carrier.building import sanitized_library
@@ -51,6 +52,13 @@ def delivering(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.
     """What delivers messages: see delivering.c."""
     made = tmp_path_factory.mktemp("carrier") / "delivering.so"
     return of_delivery.delivering(made, built, is_sanitized=SANITIZED in os.environ)
+
+
+@pytest.fixture(scope="session")
+def deferring(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """What holds messages back: see deferring.c."""
+    made = tmp_path_factory.mktemp("carrier") / "deferring.so"
+    return of_deferrals.deferring(made, built, is_sanitized=SANITIZED in os.environ)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,9 @@
 /* Delivers messages without threads, sockets, clocks and middleware: what would leave is written down. A library of its
  * own, which uses that of the carrier. */
 #define deliver_to_all note_all
+#include "collect.h"
 #include "route_ros.c"
+#include "timers.h"
 #undef deliver_to_all
 
 enum { DELIVERED = -1, FILTERED_OUT = -2 };
@@ -16,7 +18,7 @@ struct noted {
 /* What it has delivered since the last call. */
 struct delivering {
     struct ros_routing routing; /* first, as its stage is */
-    struct output notes, bytes;
+    struct output notes, bytes, losses;
     int64_t now;
 };
 
@@ -24,6 +26,11 @@ struct delivering *seam_open(counter *counters);
 void seam_close(struct delivering *of);
 size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, bool is_single,
                      uint32_t column, int64_t received_at, const void **notes);
+size_t seam_part(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
+                 uint32_t length, uint32_t column, int64_t received_at, int64_t now, const void **notes);
+void seam_adopt(struct delivering *of, const struct timer_change *change);
+int64_t seam_serve(struct delivering *of, int64_t now);
+size_t seam_losses(struct delivering *of, const void **events);
 size_t seam_from_ros(struct delivering *of, const struct ros_route *route, const void *data, size_t size,
                      int64_t received_at, const void **notes);
 
@@ -82,7 +89,8 @@ struct delivering *seam_open(counter *counters) {
     struct delivering *made = calloc(1, sizeof *made);
     if (!made) return NULL;
     struct stage *stage = &made->routing.stage;
-    if (!stage_open(stage, counters, ring_open(1 << 12), NULL)) abort();
+    struct timers *timers = timers_open_on(stage);
+    if (!timers || !stage_open(stage, counters, ring_open(1 << 16), timers)) abort();
     stage->now = now_of;
     stage->send = note_sent;
     stage->publish = note_published;
@@ -91,9 +99,11 @@ struct delivering *seam_open(counter *counters) {
 
 void seam_close(struct delivering *of) {
     ring_close(of->routing.stage.reporter.events);
+    timers_close(of->routing.stage.timers);
     stage_close(&of->routing.stage);
     free(of->notes.data);
     free(of->bytes.data);
+    free(of->losses.data);
     free(of);
 }
 
@@ -117,6 +127,54 @@ size_t seam_datagram(struct delivering *of, const struct targets *to, const void
     free(copy);
     *notes = of->notes.data;
     return of->notes.size;
+}
+
+/* Keep what was reported, in which frames and datagrams were lost before they were delivered. */
+static void keep_losses(struct delivering *of) {
+    uint64_t records[512];
+    for (size_t size; (size = ring_take(of->routing.stage.reporter.events, records, sizeof records, 0));)
+        if (!append(&of->losses, records, size)) abort();
+    of->routing.stage.reporter.window_began = INT64_MIN / 2; /* report all */
+}
+
+/* The events since the last call. */
+size_t seam_losses(struct delivering *of, const void **events) {
+    size_t size = of->losses.size;
+    *events = of->losses.data;
+    of->losses.size = 0;
+    return size;
+}
+
+/* Deliver a datagram to targets that get frames, likewise, at `now`. Without notes, it completes none. Without a `start`, its
+ * payload is not its only field. */
+size_t seam_part(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
+                 uint32_t length, uint32_t column, int64_t received_at, int64_t now, const void **notes) {
+    void *copy = exactly(data, size);
+    struct datagram datagram = {.data = copy, .size = size, .start = start, .length = length, .is_single = start != 0,
+                                .column = column, .received_at = received_at};
+    struct message message = {.datagram = &datagram, .now = now, .born = {now, now}};
+    of->now = now;
+    of->notes.size = 0;
+    bool is_complete = collect(&of->routing.stage, to, &message);
+    free(copy); /* what is kept is copied */
+    datagram.data = NULL;
+    keep_losses(of);
+    if (is_complete) note_all(&of->routing.stage, to, &message);
+    *notes = of->notes.data;
+    return of->notes.size;
+}
+
+void seam_adopt(struct delivering *of, const struct timer_change *change) {
+    timers_change(of->routing.stage.timers, change);
+    keep_losses(of);
+}
+
+/* Serve the timers that are due, and return when the next one is. */
+int64_t seam_serve(struct delivering *of, int64_t now) {
+    of->now = now;
+    timers_serve(of->routing.stage.timers, now);
+    keep_losses(of);
+    return of->routing.stage.timers->next_due;
 }
 
 /* Serve a message from ROS, likewise. */

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from ctypes import POINTER, byref, c_bool, c_char_p, c_int64, c_size_t, c_uint32, c_void_p
 from pathlib import Path
 from struct import Struct
@@ -11,6 +11,7 @@ from typing import NamedTuple, Union
 
 from router.carrier import structures as c
 from router.carrier.build import NATIVE, compile_c
+from router.carrier.collectors import NativeCollector, native_collect
 from router.carrier.from_ros import native_for_each
 from router.carrier.lowered import Programs, native_values
 from router.compiler.lowering import LoweredFeed, LoweredRoute
@@ -19,8 +20,10 @@ from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"
 _NOTED = Struct("@IIiIII")
-_OF_ROUTE, _DELIVERED, _FILTERED, _BYTES, _FIRST_LOSS = range(5)
+_OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_LOSS = range(6)
 _OF_TARGET = _FIRST_LOSS + len(c.LOSSES)
+_LOSS = Struct("@6Ii3I")
+"""`struct lost_event`."""
 
 
 def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL:
@@ -35,6 +38,15 @@ def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDL
         c_size_t,
         (c_void_p, c_void_p, c_char_p, c_uint32, c_bool, c_uint32, c_int64, POINTER(c_void_p)),
     )
+    loaded.seam_part.restype = c_size_t
+    loaded.seam_part.argtypes = (
+        c_void_p, c_void_p, c_char_p, c_uint32, c_uint32, c_uint32, c_uint32, c_int64, c_int64, POINTER(c_void_p),
+    )  # fmt: skip
+    loaded.seam_adopt.restype, loaded.seam_adopt.argtypes = None, (c_void_p, c_void_p)
+    loaded.seam_serve.restype, loaded.seam_serve.argtypes = c_int64, (c_void_p, c_int64)
+    loaded.seam_losses.restype, loaded.seam_losses.argtypes = c_size_t, (c_void_p, POINTER(c_void_p))
+    loaded.collector_open.restype, loaded.collector_open.argtypes = c_void_p, (c_int64,)
+    loaded.collector_close.restype, loaded.collector_close.argtypes = None, (c_void_p,)
     loaded.seam_from_ros.restype, loaded.seam_from_ros.argtypes = (
         c_size_t,
         (c_void_p, c_void_p, c_char_p, c_size_t, c_int64, POINTER(c_void_p)),
@@ -53,11 +65,18 @@ class Outcome(NamedTuple):
 class Delivering:
     """Delivers to all targets of a route that were lowered. Those of messages from ROS are destinations.
 
-    Without a message of its own, a target gets the datagram. `source` is the name of any sender.
+    Without a message of its own, a target gets the datagram. `source` is the name of any sender. With `collect`, there
+    may be others, and frames end after `timeout` ns.
     """
 
     def __init__(
-        self, functions: ctypes.CDLL, lowered: LoweredRoute | LoweredFeed, received_at: int = 0, source: str = ""
+        self,
+        functions: ctypes.CDLL,
+        lowered: LoweredRoute | LoweredFeed,
+        received_at: int = 0,
+        source: str = "",
+        others: Sequence[str] = (),
+        timeout: int = 1,
     ) -> None:
         self._functions, self._received_at = functions, received_at
         self._lowered = [*lowered.targets.values()]
@@ -72,7 +91,7 @@ class Delivering:
             first = 1 + number * _OF_TARGET
             made = c.Target(condition=programs.code(target.condition), message=programs.code(target.message))
             made.id, made.delivered, made.filtered = number, first + _DELIVERED, first + _FILTERED
-            made.delivered_bytes = first + _BYTES
+            made.collected, made.delivered_bytes = first + _COLLECTED, first + _BYTES
             made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(len(c.LOSSES))]
             if target.message and not is_from_ros:
                 made.topic = ctypes.pointer(topic)
@@ -80,7 +99,7 @@ class Delivering:
         self._targets = c.Targets(
             targets=(c.Target * len(targets))(*targets),
             count=len(targets),
-            sources=native_values([source.encode()], self._arrays),
+            sources=native_values([each.encode() for each in (source, *others)], self._arrays),
             topic=c.NO_NAME,
         )
         self._route: c.RosRoute | None = None
@@ -88,10 +107,18 @@ class Delivering:
             self._route = c.RosRoute(
                 for_each=native_for_each(lowered.for_each, programs), seconds=NONE, nanoseconds=NONE
             )
+        self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.addressof(self._targets)))
+        if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
+            collector = NativeCollector(functions, timeout)
+            self._adopted[0].timer = collector.address
+            collect = native_collect(lowered.collect, programs, collector, range(1 + len(others)))
+            self._targets.collect = ctypes.pointer(collect)
         self._targets.layout = programs.layout()
         if self._route is not None:
             self._route.targets = self._targets
         self._address = functions.seam_open(self._counters)
+        if self._targets.collect:
+            functions.seam_adopt(self._address, byref(c.TimerChange(adopted=self._adopted, adopted_count=1)))
 
     def __del__(self) -> None:
         self._functions.seam_close(self._address)
@@ -108,6 +135,47 @@ class Delivering:
             self._address, byref(self._targets), data, len(data), is_single, 0, self._received_at, byref(notes)
         )
         return [*self._outcomes(ctypes.string_at(notes.value or 0, size))]
+
+    def part(
+        self, data: bytes, now: int = 0, column: int = 0, payload: tuple[int, int] = (0, 0)
+    ) -> list[Outcome] | None:
+        """Deliver an envelope to targets with `collect`. `payload` is its start and its length where it is alone.
+
+        Returns one outcome for each target if it completes a frame, else None.
+        """
+        notes, to = c_void_p(), byref(self._targets)
+        about = *payload, column, self._received_at, now
+        size = self._functions.seam_part(self._address, to, data, len(data), *about, byref(notes))
+        return [*self._outcomes(ctypes.string_at(notes.value or 0, size))] or None
+
+    def serve(self, now: int) -> int:
+        """Serve the timers that are due, and return when the next one is."""
+        return int(self._functions.seam_serve(self._address, now))
+
+    def end_frames(self) -> None:
+        """End all frames, and the collector."""
+        ended = (c_void_p * 1)(self._adopted[0].timer)
+        self._functions.seam_adopt(self._address, byref(c.TimerChange(ended=ended, ended_count=1)))
+
+    def losses(self) -> list[tuple[str, str]]:
+        """What was lost before it was delivered, since the last call: label and details."""
+        events = c_void_p()
+        length = self._functions.seam_losses(self._address, byref(events))
+        records = ctypes.string_at(events.value or 0, length)
+        made, at = [], 0
+        while at < len(records):
+            size, _, _, _, target, *_ = _LOSS.unpack_from(records, at)
+            text = records[at + _LOSS.size : at + size].partition(b"\0")[0].decode()
+            made.append((self._lowered[target].label, text))
+            at += size
+        return made
+
+    def counted(self, label: str) -> dict[str, int]:
+        """What a target has counted."""
+        number = [each.label for each in self._lowered].index(label)
+        of_target = self._counters[1 + number * _OF_TARGET :][:_OF_TARGET]
+        names = (None, "delivered", "filtered", "collected", None, *c.LOSSES)
+        return {name: count for name, count in zip(names, of_target, strict=True) if name and count}
 
     def from_ros(self, data: bytes) -> list[Outcome]:
         """Serve a message from ROS. Returns one outcome for each target, for each element with `for_each`."""

@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from ctypes import c_int64, c_void_p
+from functools import partial
 from struct import Struct
 from time import monotonic, sleep
 from types import SimpleNamespace
@@ -14,12 +15,15 @@ from typing import Any, cast
 
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
+from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen
+from router.carrier.deferrals import timer_change
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
+from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
 from tests.engine.rig import Ledger
 
@@ -65,6 +69,7 @@ class Publishing:
         self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack, queue: int = 1 << 16
     ) -> None:
         self.program = program
+        self._library, self._state = library, State()
         self._received, self._published, self._braked = ((c_int64 * MOST_COUNTERS)() for _ in range(3))
         self._names = Names()
         self._events, self._ring = Ring(library, 1 << 16), Ring(library, queue)
@@ -75,10 +80,12 @@ class Publishing:
         self._limits: dict[object, c.Limit] = {}
         self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
         self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
+        self._changes: list[c.PublishChange] = []
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
         self.thread = PublishThread(library, self._ring, self._published, self._events, cast("Any", addresses))
         stack.callback(self._close)
-        self._carrier.start(self._programs[0])
+        self._change_topics()
+        self._carrier.start(self._programs[0], timer_change((), ()))
         self.sent = 0
 
     def send(self, *datagrams: bytes, listener: str = "exact") -> None:
@@ -90,9 +97,18 @@ class Publishing:
 
     def change(self, generation: int, program: Program | None = None) -> None:
         """Receive with another program from now on; the thread goes on to it."""
+        self._state = State(self._state)
         self._programs.append(self._made(program or self.program, generation))
-        self._carrier.change(self._programs[-1], ())
+        self._change_topics()
+        self._carrier.change(self._programs[-1], (), timer_change((), ()))
         self.thread.advance(generation)
+
+    def _change_topics(self) -> None:
+        made, left = self._programs[-1], [each for each in self._state.left() if isinstance(each, NativeCollector)]
+        timers = timer_change(made.adopted, [each.address for each in left])
+        made.arrays.append(left)
+        self._changes.append(c.PublishChange(timers=timers, generation=made.generation))
+        self.thread.change(self._changes[-1])
 
     def stop_receiving(self) -> None:
         self._carrier.stop_receiving()
@@ -138,6 +154,8 @@ class Publishing:
             publications=self.publishers,
             feeds=lambda _route, _names: (),
             limit=self._limit,
+            deferral=lambda *_: None,
+            collector=partial(kept_collector, self._library, self._state),
             names=self._names,
         )
         return native_program(program, generation, outlets)

@@ -97,6 +97,8 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
             publications={},
             feeds=lambda *_: [(deadman.address, False)],
             limit=lambda *_: pytest.fail("no target has one"),
+            deferral=lambda *_: None,
+            collector=lambda _: pytest.fail("no route has one"),
             names=names,
         )
         (plan,) = made.subscriptions

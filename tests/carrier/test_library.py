@@ -59,7 +59,7 @@ def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
         for field in structure._fields_
     ]
     main = tmp_path / "offsets.c"
-    headers = "".join(f"#include {name}\n" for name in ("<stdio.h>", '"from_ros.h"', '"publish.h"'))
+    headers = "".join(f"#include {name}\n" for name in ("<stdio.h>", '"collect.h"', '"from_ros.h"', '"publish.h"'))
     main.write_text(f"{headers}int main(void) {{ {' '.join(lines)} }}\n")
     build.compile_c([str(main), f"-I{build.NATIVE}", "-o", str(tmp_path / "offsets")])
     printed = subprocess.check_output([tmp_path / "offsets"], text=True)

@@ -198,7 +198,8 @@ class Rig:
         while (next_due := self._next_due()) is not None and next_due <= until:
             self.now = max(self.now, next_due)
             for timer in self.timers:
-                timer.due(self.now)
+                if timer.next_due is not None and timer.next_due <= self.now:
+                    timer.due(self.now)
         self.now = until
 
     def _next_due(self) -> int | None:

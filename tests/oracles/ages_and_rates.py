@@ -47,11 +47,11 @@ class Freshness:
 class RateLimit:
     def __init__(self, hertz: float) -> None:
         self._period = ceil(1_000_000_000 / hertz)
-        self._next = -self._period
+        self.next_pass = -self._period
 
     def may_pass(self, now: int) -> bool:
-        if now < self._next:
+        if now < self.next_pass:
             return False
-        is_on_the_grid = now < self._next + self._period
-        self._next = self._next + self._period if is_on_the_grid else now + self._period - self._period // 2
+        is_on_the_grid = now < self.next_pass + self._period
+        self.next_pass = self.next_pass + self._period if is_on_the_grid else now + self._period - self._period // 2
         return True

@@ -68,12 +68,12 @@ struct program {
     const struct route *routes;
 };
 
-/* What changes with a program, beside it: done between two datagrams. */
+/* What changes with a program, beside it: done between two datagrams. What ends sends what it holds, then. */
 struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
-    struct timer *const *ended;
-    uint32_t replaced_count, ended_count;
+    struct timer_change timers;
+    uint32_t replaced_count, reserved;
 };
 
 /* A message for topics, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */

@@ -207,12 +207,16 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
         deadman->destinations[index].datagram = memcpy(copy, destinations[index].datagram, destinations[index].size);
         copy += destinations[index].size;
     }
+    pthread_mutex_lock(&timers->lock);
     timers_add(timers, &deadman->timer);
+    pthread_mutex_unlock(&timers->lock);
     return deadman;
 }
 
 void deadman_close(struct timers *timers, struct deadman *deadman) {
+    pthread_mutex_lock(&timers->lock);
     timers_remove(timers, &deadman->timer);
+    pthread_mutex_unlock(&timers->lock);
     free(deadman);
 }
 

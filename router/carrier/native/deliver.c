@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "clock.h"
+#include "defer.h"
 #include "envelope.h"
 #include "evaluate.h"
 
@@ -22,14 +23,24 @@ struct delivery {
 
 static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
 
-/* Count and report a loss. `lost` has the reason, and details if there are any. Returns false. */
+void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+                  struct lost_event lost, const char *text) {
+    lost.route = to->route;
+    lost.topic = to->topic;
+    lost.target = target->id;
+    lost.counter = target->dropped[lost.reason];
+    stage_count(stage, lost.counter, 1);
+    report_loss(&stage->reporter, now, &lost, text);
+}
+
+void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
+    if (target->topic) lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_STALE}, "");
+    else stage_count(stage, target->dropped[LOSS_STALE], 1);
+}
+
+/* Returns false. */
 static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
-    lost.route = of->to->route;
-    lost.topic = of->to->topic;
-    lost.target = of->target->id;
-    lost.counter = of->target->dropped[lost.reason];
-    count(of, lost.counter);
-    report_loss(&of->stage->reporter, of->message->now, &lost, text);
+    lose_message(of->stage, of->to, of->target, of->message->now, lost, text);
     return false;
 }
 
@@ -39,20 +50,16 @@ static bool refuse(const struct delivery *of, int reason, uint32_t place) {
     return lose(of, (struct lost_event){.reason = (uint32_t)reason, .generation = generation, .place = place}, "");
 }
 
-/* The message is older than `ttl`. Stale commands are only counted: after a stall there are many at once. */
-static bool lose_stale(const struct delivery *of) {
-    if (of->target->topic) return lose(of, (struct lost_event){.reason = LOSS_STALE}, "");
-    count(of, of->target->dropped[LOSS_STALE]);
-    return false;
-}
-
 /* ---- fields ---- */
 
-/* Read the fields of a datagram that programs of the route use. */
-static bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
+void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
     machine_begin(machine, to->layout);
     machine->slots[SLOT_RECEIVED_AT].integer = from->received_at;
     machine->slots[SLOT_SOURCE] = to->sources[from->column];
+}
+
+bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
+    begin_datagram(machine, to, from);
     if (!from->is_single) return machine_read(machine, NODE_ENVELOPE, from->data, from->size);
     return machine_read(machine, NODE_PAYLOAD, from->data + from->start, from->length);
 }
@@ -93,7 +100,9 @@ static int64_t expiry(const struct delivery *of) {
 }
 
 static bool is_fresh(const struct delivery *of) {
-    return of->expires == NEVER || of->stage->now(of->stage) <= of->expires || lose_stale(of);
+    if (of->expires == NEVER || of->stage->now(of->stage) <= of->expires) return true;
+    lose_stale(of->stage, of->to, of->target, of->message->now);
+    return false;
 }
 
 static bool keeps_rate(const struct delivery *of) {
@@ -131,28 +140,35 @@ static enum loss loss_of(int error) {
     return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
 }
 
-static void send_it(const struct delivery *of) {
-    const struct target *target = of->target;
-    size_t size = target->trims ? trimmed_size(of->data, of->size) : of->size;
-    int error = of->stage->send(of->stage, target, of->data, size, of->expires);
+static void send_it(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+                    size_t size, int64_t expires, int64_t now) {
+    int error = stage->send(stage, target, data, size, expires);
     if (error == COMMAND_STALE) {
-        lose_stale(of);
+        lose_stale(stage, to, target, now);
     } else if (error) {
-        lose(of, (struct lost_event){.reason = loss_of(error), .error = error}, "");
+        lose_message(stage, to, target, now, (struct lost_event){.reason = loss_of(error), .error = error}, "");
     } else {
-        count(of, target->delivered);
-        stage_count(of->stage, target->delivered_bytes, (int64_t)size);
+        stage_count(stage, target->delivered, 1);
+        stage_count(stage, target->delivered_bytes, (int64_t)size);
     }
 }
 
-/* Return false if the thread has been given up. */
-static bool publish_it(const struct delivery *of) {
+static bool publish_it(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
     const char *why;
-    switch (of->stage->publish(of->stage, of->target, &why)) {
-    case PUBLISHED: count(of, of->target->delivered); return true;
-    case PUBLISH_FAILED: lose(of, (struct lost_event){.reason = LOSS_PUBLISH_ERROR}, why); return true;
+    switch (stage->publish(stage, target, &why)) {
+    case PUBLISHED: stage_count(stage, target->delivered, 1); return true;
+    case PUBLISH_FAILED:
+        lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_PUBLISH_ERROR}, why);
+        return true;
     default: return false;
     }
+}
+
+bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+                 size_t size, int64_t expires, int64_t now) {
+    if (target->topic) return publish_it(stage, to, target, now);
+    send_it(stage, to, target, data, size, expires, now);
+    return true;
 }
 
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
@@ -170,9 +186,9 @@ bool deliver(struct stage *stage, const struct targets *to, const struct target 
         return true;
     }
     if (!fits_board(&of)) return true;
-    if (target->topic) return publish_it(&of);
-    send_it(&of);
-    return true;
+    if (target->trims) of.size = trimmed_size(of.data, of.size);
+    if (target->deferral) return defer(stage, target->deferral, of.data, of.size, of.expires, message->now);
+    return deliver_now(stage, to, target, of.data, of.size, of.expires, message->now);
 }
 
 bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message) {

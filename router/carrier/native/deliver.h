@@ -7,6 +7,7 @@
  *     rate        `max_rate`                                          else rate_limited
  *     message     what the program writes, or the envelope as it was received
  *     board       what the firmware can take                          else too_large or non_finite
+ *     defer       `on_limit: latest` and `bandwidth` (defer.h)
  *     send or publish, and feed deadmen
  *
  * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table asks for, and
@@ -40,27 +41,36 @@ struct topic {
 struct target {
     struct code condition; /* empty: it gets every message */
     struct code message;   /* empty: it gets the envelope as it was received */
-    struct limit *limit;   /* `max_rate`, or NULL */
+    struct limit *limit;   /* `max_rate` with `on_limit: first`, or NULL */
+    struct deferral *deferral; /* what may hold its messages back, or NULL */
+    int64_t period;            /* of `on_limit: latest`, ns; 0 without */
     const struct topic *topic; /* NULL for a destination, which has these: */
     struct sender *sender;
     const struct board *board; /* NULL if it is no board */
     const struct feed *feeds;  /* the deadmen that a command feeds or disarms */
     uint32_t feed_count;
     uint32_t trims; /* it gets datagrams without their trailing zeros */
+    uint32_t priority; /* where its messages wait for a bandwidth, an enum priority in pace.h */
     uint32_t id;    /* in events */
-    /* Counters. `waiting`: of a target whose messages come by a ring; `delivered_bytes`: of a destination. */
-    uint32_t waiting, filtered, delivered, delivered_bytes, dropped[LOSSES];
+    /* Counters. `waiting`: of a target whose messages come by a ring; `collected`: of one that gets frames;
+     * `delivered_bytes`: of a destination. */
+    uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
 };
+
+struct deferral;
 
 /* The first slots of every layout of datagrams, and its first nodes. */
 enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
 enum { NODE_PAYLOAD, NODE_ENVELOPE };
+
+struct collect;
 
 /* The targets of a route that one thread serves. */
 struct targets {
     int64_t ttl;                 /* ns, 0 for none */
     const struct layout *layout; /* what their programs read; NULL if there are none */
     const struct value *sources; /* names of senders, by column; of datagrams */
+    const struct collect *collect; /* they get frames (collect.h), not each datagram; NULL without `collect` */
     const struct target *targets;
     uint32_t count;
     /* In events: the route, the topic whose messages these are, or NO_NAME, and the generation of the program. */
@@ -123,6 +133,23 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
     counter_add(stage->counters, index, amount);
     if (stage->counted) stage->counted(stage, index, amount);
 }
+
+/* Begin with a datagram: slots have their defaults, but those of its time and its sender. */
+void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
+
+/* Begin with it, and read the fields that programs of the route use. Return false if it is malformed. */
+bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
+
+/* Count and report that a target loses a message. `lost` has the reason, and details if there are any. */
+void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+                  struct lost_event lost, const char *text);
+
+/* The message is older than `ttl`. Stale commands are only counted: after a stall there are many at once. */
+void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now);
+
+/* Send these bytes, or publish the machine's output, and count that. Return false if the thread has been given up (LEFT). */
+bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+                 size_t size, int64_t expires, int64_t now);
 
 /* Deliver a message to one of the targets. Return false if the thread has been given up (LEFT). */
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);

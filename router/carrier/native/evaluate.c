@@ -224,6 +224,12 @@ static int run(struct machine *machine, const struct code *code, uint32_t *at) {
     return outcome;
 }
 
+int evaluate_value(struct machine *machine, const struct code *code, struct value *value, uint32_t *at) {
+    int outcome = run(machine, code, at);
+    *value = machine->stack[1];
+    return outcome;
+}
+
 int evaluate_condition(struct machine *machine, const struct code *code, bool *is_true, uint32_t *at) {
     int outcome = run(machine, code, at);
     *is_true = machine->stack[1].integer;

@@ -15,6 +15,9 @@ enum { EVALUATED = -1 };
 /* Evaluate a condition. */
 int evaluate_condition(struct machine *machine, const struct code *code, bool *is_true, uint32_t *at);
 
+/* Evaluate a number or a text, which is valid until another program runs. */
+int evaluate_value(struct machine *machine, const struct code *code, struct value *value, uint32_t *at);
+
 /* Write the message that a program makes to the machine's output. If it is refused, the output is not valid. */
 int evaluate_message(struct machine *machine, const struct code *code, uint32_t *at);
 

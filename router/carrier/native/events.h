@@ -35,7 +35,12 @@ struct lost_event {
 #define NO_NAME UINT32_MAX
 
 /* Where a program refuses a message: `places` of a LoweredTarget in compiler/lowering. */
-enum place { PLACE_MESSAGE, PLACE_CONDITION, PLACE_FOR_EACH, PLACE_OPERATIONS /* and the index of one */ };
+enum place {
+    PLACE_MESSAGE,
+    PLACE_CONDITION,
+    PLACE_ROUTE,     /* `for_each` or `collect` */
+    PLACE_OPERATIONS /* and the index of one */
+};
 
 /* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
 enum loss {
@@ -48,6 +53,7 @@ enum loss {
     LOSS_SEND_ERROR,
     LOSS_PUBLISH_ERROR,
     LOSS_TOO_LARGE,
+    LOSS_INCOMPLETE,
     LOSSES
 };
 

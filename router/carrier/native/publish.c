@@ -14,6 +14,7 @@ struct publish_thread {
     pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
     pthread_cond_t changed;
     bool has_ended, is_left; /* under the lock */
+    struct publish_change *changes; /* likewise: those that it has not reached, in order */
     _Atomic bool is_stopping;
     _Atomic uint32_t latest; /* generation */
     /* Written by the thread: */
@@ -56,17 +57,44 @@ static enum publication publish_unlocked(struct stage *stage, const struct targe
 
 /* ---- the thread ---- */
 
+/* For how long to wait for messages, in ms: until the next timer is due, or for ever (-1). */
+static int patience_of(const struct publish_thread *thread) {
+    int64_t due = atomic_load_explicit(&thread->stage.timers->next_due, memory_order_relaxed);
+    if (due == NEVER) return -1;
+    int64_t wait = due - boottime_ns();
+    return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
+}
+
 /* Take messages, without the lock. Return how many bytes they have. */
 static size_t take(struct publish_thread *thread, bool waits) {
+    int timeout = waits ? patience_of(thread) : 0;
     pthread_mutex_unlock(&thread->lock);
-    size_t size = ring_take(thread->ring, thread->records, sizeof thread->records, waits ? -1 : 0);
+    size_t size = ring_take(thread->ring, thread->records, sizeof thread->records, timeout);
     pthread_mutex_lock(&thread->lock);
     return size;
 }
 
+static void serve_timers(struct publish_thread *thread) {
+    int64_t due = atomic_load_explicit(&thread->stage.timers->next_due, memory_order_relaxed);
+    if (due == NEVER) return;
+    int64_t now = thread->stage.now(&thread->stage);
+    if (now < due) return;
+    edition_begin(&thread->edition);
+    timers_serve(thread->stage.timers, now);
+    edition_end(&thread->edition);
+}
+
 /* Go on to a generation, unless it was reached. */
 static void reach(struct publish_thread *thread, uint32_t generation) {
-    if (generation > atomic_load(&thread->generation)) atomic_store(&thread->generation, generation);
+    if (generation <= atomic_load(&thread->generation)) return;
+    while (!thread->is_left && thread->changes && thread->changes->generation <= generation) {
+        const struct publish_change *change = thread->changes;
+        thread->changes = change->next;
+        edition_begin(&thread->edition);
+        timers_change(thread->stage.timers, &change->timers);
+        edition_end(&thread->edition);
+    }
+    atomic_store(&thread->generation, generation);
 }
 
 /* Serve what was taken. Return false if the thread was left meanwhile. */
@@ -74,13 +102,23 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
     for (size_t at = 0; at < size;) {
         const struct message_record *record = (const struct message_record *)(thread->records + at);
         reach(thread, record->generation);
+        if (thread->is_left) return false;
         edition_begin(&thread->edition);
         bool goes_on = route_to_topics(&thread->stage, record);
         edition_end(&thread->edition);
         if (!goes_on) return false;
+        serve_timers(thread);
+        if (thread->is_left) return false;
         at += record->size;
     }
     return true;
+}
+
+/* Settle what is still kept. */
+static void end_timers(struct publish_thread *thread) {
+    edition_begin(&thread->edition);
+    timers_end(thread->stage.timers);
+    edition_end(&thread->edition);
 }
 
 static void *run(void *of) {
@@ -94,7 +132,10 @@ static void *run(void *of) {
         size_t size = take(thread, !is_stopping && latest <= atomic_load(&thread->generation));
         if (thread->is_left || !serve_all(thread, size) || (is_stopping && !size)) break;
         if (!size) reach(thread, latest);
+        if (!thread->is_left) serve_timers(thread);
+        if (thread->is_left) break;
     }
+    if (!thread->is_left) end_timers(thread);
     thread->has_ended = true;
     pthread_cond_broadcast(&thread->changed);
     pthread_mutex_unlock(&thread->lock);
@@ -107,6 +148,7 @@ static void *run(void *of) {
 static void publish_close(struct publish_thread *thread) {
     pthread_cond_destroy(&thread->changed);
     pthread_mutex_destroy(&thread->lock);
+    if (thread->stage.timers) timers_close(thread->stage.timers);
     stage_close(&thread->stage);
     free(thread);
 }
@@ -124,7 +166,8 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
     condition_open(&thread->changed);
     bool is_open = stage_open(&thread->stage, counters, events, NULL);
     thread->stage.publish = publish_unlocked;
-    if (is_open) return thread;
+    thread->stage.timers = timers_open_on(&thread->stage);
+    if (is_open && thread->stage.timers) return thread;
     publish_close(thread);
     return NULL;
 }
@@ -135,6 +178,15 @@ struct publish_thread *publish_open(struct ring *ring, counter *counters, struct
     if (!thread || !start_thread(&thread->thread, "publish", run, thread)) return thread;
     publish_close(thread);
     return NULL;
+}
+
+void publish_change(struct publish_thread *thread, struct publish_change *change) {
+    change->next = NULL;
+    pthread_mutex_lock(&thread->lock);
+    struct publish_change **last = &thread->changes;
+    while (*last) last = &(*last)->next;
+    *last = change;
+    pthread_mutex_unlock(&thread->lock);
 }
 
 void publish_advance(struct publish_thread *thread, uint32_t generation) {

@@ -18,6 +18,16 @@ struct publish_thread;
 struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
                                     error_function *error, reset_function *reset);
 
+/* What a generation changes in the timers of messages that the thread keeps. Belongs to the caller until it has reached it. */
+struct publish_change {
+    struct timer_change timers;
+    struct publish_change *next; /* of those that the thread has not reached */
+    uint32_t generation, reserved;
+};
+
+/* Have the thread make a change when it reaches that generation: to be called before a message of it comes. */
+void publish_change(struct publish_thread *thread, struct publish_change *change);
+
 /* Have the thread go on to a generation once all that is in the ring is served: nothing of an earlier one comes any more. */
 void publish_advance(struct publish_thread *thread, uint32_t generation);
 
@@ -27,8 +37,8 @@ bool publish_has_reached(struct publish_thread *thread, uint32_t generation);
 /* The topic in whose publisher the thread is now, by its id, and since when (monotonic); 0 if in none. */
 int64_t publish_since(struct publish_thread *thread, uint32_t *topic);
 
-/* Serve what waits, and end the thread. Returns false after 1 s: it is stuck in the middleware, and left there with a
- * publisher. Should it return, it ends; it uses nothing else of the caller's. */
+/* Serve what waits, settle what is kept, and end the thread. Returns false after 1 s: it is stuck in the middleware, and left
+ * there with a publisher. Should it return, it ends; it uses nothing else of the caller's. */
 bool publish_stop(struct publish_thread *thread);
 
 /* Copy the first counters as in `counters_copy`. */

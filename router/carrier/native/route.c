@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "collect.h"
 #include "events.h"
 
 /* ---- events ---- */
@@ -36,6 +37,7 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
 }
 
 static bool is_wanted(const struct targets *to) {
+    if (to->collect) return true; /* a frame is counted also while nobody subscribes */
     for (uint32_t index = 0; index < to->count; index++)
         if (__atomic_load_n(to->targets[index].topic->wanted, __ATOMIC_RELAXED)) return true;
     return false;
@@ -150,7 +152,7 @@ int route_datagram(struct routing *routing, struct received *received) {
 void route_by(struct routing *routing, const struct change *change) {
     for (uint32_t index = 0; index < change->replaced_count; index++)
         deadman_replace(routing->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    for (uint32_t index = 0; index < change->ended_count; index++) timer_end(routing->stage.timers, change->ended[index]);
+    timers_change(routing->stage.timers, &change->timers);
     routing->program = change->program;
 }
 
@@ -160,8 +162,9 @@ bool route_to_topics(struct stage *stage, const struct message_record *record) {
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};
     struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
+    bool is_delivered = !to->collect || collect(stage, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {
-        if (!deliver(stage, to, &to->targets[index], &message)) return false;
+        if (is_delivered && !deliver(stage, to, &to->targets[index], &message)) return false;
         stage_count(stage, to->targets[index].waiting, -1);
     }
     return true;

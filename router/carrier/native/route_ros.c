@@ -64,7 +64,7 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
     struct machine *machine = &routing->stage.machine;
     struct value list;
     uint32_t at;
-    message->place = PLACE_FOR_EACH;
+    message->place = PLACE_ROUTE;
     message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
     if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) message->outcome = LOSS_MAPPING_ERROR;
     if (message->outcome != EVALUATED) {

@@ -38,6 +38,12 @@ struct timers *timers_open_on(struct stage *stage) {
     return timers;
 }
 
+/* Send a command while the lock is held. */
+static int send_locked(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    int64_t now = stage->now(stage);
+    return command_send_at(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count, now);
+}
+
 struct timers *timers_open(counter *counters, struct ring *events) {
     struct stage *stage = calloc(1, sizeof *stage);
     if (!stage) return NULL;
@@ -48,6 +54,7 @@ struct timers *timers_open(counter *counters, struct ring *events) {
         return NULL;
     }
     stage->timers = timers;
+    stage->send = send_locked;
     timers->has_own_stage = true;
     return timers;
 }
@@ -89,37 +96,57 @@ void timers_note_due(struct timers *timers) {
     if (next < timers->timer_set_for) set_timer(timers, next);
 }
 
-void timers_await_next(struct timers *timers) { set_timer(timers, find_due(timers)); }
+void timers_await_next(struct timers *timers) {
+    if (!timers->is_left) set_timer(timers, find_due(timers));
+}
+
+void timers_add(struct timers *timers, struct timer *timer) {
+    if (timer->is_listed) return;
+    timer->is_listed = true;
+    timer->next = timers->first;
+    timers->first = timer;
+}
+
+void timers_remove(struct timers *timers, struct timer *timer) {
+    if (!timer->is_listed) return;
+    timer->is_listed = false;
+    struct timer **link = &timers->first;
+    while (*link != timer) link = &(*link)->next;
+    *link = timer->next;
+}
+
+/* End the timers that hold messages, or the deadmen. Those that are ended may leave the list. */
+static void end_all(struct timers *timers, bool holds, int64_t now) {
+    for (struct timer *each = timers->first, *next; each; each = next) {
+        next = each->next;
+        if (holds == (each->kind->adopt != NULL)) each->kind->end(timers, each, now);
+        if (timers->is_left) return;
+    }
+}
 
 /* ---- public ---- */
 
 void timers_serve(struct timers *timers, int64_t now) {
     pthread_mutex_lock(&timers->lock);
-    for (struct timer *each = timers->first; each; each = each->next)
+    for (struct timer *each = timers->first; each && !timers->is_left; each = each->next)
         if (each->due <= now) each->kind->serve(timers, each, now);
     timers_await_next(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 
-void timers_add(struct timers *timers, struct timer *timer) {
-    pthread_mutex_lock(&timers->lock);
-    timer->next = timers->first;
-    timers->first = timer;
-    pthread_mutex_unlock(&timers->lock);
-}
 
-void timers_remove(struct timers *timers, struct timer *timer) {
+void timers_change(struct timers *timers, const struct timer_change *change) {
     pthread_mutex_lock(&timers->lock);
-    struct timer **link = &timers->first;
-    while (*link != timer) link = &(*link)->next;
-    *link = timer->next;
-    pthread_mutex_unlock(&timers->lock);
-}
-
-void timer_adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
-    pthread_mutex_lock(&timers->lock);
-    timer->kind->adopt(timers, timer, to, target);
-    timers_note_due(timers);
+    int64_t now = timers->stage->now(timers->stage);
+    for (uint32_t index = 0; index < change->ended_count && !timers->is_left; index++) {
+        struct timer *timer = change->ended[index];
+        timer->kind->end(timers, timer, now);
+    }
+    for (uint32_t index = 0; index < change->adopted_count && !timers->is_left; index++) {
+        const struct adoption *adoption = &change->adopted[index];
+        adoption->timer->kind->adopt(timers, adoption->timer, adoption->to, adoption->target);
+    }
+    if (!timers->is_left) timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 
@@ -127,5 +154,14 @@ void timer_end(struct timers *timers, struct timer *timer) {
     pthread_mutex_lock(&timers->lock);
     timer->kind->end(timers, timer, timers->stage->now(timers->stage));
     timers_note_due(timers);
+    pthread_mutex_unlock(&timers->lock);
+}
+
+void timers_end(struct timers *timers) {
+    pthread_mutex_lock(&timers->lock);
+    int64_t now = timers->stage->now(timers->stage);
+    end_all(timers, true, now);
+    if (!timers->is_left) end_all(timers, false, now);
+    if (!timers->is_left) timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
 }

@@ -26,9 +26,10 @@ struct timers;
 struct timer_kind {
     /* Act: it is due at `now` (boot clock, ns). */
     void (*serve)(struct timers *timers, struct timer *timer, int64_t now);
-    /* After a reload: what it holds is delivered by this target of the next program. NULL for a kind that holds nothing. */
+    /* After a reload: what it holds is delivered by this target of the next program; the same for the first program. It is
+     * served from then on. NULL for a deadman. */
     void (*adopt)(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target);
-    /* Settle what it holds, and be due never again. */
+    /* Settle what it holds, and be due never again. What is offered to it afterwards is not held. */
     void (*end)(struct timers *timers, struct timer *timer, int64_t now);
 };
 
@@ -37,6 +38,7 @@ struct timer {
     const struct timer_kind *kind;
     struct timer *next; /* in the list of its group */
     int64_t due;        /* boot clock, ns; NEVER if it is not */
+    bool is_listed;     /* the group has it */
 };
 
 /* A group. Its stage says how what is due leaves, and where that is counted. */
@@ -44,6 +46,7 @@ struct timers {
     pthread_mutex_t lock;
     struct stage *stage;
     bool has_own_stage;
+    bool is_left; /* publishing returned LEFT: nothing of others may be used any more */
     int timer;                /* timerfd, readable when a timer is due */
     int64_t timer_set_for;    /* boot clock, ns; NEVER while it is not set */
     _Atomic int64_t next_due; /* NEVER if nothing is due; may be read without the lock */
@@ -61,18 +64,31 @@ void timers_close(struct timers *timers); /* when no thread uses it and it has n
 /* Serve the timers that are due, and set the timerfd for the next one. `now` is of the boot clock. */
 void timers_serve(struct timers *timers, int64_t now);
 
-/* Serve a timer from now on. Remove it when no program refers to it, nor anything that may still use it. */
+/* Serve a timer from now on, or no longer. To be called with the lock held; may be called again. */
 void timers_add(struct timers *timers, struct timer *timer);
 void timers_remove(struct timers *timers, struct timer *timer);
 
-/* `adopt` and `end` of a timer, under the lock. */
-void timer_adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target);
-void timer_end(struct timers *timers, struct timer *timer);
-
-/* To be called with the lock held, once `due` of a timer has changed. */
+/* Likewise, once `due` of a timer has changed. */
 void timers_note_due(struct timers *timers);
 
 /* Set the timerfd for the next timer, once those that are due were served. The lock is held. */
 void timers_await_next(struct timers *timers);
+/* What a reload changes in a group, between two messages: what the timers of the next program deliver to, and those that
+ * only the earlier one has. Of the first program: what its timers deliver to. */
+struct adoption {
+    struct timer *timer;
+    const struct targets *to;
+    const struct target *target; /* NULL: all of them */
+};
+struct timer_change {
+    const struct adoption *adopted;
+    struct timer *const *ended;
+    uint32_t adopted_count, ended_count;
+};
+void timers_change(struct timers *timers, const struct timer_change *change);
+
+/* `end` of a timer; and of all, deadmen last, as what leaves then may feed them. */
+void timer_end(struct timers *timers, struct timer *timer);
+void timers_end(struct timers *timers);
 
 #endif

@@ -9,13 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.executors import Executors, executors, is_urgent
+from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.nodes import Node
+from router.compiler.lowering.numbers import signs
 from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
-from router.compiler.lowering.sources import Datagram, Elements, RosMessage
+from router.compiler.lowering.sources import Collected, Datagram, Elements, RosMessage
 from router.errors import Diagnostic
 from router.types.protobuf import Envelope
 
@@ -26,8 +28,8 @@ class LoweredTarget:
 
     Without a `when` the condition is empty. A destination from UDP gets the envelope as it was received: its `message`
     is empty. `places` are the places of the table where a message may be refused, by `enum place` in `native/events.h`:
-    the topic whose message cannot be read ("" of datagrams, which are checked before), the condition, `for_each`, and
-    what each operation of `message` fills.
+    the topic whose message cannot be read ("" of datagrams, which are checked before), the condition, `for_each` or
+    `collect`, and what each operation of `message` fills.
     """
 
     label: str
@@ -37,11 +39,29 @@ class LoweredTarget:
 
 
 @dataclass(frozen=True, slots=True)
+class LoweredCollect:
+    """`collect`: programs that name the frame of a datagram, its size, and the place of the datagram in it.
+
+    All give integers, but `by` a text if `is_text`. `signs` says whether `count` and `order` are unsigned. A complete
+    frame goes to the slots `items` and `counted`, NONE for one that is not used.
+    """
+
+    by: Code
+    count: Code
+    order: Code
+    is_text: bool
+    signs: int
+    items: int
+    counted: int
+
+
+@dataclass(frozen=True, slots=True)
 class LoweredRoute:
     """Targets of a route by name, and the fields that they read. Slots 0 and 1 are `received_at` and `source`."""
 
     targets: Mapping[str, LoweredTarget]
     layout: Layout
+    collect: LoweredCollect | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +129,7 @@ class _Table:
 
     def add(self, checked: CheckedRoute) -> None:
         conditions = [target for target in checked.targets if not target.topic and target.when is not None]
-        topics = [target for target in checked.targets if target.topic and checked.collect is None]
+        topics = [target for target in checked.targets if target.topic]
         for targets, lowered in ((conditions, self.conditions), (topics, self.topics)):
             self._lower(checked, targets, lowered)
         for feed in checked.subscriptions:
@@ -137,9 +157,15 @@ class _Table:
     def _route(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute | None:
         """Targets that share a layout; None with a finding."""
         source = Datagram(checked.case, self.envelope)
+        collect = checked.collect if targets[0].topic else None
         try:
-            made = {target.label: _published_or_forwarded(source, target) for target in targets}
-            return LoweredRoute(made, source.layout(checked.route.span))
+            collected = source.collect(collect) if collect else None
+            place = f"{collect.span}: collect" if collect else ""
+            made = {target.label: _published_or_forwarded(source, target, place) for target in targets}
+            layout = source.layout(checked.route.span)
+            if collect is None or collected is None:
+                return LoweredRoute(made, layout)
+            return LoweredRoute(made, layout, _collect(collect, collected, made.values()))
         except TooLargeError as error:
             self.findings.append(error.diagnostic)
             return None
@@ -154,13 +180,21 @@ class _Table:
             return None
 
 
-def _published_or_forwarded(source: Datagram, target: CheckedTarget) -> LoweredTarget:
+def _published_or_forwarded(source: Datagram, target: CheckedTarget, place: str) -> LoweredTarget:
     lowering = source.lowering()
     condition = source.condition(lowering, [target.when], is_bounded=target.plan is None)
     if target.plan is None:
-        return LoweredTarget(target.label, condition.code, (), ("", condition.place, ""))
+        return LoweredTarget(target.label, condition.code, (), ("", condition.place, place))
     message = source.published(lowering, target.plan)
-    return LoweredTarget(target.label, condition.code, message.code, ("", condition.place, "", *message.places))
+    return LoweredTarget(target.label, condition.code, message.code, ("", condition.place, place, *message.places))
+
+
+def _collect(checked: CheckedCollect, made: Collected, targets: Iterable[LoweredTarget]) -> LoweredCollect:
+    used = _used(targets)
+    items, counted = (each.index if _is_among(each, used) else NONE for each in (made.items, made.counted))
+    is_text = isinstance(checked.by.kind, StringKind)
+    signed = signs(UINT32, checked.count.kind, checked.order.kind)
+    return LoweredCollect(made.by, made.count, made.order, is_text, signed, items, counted)
 
 
 def _lowered_feed(checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
@@ -188,11 +222,20 @@ def _lowered_feed(checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFe
 
 
 def _elements(elements: Elements, targets: Iterable[LoweredTarget]) -> LoweredElements:
-    used = [operation.slot for each in targets for operation in (*each.condition, *each.message)]
+    used = _used(targets)
     item = elements.item
     node = item.index if isinstance(item, Node) and item.wanted else NONE
     slots = (
-        each.index if isinstance(each, Slot) and any(each is slot for slot in used) else NONE
+        each.index if isinstance(each, Slot) and _is_among(each, used) else NONE
         for each in (item, elements.index, elements.count)
     )
     return LoweredElements(elements.code, elements.scalar, node, *slots)
+
+
+def _used(targets: Iterable[LoweredTarget]) -> list[object]:
+    """The slots and nodes of all operations."""
+    return [operation.slot for each in targets for operation in (*each.condition, *each.message)]
+
+
+def _is_among(slot: Slot, used: Sequence[object]) -> bool:
+    return any(slot is each for each in used)

@@ -22,7 +22,18 @@ from router.compiler.expressions.kinds import (
     element_of,
     kind_of,
 )
-from router.compiler.expressions.tree import Call, Choice, Contains, Each, Element, Listed, Read, Relation, Variable
+from router.compiler.expressions.tree import (
+    MESSAGE,
+    Call,
+    Choice,
+    Contains,
+    Each,
+    Element,
+    Listed,
+    Read,
+    Relation,
+    Variable,
+)
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering.names import Loop
 from router.compiler.lowering.nodes import Node
@@ -78,6 +89,8 @@ def stored(lowering: Lowering, node: Tree) -> Stored:
     match node:
         case Read() if isinstance(node.kind, ListKind):
             return _read(lowering, node)
+        case Variable():
+            return _payloads(lowering, node)
         case Listed():
             return _listed(lowering, node)
         case Each():
@@ -94,7 +107,7 @@ def are_messages(node: Tree) -> bool:
     match node:
         case Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
-        case Listed() | Choice():
+        case Variable() | Listed() | Choice():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, MessageKind)
         case _:
             return False
@@ -108,6 +121,16 @@ def _read(lowering: Lowering, node: Read) -> Stored:
     is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
     made = code(before, load(holder.value(node.field)))
     return Stored(made, holder.stored(node.field), element, message, is_unchecked)
+
+
+def _payloads(lowering: Lowering, node: Variable) -> Stored:
+    """`items` of `collect`: the only variable with a list, of messages like the source message."""
+    items, payload = lowering.names.variables[node.name], lowering.names.variables[MESSAGE]
+    assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
+    assert isinstance(payload, Node)  # noqa: S101
+    assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
+    message = Node(payload.type, payload.descriptor, f"{node.name}[].")
+    return Stored((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
 
 def _listed(lowering: Lowering, node: Listed) -> Stored:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from google.protobuf.descriptor import Descriptor
 
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, MESSAGE, RECEIVED_AT, SOURCE, Read
+from router.compiler.checked import CheckedCollect
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, MESSAGE, RECEIVED_AT, SOURCE, Read
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
@@ -105,6 +106,19 @@ class Datagram(_Source):
         super().__init__(Node(case.type, descriptor))
         self._case, self._envelope = case.name, around
 
+    def collect(self, checked: CheckedCollect) -> Collected:
+        """Lower what makes frames of datagrams. Expressions can use `items` and `count` from now on."""
+        by, count, order = map(self._number, (checked.by, checked.count, checked.order))
+        items, counted = Slot(None, ITEMS), Slot(0, COUNT)
+        self.temporaries += items, counted
+        self.variables |= {ITEMS: items, COUNT: counted}
+        return Collected(by, count, order, items, counted)
+
+    def _number(self, node: Tree) -> Code:
+        code = self.lowering().value(node)
+        _want_small([(operation, node.span) for operation in code])
+        return code
+
     def published(self, lowering: Lowering, plan: Record) -> Message:
         """Lower the ROS message of a topic."""
         return _message(cdr_message(lowering, plan))
@@ -169,6 +183,17 @@ class Elements:
     item: Meaning
     index: Slot
     count: Slot
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Programs that name the frame of a datagram, its size and the place in it, and where a complete frame goes."""
+
+    by: Code
+    count: Code
+    order: Code
+    items: Slot
+    counted: Slot
 
 
 def _message(placed: Sequence[Placed]) -> Message:

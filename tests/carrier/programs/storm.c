@@ -187,8 +187,8 @@ static void free_made(struct made *made) {
 static void change(const struct made *next, const struct made *earlier) {
     struct deadman *replaced[] = {next->feed.deadman, earlier->feed.deadman};
     struct timer *ended[] = {(struct timer *)earlier->feed.deadman};
-    struct change change = {.program = &next->program, .replaced = replaced, .ended = ended, .replaced_count = 1,
-                            .ended_count = 1};
+    struct change change = {.program = &next->program, .replaced = replaced, .replaced_count = 1,
+                            .timers = {.ended = ended, .ended_count = 1}};
     carrier_change(carrier, &change);
     atomic_store(&acting, next->feed.deadman);
     atomic_store(&latest, next->program.generation);

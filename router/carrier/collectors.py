@@ -1,0 +1,53 @@
+"""`collect` as the carrier executes it: `native/collect.h`."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+from router.carrier import structures as c
+from router.carrier.lowered import Programs
+from router.carrier.state import State
+from router.compiler.lowering import LoweredCollect
+from router.compiler.program import Handler
+
+
+class NativeCollector:
+    """Keeps the frames of one route, which end `timeout` ns after their first datagram. `address` is its own."""
+
+    def __init__(self, library: ctypes.CDLL, timeout: int) -> None:
+        """Raises MemoryError."""
+        self._library = library
+        self.address: int = library.collector_open(timeout)
+        if not self.address:
+            raise MemoryError("frames of messages cannot be collected")
+
+    def __del__(self) -> None:
+        self._library.collector_close(self.address)
+
+
+def kept_collector(library: ctypes.CDLL, state: State, handler: Handler) -> NativeCollector:
+    """The collector of a route, which lives as long as programs have it, with these topics and this payload."""
+    timeout, targets = handler.collect_timeout, tuple(target for target in handler.targets if target.is_topic)
+    assert timeout is not None  # noqa: S101 - asked for by the caller
+    key = "collect", handler.route, timeout, handler.case.message_class, targets
+    return state.keep(key, lambda: NativeCollector(library, timeout))
+
+
+def native_collect(
+    lowered: LoweredCollect, programs: Programs, collector: NativeCollector, senders: Sequence[int]
+) -> c.Collect:
+    """`senders` are numbers of names, by column. The programs are those of the route."""
+    numbers = (ctypes.c_uint32 * len(senders))(*senders)
+    programs.arrays += [collector, numbers]
+    return c.Collect(
+        collector=collector.address,
+        by=programs.code(lowered.by),
+        count=programs.code(lowered.count),
+        order=programs.code(lowered.order),
+        senders=numbers,
+        is_text=lowered.is_text,
+        signs=lowered.signs,
+        items=lowered.items,
+        counted=lowered.counted,
+    )

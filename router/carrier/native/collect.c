@@ -1,0 +1,436 @@
+#include "collect.h"
+
+#include <inttypes.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "envelope.h"
+#include "evaluate.h"
+#include "events.h"
+#include "lists.h"
+#include "timers.h"
+#include "wire.h"
+
+/* What the messages of a sender call a frame: an integer, or text. The hash tells most of them apart. */
+struct name {
+    uint64_t hash;
+    uint32_t sender, size; /* `size` of the text, or IS_INTEGER */
+    union {
+        int64_t integer;
+        uint8_t text[LONGEST_NAME];
+    };
+};
+enum { IS_INTEGER = UINT32_MAX };
+
+/* A datagram of a frame. */
+struct part {
+    struct name name;
+    uint64_t count; /* may be more than a frame can have */
+    uint32_t index;
+};
+
+struct frame {
+    struct name name;
+    bool is_open;
+    int64_t ends_at;
+    uint32_t count, held; /* parts: of the frame, and those that are there */
+    uint32_t bytes;       /* of their payloads */
+    uint32_t stored;      /* and of their records */
+    uint32_t places[MOST_PARTS]; /* where the record of each part begins in the store, plus 1; 0 if it is not there */
+};
+
+/* In the store, in front of a payload. */
+struct record {
+    uint32_t size;         /* of the payload */
+    uint32_t frame, index; /* whose it is: it is kept while that place of the frame says so */
+};
+
+enum {
+    MOST_PADDING = sizeof(uint32_t) - 1,
+    LONGEST_RECORD = sizeof(struct record) + MAX_DATAGRAM + MOST_PADDING,
+    MOST_STORED = MOST_PART_BYTES + LONGEST_RECORD + (MOST_PARTS + 1) * (sizeof(struct record) + MOST_PADDING),
+    SLACK = 1 << 16,
+    STORE = 2 * MOST_STORED + SLACK
+};
+
+struct collector {
+    struct timer timer; /* first */
+    struct timers *timers;
+    int64_t timeout;
+    const struct targets *to;
+    struct frame *order[MOST_FRAMES]; /* open frames, the oldest first, then the others */
+    uint32_t open, parts, bytes;      /* frames, their parts, and the bytes of those */
+    uint32_t first_closed, closed;    /* of a ring, the earliest first */
+    uint64_t closed_hashes[MOST_CLOSED];
+    int64_t closed_until[MOST_CLOSED];
+    struct name closed_names[MOST_CLOSED];
+    uint8_t *store;          /* records, one behind the other; those that are not kept any more are skipped */
+    uint32_t used, stored;   /* bytes of it, and of records that are kept */
+    struct frame frames[MOST_FRAMES];
+};
+
+/* ---- counting ---- */
+
+enum { LONGEST_DETAIL = 80 };
+
+static void lose(const struct collector *collector, int64_t now, const char *detail) {
+    const struct targets *to = collector->to;
+    for (uint32_t index = 0; index < to->count; index++)
+        lose_message(collector->timers->stage, to, &to->targets[index], now, (struct lost_event){.reason = LOSS_INCOMPLETE},
+                     detail);
+}
+
+static void lose_large(const struct collector *collector, uint64_t count, int64_t now) {
+    char detail[LONGEST_DETAIL];
+    snprintf(detail, sizeof detail, "a frame of %" PRIu64 " parts, more than %d", count, MOST_PARTS);
+    lose(collector, now, detail);
+}
+
+static void count_filtered(const struct collector *collector) {
+    const struct targets *to = collector->to;
+    for (uint32_t index = 0; index < to->count; index++)
+        stage_count(collector->timers->stage, to->targets[index].filtered, 1);
+}
+
+static void count_collected(const struct collector *collector) {
+    const struct targets *to = collector->to;
+    for (uint32_t index = 0; index < to->count; index++)
+        stage_count(collector->timers->stage, to->targets[index].collected, 1);
+}
+
+/* ---- names ---- */
+
+static uint64_t hash_of(const struct name *name) {
+    const uint8_t *bytes = name->size == IS_INTEGER ? (const uint8_t *)&name->integer : name->text;
+    uint32_t size = name->size == IS_INTEGER ? sizeof name->integer : name->size;
+    uint64_t hash = 14695981039346656037u + name->sender; /* FNV-1a */
+    for (uint32_t index = 0; index < size; index++) hash = (hash ^ bytes[index]) * 1099511628211u;
+    return hash;
+}
+
+static bool is_same(const struct name *one, const struct name *other) {
+    if (one->hash != other->hash || one->sender != other->sender || one->size != other->size) return false;
+    if (one->size == IS_INTEGER) return one->integer == other->integer;
+    return !memcmp(one->text, other->text, one->size);
+}
+
+static struct frame *find_frame(const struct collector *collector, const struct name *name) {
+    for (uint32_t index = 0; index < collector->open; index++)
+        if (is_same(&collector->order[index]->name, name)) return collector->order[index];
+    return NULL;
+}
+
+static bool is_closed(const struct collector *collector, const struct name *name) {
+    for (uint32_t left = collector->closed, at = collector->first_closed; left; left--, at = (at + 1) % MOST_CLOSED)
+        if (collector->closed_hashes[at] == name->hash && is_same(&collector->closed_names[at], name)) return true;
+    return false;
+}
+
+static void forget_first_closed(struct collector *collector) {
+    collector->first_closed = (collector->first_closed + 1) % MOST_CLOSED;
+    collector->closed--;
+}
+
+/* Remember a frame that has ended. */
+static void note_closed(struct collector *collector, const struct name *name, int64_t now) {
+    if (collector->closed == MOST_CLOSED) forget_first_closed(collector);
+    uint32_t at = (collector->first_closed + collector->closed++) % MOST_CLOSED;
+    collector->closed_names[at] = *name;
+    collector->closed_hashes[at] = name->hash;
+    collector->closed_until[at] = now + collector->timeout;
+}
+
+/* ---- the store ---- */
+
+/* The length of the record of a payload, a multiple of its alignment. */
+static uint32_t length_of(uint32_t size) {
+    return ((uint32_t)sizeof(struct record) + size + MOST_PADDING) & ~(uint32_t)MOST_PADDING;
+}
+
+static struct record *record_at(const struct collector *collector, uint32_t at) {
+    return (struct record *)(collector->store + at);
+}
+
+static struct value payload_of(const struct collector *collector, const struct frame *frame, uint32_t index) {
+    const struct record *record = record_at(collector, frame->places[index] - 1);
+    return (struct value){.bytes = (const uint8_t *)(record + 1), .size = record->size};
+}
+
+/* Move records that are kept to the beginning. */
+static void compact(struct collector *collector) {
+    uint32_t kept = 0;
+    for (uint32_t at = 0, length; at < collector->used; at += length) {
+        struct record record = *record_at(collector, at);
+        struct frame *frame = &collector->frames[record.frame];
+        length = length_of(record.size);
+        if (!frame->is_open || frame->places[record.index] != at + 1) continue;
+        memmove(collector->store + kept, collector->store + at, length);
+        frame->places[record.index] = kept + 1;
+        kept += length;
+    }
+    collector->used = kept;
+}
+
+static const struct node_field *find_field(const struct node *node, uint32_t number) {
+    for (uint32_t index = 0; index < node->count; index++)
+        if (node->fields[index].number == number) return &node->fields[index];
+    return NULL;
+}
+
+/* Write the payload of a datagram, and return its size. One that comes in pieces is merged by joining them; one of another
+ * case, in front of it, is replaced. */
+static uint32_t write_payload(const struct layout *layout, const struct datagram *from, uint8_t *to) {
+    if (from->is_single) {
+        memcpy(to, from->data + from->start, from->length);
+        return from->length;
+    }
+    const struct node *envelope = &layout->nodes[NODE_ENVELOPE];
+    struct bytes rest = {from->data, from->data + from->size}, value;
+    uint32_t tag, size = 0;
+    while (rest.at < rest.end && read_tag(&rest, &tag) && read_value(&rest, tag & 7, &value)) {
+        const struct node_field *field = (tag & 7) == LEN ? find_field(envelope, tag >> 3) : NULL;
+        if (field && field->node == NODE_PAYLOAD) {
+            memcpy(to + size, value.at, left(&value));
+            size += (uint32_t)left(&value);
+        } else if (field) {
+            size = 0;
+        }
+    }
+    return size;
+}
+
+/* Keep the payload of a datagram. There is room: what is kept never takes more than half of the store. */
+static void keep(struct collector *collector, struct frame *frame, uint32_t index, const struct datagram *from) {
+    uint32_t longest = length_of(from->size);
+    if (collector->used + longest > 2 * (collector->stored + longest) + SLACK) compact(collector);
+    struct record *record = record_at(collector, collector->used);
+    uint32_t size = write_payload(collector->to->layout, from, (uint8_t *)(record + 1)), length = length_of(size);
+    *record = (struct record){size, (uint32_t)(frame - collector->frames), index};
+    frame->places[index] = collector->used + 1;
+    frame->held++;
+    frame->bytes += size;
+    frame->stored += length;
+    collector->used += length;
+    collector->parts++;
+    collector->bytes += size;
+    collector->stored += length;
+}
+
+/* ---- frames ---- */
+
+static struct frame *open_frame(struct collector *collector, const struct part *part, int64_t now) {
+    struct frame *frame = collector->order[collector->open++];
+    frame->name = part->name;
+    frame->is_open = true;
+    frame->ends_at = now + collector->timeout;
+    frame->count = (uint32_t)part->count;
+    frame->held = frame->bytes = frame->stored = 0;
+    memset(frame->places, 0, part->count * sizeof *frame->places);
+    return frame;
+}
+
+/* What it holds can be read until another part is kept. */
+static void remove_frame(struct collector *collector, struct frame *frame) {
+    uint32_t at = 0;
+    while (collector->order[at] != frame) at++;
+    memmove(&collector->order[at], &collector->order[at + 1], (--collector->open - at) * sizeof *collector->order);
+    collector->order[collector->open] = frame;
+    frame->is_open = false;
+    collector->parts -= frame->held;
+    collector->bytes -= frame->bytes;
+    collector->stored -= frame->stored;
+}
+
+static void give_up(struct collector *collector, struct frame *frame, int64_t now) {
+    char detail[LONGEST_DETAIL];
+    snprintf(detail, sizeof detail, "%" PRIu32 " of %" PRIu32 " parts", frame->held, frame->count);
+    remove_frame(collector, frame);
+    lose(collector, now, detail);
+}
+
+static void close_oldest(struct collector *collector, int64_t now) {
+    struct frame *frame = collector->order[0];
+    give_up(collector, frame, now);
+    note_closed(collector, &frame->name, now);
+}
+
+static void set_due(struct collector *collector) {
+    collector->timer.due = collector->open ? collector->order[0]->ends_at : NEVER;
+}
+
+static void end_what_is_due(struct collector *collector, int64_t now) {
+    while (collector->open && collector->order[0]->ends_at <= now) close_oldest(collector, now);
+    while (collector->closed && collector->closed_until[collector->first_closed] <= now) forget_first_closed(collector);
+}
+
+/* Return the frame that this part completes, which is removed then, or NULL. */
+static struct frame *offer(struct collector *collector, const struct part *part, const struct datagram *from, int64_t now) {
+    struct frame *frame = find_frame(collector, &part->name);
+    if (frame && frame->count != part->count) {
+        give_up(collector, frame, now);
+        frame = NULL;
+    }
+    if (is_closed(collector, &part->name) || (frame && frame->places[part->index])) {
+        count_filtered(collector);
+        return NULL;
+    }
+    if (frame) {
+        count_collected(collector);
+    } else {
+        if (collector->open == MOST_FRAMES) close_oldest(collector, now);
+        frame = open_frame(collector, part, now);
+    }
+    keep(collector, frame, part->index, from);
+    if (frame->held == frame->count) {
+        remove_frame(collector, frame);
+        note_closed(collector, &frame->name, now);
+        return frame;
+    }
+    while (collector->parts > MOST_PARTS || collector->bytes > MOST_PART_BYTES) close_oldest(collector, now);
+    return NULL;
+}
+
+/* ---- the timer ---- */
+
+static void serve(struct timers *timers, struct timer *timer, int64_t now) {
+    struct collector *collector = (struct collector *)timer;
+    (void)timers;
+    end_what_is_due(collector, now);
+    set_due(collector);
+}
+
+static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
+    struct collector *collector = (struct collector *)timer;
+    (void)target;
+    collector->timers = timers;
+    collector->to = to;
+    timers_add(timers, timer);
+}
+
+static void end(struct timers *timers, struct timer *timer, int64_t now) {
+    struct collector *collector = (struct collector *)timer;
+    while (collector->open) close_oldest(collector, now);
+    set_due(collector);
+    timers_remove(timers, timer);
+}
+
+static const struct timer_kind COLLECTOR = {serve, adopt, end};
+
+struct collector *collector_open(int64_t timeout) {
+    struct collector *collector = calloc(1, sizeof *collector);
+    if (!collector) return NULL;
+    collector->timer = (struct timer){.kind = &COLLECTOR, .due = NEVER};
+    collector->timeout = timeout;
+    for (uint32_t index = 0; index < MOST_FRAMES; index++) collector->order[index] = &collector->frames[index];
+    collector->store = malloc(STORE);
+    if (!collector->store) {
+        free(collector);
+        return NULL;
+    }
+    return collector;
+}
+
+void collector_close(struct collector *collector) {
+    free(collector->store);
+    free(collector);
+}
+
+/* ---- datagrams ---- */
+
+/* All topics lose a datagram that `collect` refuses. Returns false. */
+static bool refuse(struct stage *stage, const struct targets *to, const struct message *message, int reason,
+                   const char *detail) {
+    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
+    for (uint32_t index = 0; index < to->count; index++)
+        lose_message(stage, to, &to->targets[index], message->now, lost, detail);
+    return false;
+}
+
+/* Print an integer, signed unless `signs` says otherwise. */
+static const char *printed(char *text, size_t size, int64_t number, uint32_t is_unsigned) {
+    if (is_unsigned) snprintf(text, size, "%" PRIu64, (uint64_t)number);
+    else snprintf(text, size, "%" PRId64, number);
+    return text;
+}
+
+/* Whether a frame of `count` has the place `order`. */
+static bool has_place(const struct collect *of, int64_t count, int64_t order) {
+    bool is_count = count >= 0 || (of->signs & FIRST_UNSIGNED), is_place = order >= 0 || (of->signs & SECOND_UNSIGNED);
+    return is_count && is_place && (uint64_t)order < (uint64_t)count;
+}
+
+static bool set_name(struct name *name, const struct collect *of, const struct value *by) {
+    name->size = of->is_text ? by->size : IS_INTEGER;
+    if (!of->is_text) name->integer = by->integer;
+    else if (by->size > LONGEST_NAME) return false;
+    else if (by->size) memcpy(name->text, by->bytes, by->size);
+    name->hash = hash_of(name);
+    return true;
+}
+
+/* Find out which part of which frame a datagram is. Return false, with all losses counted, if it is none. */
+static bool identify(struct stage *stage, const struct targets *to, const struct message *message, struct part *part) {
+    const struct collect *of = to->collect;
+    struct machine *machine = &stage->machine;
+    struct value by, count, order;
+    char detail[LONGEST_DETAIL], numbers[2][24];
+    uint32_t at;
+    if (!read_datagram(machine, to, message->datagram)) return refuse(stage, to, message, LOSS_MAPPING_ERROR, "");
+    part->name.sender = of->senders[message->datagram->column];
+    int outcome = evaluate_value(machine, &of->by, &by, &at);
+    if (outcome == EVALUATED && !set_name(&part->name, of, &by)) {
+        snprintf(detail, sizeof detail, "'by' of %" PRIu32 " bytes, more than %d", by.size, LONGEST_NAME);
+        return refuse(stage, to, message, LOSS_MAPPING_ERROR, detail);
+    }
+    if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->count, &count, &at);
+    if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->order, &order, &at);
+    if (outcome != EVALUATED) return refuse(stage, to, message, outcome, "");
+    if (!has_place(of, count.integer, order.integer)) {
+        printed(numbers[0], sizeof numbers[0], count.integer, of->signs & FIRST_UNSIGNED);
+        printed(numbers[1], sizeof numbers[1], order.integer, of->signs & SECOND_UNSIGNED);
+        snprintf(detail, sizeof detail, "a frame of %s has no part %s", numbers[0], numbers[1]);
+        return refuse(stage, to, message, LOSS_MAPPING_ERROR, detail);
+    }
+    part->count = count.bits;
+    part->index = (uint32_t)order.bits; /* of a frame that is too large, it means nothing */
+    return true;
+}
+
+/* Keep a part. Return the frame if it is complete then, else NULL. */
+static struct frame *take(struct timers *timers, struct collector *collector, const struct part *part,
+                          const struct message *message) {
+    struct frame *complete = NULL;
+    pthread_mutex_lock(&timers->lock);
+    end_what_is_due(collector, message->now);
+    if (part->count > MOST_PARTS) lose_large(collector, part->count, message->now);
+    else complete = offer(collector, part, message->datagram, message->now);
+    set_due(collector);
+    timers_note_due(timers);
+    pthread_mutex_unlock(&timers->lock);
+    return complete;
+}
+
+/* Read the first payload of a frame, and put all of them into the slot for `items`. */
+static bool read_frame(struct machine *machine, const struct targets *to, const struct frame *frame,
+                       const struct datagram *last) {
+    const struct collect *of = to->collect;
+    struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
+    begin_datagram(machine, to, last);
+    if (!machine_read(machine, NODE_PAYLOAD, first.bytes, first.size)) return false;
+    for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
+        if (!list_add(machine, &items, payload_of(of->collector, frame, index))) return false;
+    if (of->items != NONE) machine->slots[of->items] = items;
+    if (of->counted != NONE) machine->slots[of->counted].integer = frame->count;
+    return true;
+}
+
+bool collect(struct stage *stage, const struct targets *to, struct message *message) {
+    struct part part;
+    if (!identify(stage, to, message, &part)) return false;
+    const struct frame *frame = take(stage->timers, to->collect->collector, &part, message);
+    if (!frame) return false;
+    message->is_read = true;
+    message->outcome = read_frame(&stage->machine, to, frame, message->datagram) ? EVALUATED : LOSS_MAPPING_ERROR;
+    return true;
+}

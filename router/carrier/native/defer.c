@@ -1,0 +1,141 @@
+#include "defer.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "envelope.h"
+#include "limit.h"
+
+struct deferral {
+    struct timer timer; /* due while it holds a message: when that may pass */
+    struct route_target of;
+    struct pacer *pacer;  /* NULL without a bandwidth */
+    struct limit limit;   /* of `on_limit: latest`; its period is 0 without */
+    struct output held;
+    int64_t expires; /* of what is held */
+    bool is_held;
+    bool has_ended; /* holds nothing any more */
+};
+
+/* All but the public functions is called with the lock held. */
+
+static void pass_on(struct timers *timers, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
+                    int64_t now) {
+    const struct route_target *of = &deferral->of;
+    bool can_leave = size <= LONGEST_SENT; /* else sending it fails, and that is counted */
+    if (deferral->pacer && !deferral->has_ended && can_leave)
+        pacer_queue(timers, deferral->pacer, of, data, size, expires, now);
+    else if (!deliver_now(timers->stage, of->to, of->target, data, size, expires, now))
+        timers->is_left = true;
+}
+
+static void exchange(struct output *one, struct output *other) {
+    struct output kept = *one;
+    *one = *other;
+    *other = kept;
+}
+
+static void forget(struct deferral *deferral) {
+    deferral->is_held = false;
+    deferral->timer.due = NEVER;
+}
+
+/* Keep a message until it may pass. What the machine has written is not copied. */
+static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires) {
+    struct output *written = &stage->machine.output;
+    deferral->held.size = 0;
+    if (data == written->data) {
+        exchange(&deferral->held, written);
+        deferral->held.size = size;
+    } else {
+        append(&deferral->held, data, size); /* has room: deferral_open */
+    }
+    deferral->is_held = true;
+    deferral->expires = expires;
+    deferral->timer.due = deferral->limit.next_pass;
+}
+
+/* Deliver what is held, unless it has expired. */
+static void release(struct timers *timers, struct deferral *deferral, int64_t now) {
+    if (!deferral->is_held) return;
+    forget(deferral);
+    if (now > deferral->expires) {
+        lose_stale(timers->stage, deferral->of.to, deferral->of.target, now);
+        return;
+    }
+    struct output *held = &deferral->held;
+    if (deferral->of.target->topic) { /* which gets the machine's output */
+        exchange(held, &timers->stage->machine.output);
+        held = &timers->stage->machine.output;
+    }
+    pass_on(timers, deferral, held->data, held->size, deferral->expires, now);
+}
+
+static void offer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
+                  int64_t now) {
+    if (deferral->is_held) stage_count(stage->timers->stage, deferral->of.target->dropped[LOSS_RATE_LIMITED], 1);
+    if (limit_passes(&deferral->limit, now)) {
+        forget(deferral);
+        pass_on(stage->timers, deferral, data, size, expires, now);
+    } else {
+        hold(stage, deferral, data, size, expires);
+    }
+}
+
+/* ---- the timer ---- */
+
+static void serve(struct timers *timers, struct timer *timer, int64_t now) {
+    struct deferral *deferral = (struct deferral *)timer;
+    if (now > deferral->expires || limit_passes(&deferral->limit, now)) release(timers, deferral, now);
+}
+
+/* With another rate, what is held leaves now, and the limit begins anew. */
+static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
+    struct deferral *deferral = (struct deferral *)timer;
+    int64_t period = target->period;
+    if (period != deferral->limit.period) {
+        release(timers, deferral, timers->stage->now(timers->stage));
+        deferral->limit = (struct limit){period, period - period / 2, -period};
+    }
+    deferral->of = (struct route_target){to, target};
+    timers_add(timers, timer);
+}
+
+static void end(struct timers *timers, struct timer *timer, int64_t now) {
+    struct deferral *deferral = (struct deferral *)timer;
+    deferral->has_ended = true;
+    if (deferral->pacer) pacer_release(timers, deferral->pacer, &deferral->of, now);
+    release(timers, deferral, now);
+    timers_remove(timers, timer);
+}
+
+static const struct timer_kind DEFERRAL = {.serve = serve, .adopt = adopt, .end = end};
+
+/* ---- public ---- */
+
+bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now) {
+    struct timers *timers = stage->timers;
+    pthread_mutex_lock(&timers->lock);
+    if (deferral->limit.period && !deferral->has_ended) offer(stage, deferral, data, size, expires, now);
+    else pass_on(timers, deferral, data, size, expires, now);
+    bool goes_on = !timers->is_left;
+    if (goes_on) timers_note_due(timers);
+    pthread_mutex_unlock(&timers->lock);
+    return goes_on;
+}
+
+struct deferral *deferral_open(struct pacer *pacer) {
+    struct deferral *deferral = calloc(1, sizeof *deferral);
+    if (!deferral) return NULL;
+    deferral->timer = (struct timer){.kind = &DEFERRAL, .due = NEVER};
+    deferral->pacer = pacer;
+    deferral->held = (struct output){malloc(MAX_DATAGRAM), 0, MAX_DATAGRAM};
+    if (deferral->held.data) return deferral;
+    free(deferral);
+    return NULL;
+}
+
+void deferral_close(struct deferral *deferral) {
+    free(deferral->held.data);
+    free(deferral);
+}

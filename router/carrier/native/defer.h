@@ -1,0 +1,21 @@
+/* Messages that are held back: by `on_limit: latest`, by the bandwidth of their endpoint (pace.h), or by both.
+ *
+ * With `on_limit: latest` at most one message passes per period, and the newest of those in between is held until it may. A
+ * held message is dropped as `rate_limited` when a newer one replaces it, as `stale` when it expires. A message is counted
+ * when it leaves or is dropped, and feeds deadmen when it leaves. */
+#ifndef DEFER_H
+#define DEFER_H
+
+#include "deliver.h"
+#include "pace.h"
+
+/* Open the deferral of a target, a timer; `pacer` is NULL without a bandwidth. It delivers to the target that it adopts. NULL
+ * for lack of memory. */
+struct deferral *deferral_open(struct pacer *pacer);
+void deferral_close(struct deferral *deferral);
+
+/* Deliver a message to the target of a deferral, now or later: `data` is the machine's output, or a datagram. Return false
+ * if the thread has been given up (LEFT). */
+bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now);
+
+#endif

@@ -1,0 +1,219 @@
+#include "pace.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+static const int64_t SECOND = 1000000000;      /* ns, as are: */
+static const int64_t BURST = 20000000;         /* what a pause saves up */
+static const int64_t OVERDRAFT = 100000000;    /* what commands may overdraw */
+enum { LEAST_OVERDRAFT = 2048 };               /* bytes, where the budget is so small that this is more */
+
+/* A datagram that waits. It follows, filled up to a multiple of 8 bytes. */
+struct waiting_datagram {
+    const struct route_target *of;
+    int64_t expires;
+    int64_t cost; /* the time in which the budget earns it */
+    size_t size;
+};
+enum { LONGEST_WAITING = sizeof(struct waiting_datagram) + LONGEST_SENT + 8 };
+
+/* Datagrams of one priority, the oldest first: between `first` and `end`, or if they go round, between `first` and `limit`
+ * and between 0 and `end`. */
+struct lane {
+    uint8_t *bytes;
+    size_t capacity, first, end, limit;
+    uint32_t count;
+    bool goes_round;
+};
+
+struct pacer {
+    struct timer timer;
+    struct lane lanes[PRIORITIES];
+    int64_t bandwidth; /* bytes per second */
+    int64_t overdraft;
+    int64_t bytes_left, datagrams_left; /* that may wait still; below 0 until the oldest was dropped */
+    int64_t paid_at; /* when the budget has paid for all that was sent; what lies before now is saved up */
+};
+
+/* ---- lanes ---- */
+
+static size_t whole_size(size_t size) { return (sizeof(struct waiting_datagram) + size + 7) & ~(size_t)7; }
+
+static struct waiting_datagram *first_of(const struct lane *lane) {
+    return (struct waiting_datagram *)(lane->bytes + lane->first);
+}
+
+/* Add a datagram. There always is room, also while the first one stays: lane_open. */
+static void put(struct lane *lane, const struct waiting_datagram *waiting, const uint8_t *data) {
+    size_t size = whole_size(waiting->size);
+    if (!lane->count) {
+        lane->first = lane->end = 0;
+        lane->goes_round = false;
+    }
+    if (!lane->goes_round && size > lane->capacity - lane->end) {
+        lane->limit = lane->end;
+        lane->end = 0;
+        lane->goes_round = true;
+    }
+    memcpy(lane->bytes + lane->end, waiting, sizeof *waiting);
+    if (waiting->size) memcpy(lane->bytes + lane->end + sizeof *waiting, data, waiting->size);
+    lane->end += size;
+    lane->count++;
+}
+
+/* Take off the first datagram. It stays where it is until another one is put. */
+static const struct waiting_datagram *take(struct lane *lane) {
+    const struct waiting_datagram *taken = first_of(lane);
+    lane->first += whole_size(taken->size);
+    if (lane->goes_round && lane->first == lane->limit) {
+        lane->first = 0;
+        lane->goes_round = false;
+    }
+    lane->count--;
+    return taken;
+}
+
+/* Room for all that may wait, of one datagram more, and so much that a free piece is long enough for another one. */
+static bool lane_open(struct lane *lane, int64_t bytes, int64_t datagrams) {
+    lane->capacity = (size_t)bytes + (size_t)datagrams * (sizeof(struct waiting_datagram) + 8) + 4 * LONGEST_WAITING;
+    lane->bytes = malloc(lane->capacity);
+    return lane->bytes;
+}
+
+/* ---- the budget ---- */
+
+static int64_t cost_of(const struct pacer *pacer, size_t size) {
+    return ((int64_t)size * SECOND + pacer->bandwidth - 1) / pacer->bandwidth;
+}
+
+/* Cap what is saved up. To be called before the first datagram of a lane changes. */
+static void limit_savings(struct pacer *pacer, int64_t now) {
+    int64_t first = 0;
+    for (int index = PRIORITY_COMMAND + 1; index < PRIORITIES; index++) {
+        const struct lane *lane = &pacer->lanes[index];
+        if (lane->count && first_of(lane)->cost > first) first = first_of(lane)->cost;
+    }
+    int64_t earliest = now - BURST - first;
+    if (pacer->paid_at < earliest) pacer->paid_at = earliest;
+}
+
+static const struct waiting_datagram *take_off(struct pacer *pacer, struct lane *lane) {
+    const struct waiting_datagram *taken = take(lane);
+    pacer->bytes_left += (int64_t)taken->size;
+    pacer->datagrams_left++;
+    return taken;
+}
+
+static void send_first(struct timers *timers, struct pacer *pacer, struct lane *lane, int64_t now) {
+    const struct waiting_datagram *first = take_off(pacer, lane);
+    const struct route_target *of = first->of;
+    if (now > first->expires) {
+        lose_stale(timers->stage, of->to, of->target, now);
+        limit_savings(pacer, now);
+        return;
+    }
+    pacer->paid_at += first->cost;
+    deliver_now(timers->stage, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);
+}
+
+static void send_affordable(struct timers *timers, struct pacer *pacer, int64_t now) {
+    pacer->timer.due = NEVER;
+    for (int index = 0; index < PRIORITIES; index++) {
+        struct lane *lane = &pacer->lanes[index];
+        while (lane->count) {
+            const struct waiting_datagram *first = first_of(lane);
+            int64_t may_go_at = pacer->paid_at + (index == PRIORITY_COMMAND ? -pacer->overdraft : first->cost);
+            if (now < may_go_at && now <= first->expires) {
+                pacer->timer.due = may_go_at + BURST / 2; /* later than necessary: one call then sends several */
+                /* One that has expired no longer counts in the savings. */
+                if (first->expires != NEVER && first->expires + 1 < pacer->timer.due) pacer->timer.due = first->expires + 1;
+                return;
+            }
+            send_first(timers, pacer, lane, now);
+        }
+    }
+}
+
+static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
+    int lowest = PRIORITIES - 1;
+    while (!pacer->lanes[lowest].count) lowest--;
+    const struct route_target *of = take_off(pacer, &pacer->lanes[lowest])->of;
+    lose_message(timers->stage, of->to, of->target, now, (struct lost_event){.reason = LOSS_QUEUE_FULL}, "");
+}
+
+/* ---- the timer ---- */
+
+static void serve(struct timers *timers, struct timer *timer, int64_t now) {
+    struct pacer *pacer = (struct pacer *)timer;
+    limit_savings(pacer, now);
+    send_affordable(timers, pacer, now);
+}
+
+static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
+    (void)to, (void)target; /* it delivers to those for which datagrams wait */
+    timers_add(timers, timer);
+}
+
+/* Send all that waits, whatever the budget: at most what there is room for. */
+static void end(struct timers *timers, struct timer *timer, int64_t now) {
+    struct pacer *pacer = (struct pacer *)timer;
+    timer->due = NEVER;
+    for (int index = 0; index < PRIORITIES; index++)
+        while (pacer->lanes[index].count) send_first(timers, pacer, &pacer->lanes[index], now);
+    timers_remove(timers, timer);
+}
+
+static const struct timer_kind PACER = {.serve = serve, .adopt = adopt, .end = end};
+
+/* ---- public ---- */
+
+void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
+                 int64_t expires, int64_t now) {
+    struct waiting_datagram waiting = {of, expires, cost_of(pacer, size), size};
+    limit_savings(pacer, now);
+    put(&pacer->lanes[of->target->priority], &waiting, data);
+    pacer->bytes_left -= (int64_t)size;
+    pacer->datagrams_left--;
+    send_affordable(timers, pacer, now);
+    while (pacer->bytes_left < 0 || pacer->datagrams_left < 0) drop_one(timers, pacer, now);
+}
+
+void pacer_release(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now) {
+    limit_savings(pacer, now);
+    for (int index = 0; index < PRIORITIES; index++) {
+        struct lane *lane = &pacer->lanes[index];
+        for (uint32_t left = lane->count; left; left--) {
+            if (first_of(lane)->of == of) {
+                send_first(timers, pacer, lane, now);
+            } else {
+                const struct waiting_datagram *kept = first_of(lane);
+                put(lane, kept, (const uint8_t *)(kept + 1));
+                take(lane);
+            }
+        }
+    }
+}
+
+struct pacer *pacer_open(int64_t bandwidth) {
+    struct pacer *pacer = calloc(1, sizeof *pacer);
+    if (!pacer) return NULL;
+    int64_t room = bandwidth < LEAST_ROOM ? LEAST_ROOM : bandwidth > MOST_ROOM ? MOST_ROOM : bandwidth;
+    pacer->timer = (struct timer){.kind = &PACER, .due = NEVER};
+    pacer->bandwidth = bandwidth;
+    pacer->overdraft = cost_of(pacer, LEAST_OVERDRAFT);
+    if (pacer->overdraft < OVERDRAFT) pacer->overdraft = OVERDRAFT;
+    pacer->bytes_left = room;
+    pacer->datagrams_left = room / BYTES_PER_WAITING;
+    pacer->paid_at = -BURST;
+    bool is_open = true;
+    for (int index = 0; index < PRIORITIES; index++)
+        is_open &= lane_open(&pacer->lanes[index], pacer->bytes_left, pacer->datagrams_left);
+    if (is_open) return pacer;
+    pacer_close(pacer);
+    return NULL;
+}
+
+void pacer_close(struct pacer *pacer) {
+    for (int index = 0; index < PRIORITIES; index++) free(pacer->lanes[index].bytes);
+    free(pacer);
+}

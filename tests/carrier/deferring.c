@@ -1,0 +1,160 @@
+/* Deferrals and pacers without threads, sockets and clocks: what would leave is written down. A library of its own, which
+ * uses that of the carrier. */
+#include "defer.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+enum { MOST_TARGETS = 256, COUNTERS = 32 };
+
+/* What has left, or would have if it had not been refused. The bytes follow. */
+struct noted {
+    uint32_t size, target;
+    int64_t at;
+    uint32_t length, reserved;
+};
+
+/* One thread that offers, a group of timers, and their targets. Counters of target N begin at N * COUNTERS. */
+struct deferring {
+    struct stage offering, sending;
+    struct timers *timers;
+    counter counters[MOST_TARGETS * COUNTERS];
+    struct topic topic;
+    struct targets to;
+    struct target targets[MOST_TARGETS];
+    struct output notes;
+    int64_t now;
+    int error; /* that sending returns */
+};
+
+struct deferring *seam_open(void);
+void seam_close(struct deferring *of);
+uint32_t seam_target(struct deferring *of, struct deferral *deferral, int64_t period, uint32_t priority, bool is_topic);
+void seam_offer(struct deferring *of, uint32_t number, const void *data, size_t size, int64_t expires, int64_t now);
+void seam_offer_written(struct deferring *of, uint32_t number, const void *data, size_t size, int64_t expires, int64_t now);
+void seam_adopt(struct deferring *of, struct timer *timer, uint32_t number);
+void seam_end(struct deferring *of, struct timer *timer);
+void seam_end_all(struct deferring *of);
+void seam_set(struct deferring *of, int64_t now, int error);
+void seam_serve(struct deferring *of, int64_t now);
+int64_t seam_next_due(struct deferring *of);
+int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which);
+size_t seam_taken(struct deferring *of, const void **notes);
+
+static struct deferring *opened; /* for functions of the stages, which are one after the other */
+
+static int64_t now_of(struct stage *stage) {
+    (void)stage;
+    return opened->now;
+}
+
+static int note(const struct target *target, const uint8_t *data, size_t size) {
+    static const uint8_t zeros[8];
+    struct noted noted = {.size = (uint32_t)(sizeof noted + (size + 7) / 8 * 8), .target = (uint32_t)(target - opened->targets),
+                          .at = opened->now, .length = (uint32_t)size};
+    if (opened->error) return opened->error;
+    if (!append(&opened->notes, &noted, sizeof noted) || !append(&opened->notes, data, size) ||
+        !append(&opened->notes, zeros, noted.size - sizeof noted - size))
+        abort();
+    return 0;
+}
+
+static int send_noted(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    (void)stage;
+    return opened->now > expires ? COMMAND_STALE : note(target, data, size);
+}
+
+static enum publication publish_noted(struct stage *stage, const struct target *target, const char **why) {
+    *why = "refused";
+    return note(target, stage->machine.output.data, stage->machine.output.size) ? PUBLISH_FAILED : PUBLISHED;
+}
+
+static void open_stage(struct deferring *of, struct stage *stage) {
+    if (!stage_open(stage, of->counters, ring_open(1 << 12), NULL)) abort();
+    stage->now = now_of;
+    stage->send = send_noted;
+    stage->publish = publish_noted;
+}
+
+struct deferring *seam_open(void) {
+    struct deferring *made = calloc(1, sizeof *made);
+    if (!made) abort();
+    open_stage(made, &made->offering);
+    open_stage(made, &made->sending);
+    made->timers = timers_open_on(&made->sending);
+    if (!made->timers) abort();
+    made->offering.timers = made->sending.timers = made->timers;
+    made->to.targets = made->targets;
+    opened = made;
+    return made;
+}
+
+void seam_close(struct deferring *of) {
+    timers_close(of->timers);
+    ring_close(of->offering.reporter.events);
+    ring_close(of->sending.reporter.events);
+    stage_close(&of->offering);
+    stage_close(&of->sending);
+    free(of->notes.data);
+    free(of);
+}
+
+/* Add a target, and have its deferral deliver to it. Return its number. */
+uint32_t seam_target(struct deferring *of, struct deferral *deferral, int64_t period, uint32_t priority, bool is_topic) {
+    uint32_t number = of->to.count++, first = number * COUNTERS;
+    struct target *made = &of->targets[number];
+    *made = (struct target){.deferral = deferral, .period = period, .priority = priority, .delivered = first,
+                            .delivered_bytes = first + 1, .topic = is_topic ? &of->topic : NULL};
+    for (uint32_t reason = 0; reason < LOSSES; reason++) made->dropped[reason] = first + 2 + reason;
+    if (deferral) seam_adopt(of, (struct timer *)deferral, number);
+    return number;
+}
+
+void seam_adopt(struct deferring *of, struct timer *timer, uint32_t number) {
+    struct adoption adoption = {timer, &of->to, &of->targets[number]};
+    timers_change(of->timers, &(struct timer_change){.adopted = &adoption, .adopted_count = 1});
+}
+
+void seam_end(struct deferring *of, struct timer *timer) {
+    timers_change(of->timers, &(struct timer_change){.ended = &timer, .ended_count = 1});
+}
+
+void seam_end_all(struct deferring *of) { timers_end(of->timers); }
+
+void seam_set(struct deferring *of, int64_t now, int error) {
+    of->now = now;
+    of->error = error;
+}
+
+void seam_serve(struct deferring *of, int64_t now) { timers_serve(of->timers, now); }
+
+int64_t seam_next_due(struct deferring *of) { return of->timers->next_due; }
+
+int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which) {
+    return of->counters[number * COUNTERS + which];
+}
+
+/* A datagram of which a sanitizer sees what is read behind it. */
+void seam_offer(struct deferring *of, uint32_t number, const void *data, size_t size, int64_t expires, int64_t now) {
+    uint8_t *copy = malloc(size ? size : 1);
+    if (!copy) abort();
+    if (size) memcpy(copy, data, size);
+    if (!defer(&of->offering, of->targets[number].deferral, copy, size, expires, now)) abort();
+    free(copy);
+}
+
+/* What a machine has written: that of the thread which publishes, for a topic. */
+void seam_offer_written(struct deferring *of, uint32_t number, const void *data, size_t size, int64_t expires, int64_t now) {
+    struct stage *stage = of->targets[number].topic ? &of->sending : &of->offering;
+    stage->machine.output.size = 0;
+    if (!append(&stage->machine.output, data, size)) abort();
+    if (!defer(stage, of->targets[number].deferral, stage->machine.output.data, size, expires, now)) abort();
+}
+
+/* What has left since the last call. */
+size_t seam_taken(struct deferring *of, const void **notes) {
+    size_t size = of->notes.size;
+    *notes = of->notes.data;
+    of->notes.size = 0;
+    return size;
+}
