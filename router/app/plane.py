@@ -32,7 +32,6 @@ from router.carrier.mirror import MirrorRing
 from router.carrier.outlets import Names, Outlets, Publication
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.ring import Ring
-from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
 from router.clock import boottime_ns
@@ -154,21 +153,18 @@ class Plane:
             self._publishing.open()
         bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
         deferrals = Deferrals(self._library, opened.state, opened.senders, opened.publications, bandwidths)
-        try:
-            outlets = Outlets(
-                listeners=opened.listeners,
-                senders={endpoint: sender.address for endpoint, sender in opened.senders.items()},
-                publications=opened.publications,
-                feeds=lambda route, names: [(deadmen[name].address, name != route) for name in names],
-                limit=partial(_limit, opened.state),
-                deferral=deferrals.deferral,
-                collector=partial(kept_collector, self._library, opened.state),
-                names=self._names,
-                boards=NativeBoards(program.boards),
-            )
-            native = native_program(program, generation, outlets)
-        except CannotCarry as error:
-            raise StartError(f"the carrier cannot take these messages: {error}") from error
+        outlets = Outlets(
+            listeners=opened.listeners,
+            senders={endpoint: sender.address for endpoint, sender in opened.senders.items()},
+            publications=opened.publications,
+            feeds=lambda route, names: [(deadmen[name].address, name != route) for name in names],
+            limit=partial(_limit, opened.state),
+            deferral=deferrals.deferral,
+            collector=partial(kept_collector, self._library, opened.state),
+            names=self._names,
+            boards=NativeBoards(program.boards),
+        )
+        native = native_program(program, generation, outlets)
         messages = native_from_ros(program, generation, outlets)
         for arrays in (native.arrays, messages.arrays):
             arrays += [opened.senders, deadmen]

@@ -33,7 +33,7 @@ class NativeProgram:
 
 
 def native_program(program: Program, generation: int, outlets: Outlets) -> NativeProgram:
-    """Make the arrays of a program; `generation` numbers the programs of the process. Raises CannotCarry."""
+    """Make the arrays of a program; `generation` numbers the programs of the process."""
     schema = wire_schema(program.envelope, program.inbound.keys())
     handlers = [handler for several in program.inbound.values() for handler in several]
     made = NativeProgram(generation, arrays=[schema])

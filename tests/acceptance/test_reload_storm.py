@@ -33,7 +33,7 @@ SECONDS = float(os.environ.get("STORM_SECONDS", "40"))
 HOSTS = {"sensor": "127.0.0.30", "station": "127.0.0.31", "driving": "127.0.0.32", "arm": "127.0.0.33"}
 HOSTS["radio"] = "127.0.0.34"
 BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
-PARTS = 3
+PARTS, BURST = 3, 20
 MOST_GROWTH = 0.05
 ENOUGH = 120
 """Reloads from which on memory is looked at: the allocator of the first ones fills its arenas."""
@@ -81,6 +81,7 @@ class Storm:
     """The tables: each choice is made anew for each."""
 
     boards: dict[str, socket.socket]
+    path: Path
     http: int = field(default_factory=lambda: free_port(kind=socket.SOCK_STREAM))
     listen: int = field(default_factory=free_port)
     second: int = field(default_factory=free_port)
@@ -89,7 +90,18 @@ class Storm:
     last_words: int = 0
     """How often the deadman of `drive_motor` has gone, armed."""
 
-    def table(self) -> str:
+    def write_first(self) -> None:
+        """One with a deadman for `drive_motor`."""
+        self.is_guarded = False
+        while not self.is_guarded:
+            self.write()
+        self.last_words = 0
+
+    def write(self) -> None:
+        self.path.write_text(self._table())
+        os.utime(self.path, (time.time() - 60,) * 2)  # or the reload waits until it rests
+
+    def _table(self) -> str:
         one = self.choice.choice
         was_guarded, self.is_guarded = self.is_guarded, one([True, True, False])
         self.last_words += was_guarded and not self.is_guarded
@@ -188,91 +200,82 @@ def bound(host: str) -> Iterator[socket.socket]:
         yield opened
 
 
-def enveloped(**payload: Any) -> bytes:
-    made: bytes = WIRE.envelope.message_class(**payload).SerializeToString()
-    return made
-
-
 def memory(router: RouterProcess) -> int:
     """kB of this process alone."""
     rollup = Path(f"/proc/{router.process.pid}/smaps_rollup").read_text()
     return int(next(line.split()[1] for line in rollup.splitlines() if line.startswith("Private_Dirty")))
 
 
+def start_sending(boards: dict[str, socket.socket], drives: Publisher, listen: int) -> dict[str, Sending]:
+    """All that comes, by name."""
+
+    def by(board: str, **payload: Any) -> None:
+        data = WIRE.envelope.message_class(**payload).SerializeToString()
+        boards[board].sendto(data, ("127.0.0.1", listen))
+
+    def burst(number: int) -> None:
+        for each in range(BURST):
+            by("sensor", imu_info={"accel_x": BURST * number + each})
+
+    def frame(number: int) -> None:
+        order = list(range(PARTS))
+        random.Random(number).shuffle(order)
+        for index in order:
+            by("sensor", detected_object={"frame_id": number % 65536, "total_count": PARTS, "index": index})
+            time.sleep(0.01)
+
+    return {
+        "ph": Sending(500, lambda number: by("sensor", ph_info={"ph_value": number})),
+        "imu": Sending(20, burst),
+        "manual": Sending(50, lambda number: by("station", manual_drive={"turn": number})),
+        "drive": Sending(50, lambda number: drives.publish([b"\0\1\0\0" + struct.pack("<ff", number, 1)])),
+        "frame": Sending(10, frame),
+    }
+
+
+def reload_every_second(storm: Storm, router: RouterProcess) -> list[int]:
+    """The memory after each."""
+    used, until = [], time.monotonic() + SECONDS
+    while (began := time.monotonic()) < until:
+        storm.write()
+        answer = post(f"http://127.0.0.1:{storm.http}", "/-/reload", 60)
+        assert answer.ok, answer.body
+        used.append(memory(router))
+        time.sleep(max(0.0, began + 1 - time.monotonic()))
+    return used
+
+
 @pytest.mark.slow
 def test_a_storm_of_reloads(tmp_path: Path) -> None:
     with ExitStack() as opening:
         boards = {name: opening.enter_context(bound(host)) for name, host in HOSTS.items()}
-        storm, path = Storm(boards), tmp_path / "table.yaml"
-
-        def write() -> None:
-            path.write_text(storm.table())
-            os.utime(path, (time.time() - 60,) * 2)  # or the reload waits until it rests
-
-        while not storm.is_guarded or not path.exists():
-            write()
-        storm.last_words = 0
-        router = opening.enter_context(RouterProcess(tmp_path, path))
+        storm = Storm(boards, tmp_path / "table.yaml")
+        storm.write_first()
+        router = opening.enter_context(RouterProcess(tmp_path, storm.path))
         subscriber = opening.enter_context(closing(Subscriber("storm_objects", "comms/msg/DetectedObjectArray")))
         drives = opening.enter_context(closing(Publisher("storm_drive", "comms/msg/DrivingBoardMotorMessage")))
-        assert drives.line() == "matched"
-        assert subscriber.line() == "matched"
+        assert drives.line() == subscriber.line() == "matched"
         time.sleep(1)  # the router learns of the subscriber
         frames = Reading(subscriber).lines
         receiving = {name: Receiving(boards[name]) for name in HOSTS}
-        to = "127.0.0.1", storm.listen
-
-        def by(board: str, data: bytes) -> None:
-            boards[board].sendto(data, to)
-
-        def burst(number: int) -> None:
-            for each in range(20):
-                by("sensor", enveloped(imu_info={"accel_x": 20 * number + each}))
-
-        def frame(number: int) -> None:
-            for index in storm_order(number):
-                made = {"frame_id": number % 65536, "total_count": PARTS, "index": index}
-                by("sensor", enveloped(detected_object=made))
-                time.sleep(0.01)
-
-        sending = {
-            "ph": Sending(500, lambda number: by("sensor", enveloped(ph_info={"ph_value": number}))),
-            "imu": Sending(20, burst),
-            "manual": Sending(50, lambda number: by("station", enveloped(manual_drive={"turn": number}))),
-            "drive": Sending(50, lambda number: drives.publish([b"\0\1\0\0" + struct.pack("<ff", number, 1)])),
-            "frame": Sending(10, frame),
-        }
-        used, until = [memory(router)], time.monotonic() + SECONDS
-        while (began := time.monotonic()) < until:
-            write()
-            answer = post(f"http://127.0.0.1:{storm.http}", "/-/reload", 60)
-            assert answer.ok, answer.body
-            used.append(memory(router))
-            time.sleep(max(0.0, began + 1 - time.monotonic()))
+        sending = start_sending(boards, drives, storm.listen)
+        used = reload_every_second(storm, router)
         for each in sending.values():
             each.stop()
-        wait_until(lambda: len(receiving["radio"].of("imu_info", lambda imu: imu.accel_x)) >= 20 * sending["imu"].count)
-        wait_until(lambda: len(frames) >= sending["frame"].count)
+        count = {name: each.count for name, each in sending.items()}
+        wait_until(lambda: len(receiving["radio"].of("imu_info", lambda imu: imu.accel_x)) >= BURST * count["imu"])
+        wait_until(lambda: len(frames) >= count["frame"])
         for board in receiving.values():
             board.stop()
         log = router.log()
-    numbers = {name: list(range(each.count)) for name, each in sending.items()}
-    got = receiving["station"].of("ph_info", lambda ph: ph.ph_value)
-    assert got == numbers["ph"]
-    assert receiving["radio"].of("imu_info", lambda imu: imu.accel_x) == list(range(20 * sending["imu"].count))
-    assert receiving["arm"].of("manual_drive", lambda drive: drive.turn) == numbers["manual"]
-    assert receiving["driving"].of("drive_motor", lambda drive: drive.distance_to_go) == numbers["drive"]
-    assert len(frames) == len(set(frames)) == sending["frame"].count
+    assert receiving["station"].of("ph_info", lambda ph: ph.ph_value) == list(range(count["ph"]))
+    assert receiving["radio"].of("imu_info", lambda imu: imu.accel_x) == list(range(BURST * count["imu"]))
+    assert receiving["arm"].of("manual_drive", lambda drive: drive.turn) == list(range(count["manual"]))
+    assert receiving["driving"].of("drive_motor", lambda drive: drive.distance_to_go) == list(range(count["drive"]))
+    assert len(frames) == len(set(frames)) == count["frame"]
     assert receiving["arm"].datagrams.count(BRAKE) == 1  # of the start
     assert receiving["driving"].datagrams.count(BRAKE) == 1 + storm.last_words
     assert [line for line in log if line["event"].startswith(("message dropped", "commands stopped"))] == []
     if len(used) > ENOUGH:
         quarter = len(used) // 4
         assert mean(used[-quarter:]) / mean(used[quarter : 2 * quarter]) < 1 + MOST_GROWTH
-
-
-def storm_order(number: int) -> list[int]:
-    """The parts of a frame come in any order."""
-    order = list(range(PARTS))
-    random.Random(number).shuffle(order)
-    return order

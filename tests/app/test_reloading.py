@@ -25,7 +25,6 @@ from router.app.counts import ThreadCounts
 from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.app.watching import watched_files
-from router.carrier.schema import CannotCarry
 from router.compiler import check_table
 from router.compiler.metrics import Counters
 from router.observe.http import HttpServer
@@ -609,18 +608,5 @@ def test_a_reload_agrees_with_validate_about_stray_protos_and_a_lock_elsewhere(s
         (protos / "stray.proto").unlink()
         lock.unlink()
         assert router.reload().text == "the table has 1 error"
-        site.send(numbered(1))
-        assert site.basestation.recv(1000) == numbered(1)
-
-
-def test_messages_that_the_carrier_cannot_take_are_refused(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise CannotCarry("a closed enum")
-
-    with site.router(PH) as router:
-        monkeypatch.setattr("router.carrier.program.wire_schema", refuse)
-        site.write(PH + turns("1h"))
-        result = router.reload()
-        assert (result.ok, result.text) == (False, "the carrier cannot take these messages: a closed enum")
         site.send(numbered(1))
         assert site.basestation.recv(1000) == numbered(1)
