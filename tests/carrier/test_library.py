@@ -112,6 +112,7 @@ typedef struct {
     int64_t source_timestamp, received_timestamp; uint64_t publication_sequence_number, reception_sequence_number;
     rmw_gid_t publisher_gid;
 } rmw_message_info_t;
+#define RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED UINT64_MAX
 """,
 }
 """Headers like those of rcl, as far as they are used."""
@@ -125,7 +126,11 @@ typedef struct {
         ("*allocate, *deallocate", "*deallocate, *allocate"),
         ("source_timestamp, received_timestamp", "received_timestamp, source_timestamp"),
         ("[1024]", "[2048]"),
-        ("uint64_t publication_sequence_number, reception_sequence_number;", "uint64_t sequence_number;"),
+        (
+            "publication_sequence_number, reception_sequence_number",
+            "reception_sequence_number, publication_sequence_number",
+        ),
+        ("UINT64_MAX", "0"),
         ("16u", "24u"),
     ],
 )
