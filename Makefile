@@ -37,10 +37,9 @@ SANITIZED = CARRIER_TESTED_WITH_SANITIZERS=1 LD_PRELOAD=$$(gcc -print-file-name=
 test: tools  ## run the tests of the router but the slow ones; TESTS=tests/wire for some. Your tables: make validate
 	@$(ENV) $(PYTEST) -m "not slow" $(TESTS)
 
-test-all: tools  ## run every test, also the slow ones; the carrier's with sanitizers too, a router's on both carriers
+test-all: tools  ## run every test, also the slow ones; the carrier's with sanitizers too
 	@$(ENV) HYPOTHESIS_PROFILE=full $(PYTEST) $(TESTS)
 	@$(ENV) $(SANITIZED) $(PYTEST) -m "not slow" $(or $(TESTS),tests/carrier)
-	@$(ENV) ROUTER_CARRIER=python $(PYTEST) $(or $(TESTS),tests/acceptance tests/app)
 
 demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover
 	@$(ENV) .venv/bin/python -m demo

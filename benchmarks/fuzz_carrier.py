@@ -1,11 +1,9 @@
 """Datagrams by the million to the engine and to the carrier: the same decision about each.
 
     python -m benchmarks.fuzz_carrier --count 1000000 --seed 1
-    python -m benchmarks.fuzz_carrier --whole --count 1000000 --seed 1
 
-Made by the grammar in tests/carrier/datagrams.py, for the schemas of tests/carrier/decisions.py in equal parts. With
-`--whole`, for the table of tests/carrier/whole.py: then what is sent, published and counted is compared as well.
-Exits 1 for any difference, and prints the first ones in hexadecimal digits.
+Made by the grammar in tests/carrier/datagrams.py, for the schemas of tests/carrier/decisions.py in equal parts. Exits 1
+for any difference, and prints the first ones in hexadecimal digits.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.carrier import whole
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, CarrierSide, PythonSide, native_library, table
 
@@ -42,24 +39,11 @@ def fuzz(schema: str, count: int, seed: int, found: Callable[[str], None]) -> Co
     return decisions
 
 
-def compare_whole(count: int, seed: int) -> int:
-    with tempfile.TemporaryDirectory() as folder:
-        library = whole.library(Path(folder, "carrier.so"))
-        difference, fates = whole.compare(library, Path(folder), count, seed, publishes=True)
-    for labels, number in fates.items():
-        print(*labels, number)
-    print(difference or "no difference")
-    return 1 if difference else 0
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--whole", action="store_true", help="compare all that becomes of a datagram")
     arguments = parser.parse_args()
-    if arguments.whole:
-        return compare_whole(arguments.count, arguments.seed)
     differences: list[str] = []
     for schema in SCHEMAS:
         decisions = fuzz(schema, arguments.count // len(SCHEMAS), arguments.seed, differences.append)

@@ -20,8 +20,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from router.compiler import check_table
+from router.compiler.metrics import Report
 from router.compiler.program import Program
-from router.engine import InboundEngine, Report
+from router.engine import InboundEngine
 from router.engine.freshness import Freshness
 from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Ledger, Rig

@@ -71,9 +71,8 @@ The log writes the first drop of a kind (route, target, reason) at once, then at
 the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
 last line comes; metrics are up to date."""
 _DURATION = """\
-`router_route_duration_seconds` ends when a datagram is forwarded. Where the carrier does that, all other targets have
-it in their queues by then; with `ROUTER_CARRIER=python`, and for messages from ROS, all targets are served. Its upper
-bounds, in microseconds:"""
+`router_route_duration_seconds` ends when a datagram is forwarded, and waits for the thread that publishes it on topics;
+of a message from ROS, when all targets are served. Its upper bounds, in microseconds:"""
 
 
 def keys_page() -> str:

@@ -1,13 +1,11 @@
-"""Threads that never delay the end of the process; wake-up events, pauses, and stops with deadlines."""
+"""Threads that never delay the end of the process; wake-up events, and stops with deadlines."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
@@ -21,10 +19,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _LONGEST_WAIT_MS = 3_600_000
-
-PAUSE_TIMEOUT_S = 1.0
-"""Seconds within which a thread has to pause. No datagram is routed meanwhile, and the watchdog is not fed."""
-
 
 START_S = 2.0
 """Seconds within which a started thread has to run."""
@@ -104,46 +98,6 @@ class WakeEvent:
     def close(self) -> None:
         """Idempotent. Neither `wait` nor `set` may be called afterwards."""
         self._event.close()
-
-
-class _Timer(ctypes.Structure):
-    """`struct itimerspec`, which begins with the interval of repetitions: none."""
-
-    _fields_ = (("interval", ctypes.c_long * 2), ("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
-
-
-_libc = ctypes.CDLL(None, use_errno=True)
-_TFD_TIMER_ABSTIME = 1
-
-
-class Alarm:
-    """A deadline of the boot clock for one waiting thread: one that passes while the computer is suspended ends the
-    wait on resume, which no timeout of `poll` does.
-
-    A timerfd, by the C library's functions: Python has them since 3.13.
-    """
-
-    def __init__(self) -> None:
-        self._timer = _libc.timerfd_create(time.CLOCK_BOOTTIME, os.O_CLOEXEC)
-        if self._timer < 0:
-            raise OSError(ctypes.get_errno(), "no timer")
-        self._poll = select.poll()
-        self._poll.register(self._timer, select.POLLIN)
-
-    def set_for(self, due: int) -> None:
-        """Have `wait` return at `due` (boot clock, ns), in place of what was set before. Thread-safe."""
-        at = _Timer(seconds=max(due, 1) // 10**9, nanoseconds=max(due, 1) % 10**9)  # 0 would stop it
-        _libc.timerfd_settime(self._timer, _TFD_TIMER_ABSTIME, ctypes.byref(at), None)
-
-    def wait(self) -> None:
-        """Return when the deadline has passed."""
-        self._poll.poll()
-
-    def close(self) -> None:
-        """Idempotent. Neither `set_for` nor `wait` may be called afterwards."""
-        if self._timer >= 0:
-            os.close(self._timer)
-        self._timer = -1
 
 
 @contextmanager
@@ -287,25 +241,4 @@ class _Steps:
 
 
 class StuckError(RuntimeError):
-    """A thread did not pause in time, and nothing was changed."""
-
-
-@contextmanager
-def paused(submit: Callable[[Callable[[], None]], None]) -> Iterator[None]:
-    """Pause a thread between two iterations of its loop, to change what it uses. Raises StuckError after a timeout.
-
-    `submit(task)` makes the thread call `task` between two iterations, and returns at once.
-    """
-    has_paused, resume = threading.Event(), threading.Event()
-
-    def pause() -> None:
-        has_paused.set()
-        resume.wait()
-
-    try:
-        submit(pause)
-        if not has_paused.wait(PAUSE_TIMEOUT_S):
-            raise StuckError("a thread of the router is stuck, or has too much to do: try again")
-        yield
-    finally:
-        resume.set()
+    """A thread did not answer in time, and nothing was changed."""

@@ -20,8 +20,8 @@ from tests.lanes import LANE
 os.environ["ROS_DOMAIN_ID"] = str(1 + LANE)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
-# Unless `make test-all` says otherwise, routers of tests run on the carrier: of the sources that there are now.
-if os.environ.setdefault("ROUTER_CARRIER", "native") == "native" and not is_current():
+# Routers of tests run on the library of the sources that there are now.
+if not is_current():
     build()
 
 # The rover's table records what came before a deadman trips.

@@ -22,21 +22,22 @@ IMPORTS = {
     "types": "errors assets",
     "values": "errors types",
     "compiler": "errors assets table types",
-    "engine": LANGUAGE,
-    "net": f"{GROUND} {LANGUAGE} engine",
-    "carrier": f"{GROUND} {LANGUAGE} engine net",
-    "ros": f"{GROUND} {LANGUAGE} engine",
-    "gateway": f"{GROUND} {LANGUAGE} engine net carrier ros",
-    "recording": f"{GROUND} {LANGUAGE} engine net",
-    "observe": f"{GROUND} {LANGUAGE} values engine net recording",
-    "rehearsal": f"{LANGUAGE} values engine carrier recording",
-    "tools": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe rehearsal",
-    "app": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe",
-    "cli": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal tools carrier app",
+    "datagrams": "errors table types",
+    "engine": f"{LANGUAGE} datagrams",
+    "net": f"{GROUND} {LANGUAGE} datagrams",
+    "carrier": f"{GROUND} {LANGUAGE} datagrams engine net",
+    "ros": f"{GROUND} {LANGUAGE}",
+    "gateway": f"{GROUND} {LANGUAGE} datagrams engine net carrier ros",
+    "recording": f"{GROUND} {LANGUAGE} datagrams net",
+    "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
+    "rehearsal": f"{LANGUAGE} values datagrams engine carrier recording",
+    "tools": f"{GROUND} {LANGUAGE} values datagrams engine net carrier ros gateway recording observe rehearsal",
+    "app": f"{GROUND} {LANGUAGE} values datagrams engine net carrier ros gateway recording observe",
+    "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools carrier app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"errors", "table", "types", "values", "compiler", "engine"}
+PURE = {"errors", "table", "types", "values", "compiler", "datagrams", "engine"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Imu, LaserScan
 from std_msgs.msg import Byte, ByteMultiArray, Empty, Header, String
 
-from router.engine.wire import wire_of_protos
+from router.datagrams import wire_of_protos
 from router.errors import UsageError
 from router.types.protobuf import PayloadCase
 from router.values import (

@@ -1,8 +1,4 @@
-"""Messages from ROS that a native thread serves, from one program to the next.
-
-Topics that another thread is to serve, or from another subscription, are left before the swap. All others are served by
-the earlier program until the swap is done, unless deadmen change: those of two programs do not get feeds in turns.
-"""
+"""Messages from ROS: what a program makes of them, and the two threads that take them, from one program to the next."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription, forget_what_is_served
+from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription
 from router.carrier.ring import Ring
 from router.errors import StartError
 from router.log import logger
@@ -19,7 +15,7 @@ from router.threads import StuckError
 
 @dataclass(frozen=True, slots=True)
 class RosTopics:
-    """What a program has a native thread make of messages from ROS, and all of its subscriptions by topic."""
+    """What a program makes of messages from ROS, and all of its subscriptions by topic."""
 
     messages: NativeFromRos
     subscriptions: Mapping[str, Subscription]
@@ -30,7 +26,7 @@ class RosTopics:
 
 
 class FromRos:
-    """The thread, which starts with the first program that has messages for it.
+    """One of the threads, which starts with the first program that has messages for it.
 
     `deadmen` is the address of the carrier's, `counts` the array that the thread counts in. Urgent messages have a
     thread of their own.
@@ -73,21 +69,20 @@ class FromRos:
         except MemoryError as error:
             raise StartError(str(error)) from error
 
-    def leave(self, next_one: RosTopics, *, keeps: bool) -> None:
-        """Cease to serve what the next program does not have, or everything, once what has arrived is served.
+    def leave(self, next_one: RosTopics) -> None:
+        """Cease to serve topics that the other thread is to serve, once what has arrived on them is served.
 
-        Raises StuckError, with nothing changed.
+        Raises StuckError, with nothing changed, also where there are none.
         """
         if self._thread is None:
             return
-        now, then = self._served, next_one.subscriptions
-        own = next_one.only(urgent=self.is_urgent).messages.topics
-        kept = [topic for topic in now.messages.topics if keeps and topic in own]
-        kept = [topic for topic in kept if then[topic] is now.subscriptions[topic]]
-        forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.messages.topics if topic in then})
-        topics = {topic: now.messages.topics[topic] for topic in kept}
-        messages = NativeFromRos(topics, now.messages.urgent, now.messages.arrays)
-        self._thread.serve(messages, {topic: then[topic] for topic in kept})
+        now, then = self._served, next_one.only(urgent=not self.is_urgent).messages.topics
+        kept = {topic: routes for topic, routes in now.messages.topics.items() if topic not in then}
+        messages = NativeFromRos(kept, now.messages.urgent, now.messages.arrays)
+        self._thread.serve(messages, {topic: now.subscriptions[topic] for topic in kept})
+        for topic in now.messages.topics.keys() & then.keys():
+            if (subscription := next_one.subscriptions[topic]) is not now.subscriptions[topic]:
+                subscription.take_all()  # which the earlier subscription has received as well
 
     def stay(self) -> None:
         """Undo `leave`."""

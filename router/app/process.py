@@ -14,9 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from router.app.timers import TimerThread
-from router.clock import boottime_ns, monotonic_ns
-from router.engine.timers import Timer
+from router.clock import monotonic_ns
 from router.log import logger
 from router.net.udp import inherited
 
@@ -26,34 +24,25 @@ _CHECKS = 4
 NOTIFY_TIMEOUT = 5.0
 """Seconds for which a notification waits for a busy service manager, and so the longest delay of a reload or stop."""
 
-_BACKGROUND_SWITCH_INTERVAL = 0.00005
-"""Seconds after which a compiling thread yields to the receive thread, which needs that after each system call."""
-
 _REMEDY = "ListenDatagram= in rover-router.socket says something else than the table: install the service anew"
 
 
 @contextmanager
-def supervised(progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda *_: False) -> Iterator[None]:
+def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[None]:
     """Notify that the router is ready inside, and stops at the end.
 
-    The service manager's watchdog is fed while `progress()` changes, which it has to do at least every half second. If
-    the router is stuck, it ends it with SIGABRT, and the log shows where each thread stood. `feed(socket, interval)`
-    has it fed by native threads instead, every `interval` ns, or returns False.
+    `feed(socket, interval)` has native threads feed the service manager's watchdog every `interval` ns, while they make
+    progress; a socket of -1 ends that. If the router is stuck, the service manager ends it with SIGABRT, and the log
+    shows where each thread stood.
     """
     for address in inherited().unclaimed():
         logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
         notify("READY=1")
-        if (limit := _watchdog_ns()) is not None:
+        if (limit := _watchdog_ns()) is not None and (notifying := _notify_socket()) is not None:
             faulthandler.enable()
-            notifying = _notify_socket()
-            if notifying is None or not feed(ending.enter_context(notifying).fileno(), limit // _CHECKS):
-                thread = TimerThread("watchdog", _log_fault)
-                thread.add(Watchdog(progress, limit // _CHECKS, boottime_ns()))
-                thread.start()
-                ending.callback(thread.stop)
-            else:
-                ending.callback(feed, -1, 0)
+            feed(ending.enter_context(notifying).fileno(), limit // _CHECKS)
+            ending.callback(feed, -1, 0)
         ending.callback(notify, "STOPPING=1", "WATCHDOG=1")  # the service manager's stop timeout starts here
         yield
 
@@ -66,25 +55,6 @@ def reloading() -> Iterator[None]:
         yield
     finally:
         notify("READY=1")
-
-
-class Watchdog(Timer):
-    """Feeds the watchdog every `interval` ns, if `progress()` has changed since."""
-
-    def __init__(self, progress: Callable[[], int], interval: int, now: int) -> None:
-        self.next_due: int | None = now + interval
-        self._progress = progress
-        self._interval = interval
-        self._seen: int | None = None
-
-    def due(self, now: int) -> None:
-        self.next_due = now + self._interval
-        if (reached := self._progress()) != self._seen:
-            self._seen = reached
-            notify("WATCHDOG=1")
-
-    def end(self, now: int) -> None:
-        self.next_due = None
 
 
 def notify(*lines: str) -> None:
@@ -121,25 +91,10 @@ def _watchdog_ns() -> int | None:
     return int(microseconds) * 1000 if is_ours and microseconds.isdecimal() and int(microseconds) else None
 
 
-def _log_fault(error: Exception) -> None:
-    logger.error("the watchdog cannot be fed", error=str(error))
-
-
 def tune_interpreter() -> None:
     """Set up the process for low latency. To be called once, by the owner of the process, after start-up."""
     gc.freeze()  # objects made at start-up live as long as the process and need no scan
     may_open, may_request = resource.getrlimit(resource.RLIMIT_NOFILE)
     if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few for as many clients of a gateway
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
-    sys.setswitchinterval(0.0005)  # the longest that the receive thread waits for a busy thread
-
-
-@contextmanager
-def beside_traffic() -> Iterator[None]:
-    """Let this thread compute for long without delaying others: it yields more often."""
-    usual = sys.getswitchinterval()
-    sys.setswitchinterval(min(usual, _BACKGROUND_SWITCH_INTERVAL))
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(usual)
+    sys.setswitchinterval(0.0005)  # the longest that gateways wait for a busy thread

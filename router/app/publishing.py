@@ -1,4 +1,4 @@
-"""Topics on which a native thread publishes, from one program to the next."""
+"""The thread that publishes on topics, from one program to the next."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from router.log import logger
 
 
 class Publishing:
-    """The thread, which starts with the first program that has topics. Where rcl is not as expected, Python publishes.
+    """The thread, which starts with the first program that has topics.
 
     `counts` is the array that the thread counts in, `ring` has the messages for it.
     """
@@ -25,23 +25,16 @@ class Publishing:
         self._library = library
         self._counts, self._events, self._names = counts, events, names
         self._thread: PublishThread | None = None
-        self._is_refused = False
 
-    def open(self, *, has_topics: bool) -> bool:
-        """Start the thread if there are topics. Return whether there is one. Raises StartError."""
-        if self._thread is None and has_topics and not self._is_refused:
-            from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
-
-            functions = None if self._library.rcl_types_differ() else publish_functions()
-            if functions is None:
-                self._is_refused = True
-                logger.warning("rcl is not as the carrier expects it, and Python publishes, more slowly")
-                return False
-            try:
-                self._thread = PublishThread(self._library, self.ring, self._counts, self._events, functions)
-            except MemoryError as error:
-                raise StartError(str(error)) from error
-        return self._thread is not None
+    def open(self) -> None:
+        """Start the thread, for a program that has topics. Raises StartError."""
+        if self._thread is not None:
+            return
+        functions = functions_of_rcl(self._library)
+        try:
+            self._thread = PublishThread(self._library, self.ring, self._counts, self._events, functions)
+        except MemoryError as error:
+            raise StartError(str(error)) from error
 
     def counters(self, count: int) -> list[int]:
         """Return the first counters, as they are between two messages."""
@@ -61,11 +54,6 @@ class Publishing:
         """Wait until nothing of earlier generations is in use. Return False after `timeout` s."""
         return self._thread is None or self._thread.wait_for(generation, timeout)
 
-    def hold(self, generation: int) -> None:
-        """Publish nothing of that generation or a later one, until this is called with 0."""
-        if self._thread is not None:
-            self._thread.hold(generation)
-
     def stalled(self) -> tuple[str, float] | None:
         """The topic in whose publisher the thread is now, and for how many seconds."""
         stalled = self._thread.stalled() if self._thread else None
@@ -80,3 +68,16 @@ class Publishing:
         if not has_ended:
             logger.error("a thread is stuck, and the router ends without it", threads=["publish"])
         return has_ended
+
+
+def functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
+    """Addresses of what publishes, and of what says and forgets why it could not. Raises StartError."""
+    from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
+
+    functions = None if library.rcl_types_differ() else publish_functions()
+    if functions is None:
+        raise StartError(
+            "rcl, by which ROS publishes, has other structures than the carrier expects",
+            "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
+        )
+    return functions

@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from router.app.process import beside_traffic, reloading
+from router.app.counts import ThreadCounts
+from router.app.process import reloading
 from router.app.runtime import Runtime
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
-from router.app.wiring import ThreadCounts
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked
@@ -54,11 +54,11 @@ class Reloader:
     def reload(self) -> ReloadResult:
         """Reload the table. If it is invalid or something cannot be opened, nothing changes; the result says why."""
         with self._one_at_a_time:
-            if not self._is_open or self._runtime.wiring is None:
+            if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
-            with background_threads(), beside_traffic(), reloading():
-                kind, result = self._attempt(self._runtime.wiring.program)
+            with background_threads(), reloading():
+                kind, result = self._attempt(self._runtime.program)
             self._count(kind)
             self._remember(is_good=result.ok)
             seconds = round((monotonic_ns() - began) / 1e9, 3)
@@ -70,12 +70,12 @@ class Reloader:
     def reopen(self) -> None:
         """Reopen the listeners whose address or network interface is there now, if there are any."""
         with self._one_at_a_time:
-            wiring = self._runtime.wiring
+            program = self._runtime.program
             replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
-            if not self._is_open or wiring is None or not replaceable:
+            if not self._is_open or program is None or not replaceable:
                 return
             try:
-                self._runtime.take_over(self._runtime.prepare(wiring.program))
+                self._runtime.take_over(self._runtime.prepare(program))
             except (StartError, StuckError, OSError) as error:  # the watcher calls again
                 logger.warning("a listener cannot be opened on its network", why=str(error))
             else:

@@ -10,16 +10,11 @@ from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from router.app.native_datapath import NativeDatapath
-from router.app.python_datapath import PythonDatapath
+from router.app.counts import ThreadCounts
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
-from router.app.timers import Timers
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
-from router.app.wiring import Datapath, RouterContext, ThreadCounts
-from router.carrier.boards import NativeBoards
-from router.carrier.library import chosen_library
-from router.carrier.schema import CannotCarry, wire_schema
+from router.carrier.library import load
 from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
@@ -30,7 +25,6 @@ from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, StopStack, background_threads
-from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
     from prometheus_client.metrics_core import Metric as Family
@@ -63,9 +57,8 @@ class Router:
         self._first = program
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
-        self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
-        context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
-        self._runtime = Runtime(context, ros_args, partial(_datapath, program, context, self.mirror))
+        self.mirror = Mirror(self._observers_changed, self._reporter.failed)
+        self._runtime = Runtime(load(), self._counts, self.mirror, self._reporter, self._deadman_changed, ros_args)
         self._services = Services(self)
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
         self._watcher: Watcher | None = None
@@ -83,7 +76,7 @@ class Router:
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)
                 self._open_services(change, services)
-            self._runtime.start(change, opening)
+            self._runtime.start(change)
             self._reloader.open()
             opening.callback(self._unwatch_all)
             self._watch()
@@ -117,8 +110,7 @@ class Router:
     @property
     def program(self) -> Program:
         """The running program; a reload replaces it."""
-        wiring = self._runtime.wiring
-        return wiring.program if wiring is not None else self._first
+        return self._runtime.program or self._first
 
     @property
     def listeners(self) -> Mapping[str, Listener]:
@@ -139,11 +131,11 @@ class Router:
         return totals | {"kernel_drops": sum(dropped for _, dropped in self._runtime.drops.totals())}
 
     def progress(self) -> int:
-        return self._runtime.datapath.turns + self.total("datagrams_received")
+        return self._runtime.plane.turns + self.total("datagrams_received")
 
-    def feed_watchdog(self, notify: int, interval: int) -> bool:
-        """Have native threads feed a watchdog by a connected socket, every `interval` ns; False if there are none."""
-        return self._runtime.datapath.watch(notify, interval)
+    def feed_watchdog(self, notify: int, interval: int) -> None:
+        """Feed a watchdog by a connected socket, every `interval` ns; -1 for none."""
+        self._runtime.plane.feed_watchdog(notify, interval)
 
     def collect(self) -> Iterator[Family]:
         if (made := self._collector) is None or made[0] is not self.program:
@@ -166,7 +158,7 @@ class Router:
 
     def _observers_changed(self) -> None:
         """Called when the first observer of received datagrams attaches or the last one detaches."""
-        self._runtime.datapath.observe(is_observed=self.mirror.is_observed)
+        self._runtime.plane.observe(is_observed=self.mirror.is_observed)
 
     def _deadman_changed(self, route: str, active: bool) -> None:
         self._reporter.deadman_changed(route, active)
@@ -204,7 +196,7 @@ class Router:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
 
         return {
-            "mirror_dropped": lambda: [((), self.mirror.lost + self.total("mirror_dropped"))],
+            "mirror_dropped": lambda: [((), self.mirror.lost)],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
@@ -225,20 +217,6 @@ class Router:
         # Of this program, whose counters are there before those of the running one are adopted, once nothing is stuck.
         copies = partial(self._counts.copies, program.counters.size)
         return CountersCollector(program.counters, copies, self._asked(), build)
-
-
-def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]) -> Datapath:
-    """The carrier where there is one that can take the program's messages, else Python. Raises StartError."""
-    library = chosen_library()
-    if library is not None:
-        try:
-            wire_schema(program.envelope, ())
-            NativeBoards(program.boards)
-        except CannotCarry as error:
-            logger.warning("the carrier cannot take these messages, and Python serves them", why=str(error))
-        else:
-            return NativeDatapath(library, context, mirror)
-    return PythonDatapath(context, mirror, subscribed)
 
 
 def _version() -> str:

@@ -1,24 +1,28 @@
 """Everything that is open for the running program, and how another program takes over.
 
-A takeover has three steps: prepare (open what the program needs in addition; may fail), swap (between two datagrams,
-while all receiving threads are paused), finish (close what is no longer used). The first program starts the same way.
+A reload has three steps: prepare (open what the program needs in addition; may fail), adopt (each thread changes to it
+between two messages), finish (close what is no longer used). The first program starts the same way.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from router.app.counts import ThreadCounts
+from router.app.plane import Built, Opened, Plane
 from router.app.sockets import KernelDrops, SocketChange, Sockets
-from router.app.wiring import Datapath, RouterContext, Wiring
-from router.carrier.library import load
+from router.carrier.state import State
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import SourceSpan, StartError
 from router.log import fault
+from router.observe.reports import Reporter
+from router.recording.mirror import Mirror
 from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
@@ -37,26 +41,45 @@ class Change:
 
     sockets: SocketChange
     topics: RosChange | None
-    wiring: Wiring
+    built: Built
     gateways: GatewayChange | None
     undo: ExitStack
 
+    @property
+    def program(self) -> Program:
+        return self.built.program
+
 
 class Runtime:
-    """The sockets, ROS node, gateways and threads of the running program."""
+    """The sockets, ROS node, gateways and threads of the running program.
+
+    `deadman_changed` is called with a route and whether its deadman is tripped.
+    """
 
     def __init__(
-        self, context: RouterContext, ros_args: Sequence[str], datapath: Callable[[Callable[[], bool]], Datapath]
+        self,
+        library: ctypes.CDLL,
+        counts: ThreadCounts,
+        mirror: Mirror,
+        reporter: Reporter,
+        deadman_changed: Callable[[str, bool], None],
+        ros_args: Sequence[str],
     ) -> None:
-        self.wiring: Wiring | None = None
-        self.datapath = datapath(self._is_subscribed)
+        self._library = library
+        self.plane = Plane(library, counts, mirror, reporter, deadman_changed)
         self.drops = KernelDrops()
-        self.sockets = Sockets(self.drops, self.datapath.open_listener, self.datapath.open_sender)
+        self.sockets = Sockets(self.drops, library)
         self.gateways: GatewayThread | None = None
-        self._context = context
+        self._counts = counts
+        self._reporter = reporter
         self._ros_args = ros_args
         self._ros: RouterNode | None = None
         self._unfinished: list[Callable[[], None]] = []
+
+    @property
+    def program(self) -> Program | None:
+        """What runs."""
+        return self.plane.now.program if self.plane.now else None
 
     @property
     def node_name(self) -> str:
@@ -65,23 +88,17 @@ class Runtime:
 
     def stalled(self) -> dict[str, float]:
         """For how many seconds a call that publishes on a topic has been in the middleware, by topic; 0 if in none."""
-        stalled = dict.fromkeys((plan.label for plan in self.wiring.program.publishers) if self.wiring else (), 0.0)
-        ros, native = self._ros, self.datapath.stalled()
-        for topic, seconds in (*(ros.stalled() if ros else ()), *([native] if native else ())):
+        stalled = dict.fromkeys((plan.label for plan in self.program.publishers) if self.program else (), 0.0)
+        for topic, seconds in (*(self._ros.stalled() if self._ros else ()), *self.plane.stalled()):
             if seconds >= _STALLED_S:
                 stalled[topic] = max(seconds, stalled.get(topic, 0.0))
         return stalled
 
-    def start(self, change: Change, closing: ExitStack) -> None:
-        """Run the prepared program. `closing` stops receiving."""
-        timers = self._context.timers
-        timers.start()
-        closing.callback(self._stop_ros)
-        self._swap(change)
+    def start(self, change: Change) -> None:
+        """Run the prepared program."""
+        self.adopt(change)
         with background_threads():
-            self._finish(change, None)
-        self.datapath.start()
-        closing.callback(lambda: self.datapath.stop(list(self.sockets.listeners.values())))
+            self.finish(change, None)
 
     def close_with(self, closing: ExitStack) -> None:
         """Have `closing` close sockets and ROS, after the services that use them."""
@@ -90,11 +107,12 @@ class Runtime:
         closing.callback(self._close_ros)
 
     def end_with(self, closing: ExitStack) -> None:
-        """Have `closing` stop gateways, then open frames, waiting messages and last deadmen, which send once more."""
-        closing.callback(self.datapath.close)
-        for thread in self._context.timers.threads:  # of deadmen last
-            closing.callback(thread.stop)
+        """Have `closing` stop threads, then gateways, then deadmen, which send once more."""
+        closing.callback(self._close_plane)
         closing.callback(self._stop_gateways)
+        closing.callback(self._stop_plane)
+
+    # a reload
 
     def prepare(self, program: Program) -> Change:
         """Open what `program` needs and is not open yet. Raises StartError, with nothing changed.
@@ -102,7 +120,7 @@ class Runtime:
         For the first program, deadmen send their payload of the start here: nothing is received yet, but gateways serve
         clients as soon as they are open.
         """
-        if self._unfinished and self.wiring is not None and self.datapath.has_passed(self.wiring):
+        if self._unfinished and self.plane.has_passed():
             self._close_unfinished()  # first: it may be opened again
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
@@ -110,49 +128,37 @@ class Runtime:
                 _check_ros_arguments(program, self._ros_args)
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
-            self._context.counts.make_room(program.counters)
-            states = self.datapath.states(self.wiring)
-            undo.callback(lambda: self._context.timers.release(states.added()))
-            if self.wiring is None:
-                self.datapath.start_deadmen(program, sockets, states)
+            self._counts.make_room(program.counters)
+            now = self.plane.now
+            state = State(now.state if now else None)
+            if now is None:
+                self.plane.start_deadmen(program, sockets.senders, state)
             topics = self._prepare_topics(program, undo)
-            wiring = self.datapath.wire(program, sockets, self._ros, topics, states)
-            undo.callback(self.datapath.abandon, wiring)
-            if self.wiring is None:
-                wiring.start(self._context.timers)
-            gateways = self._prepare_gateways(program, wiring, undo)
-            return Change(sockets, topics, wiring, gateways, undo.pop_all())
+            opened = Opened(
+                sockets.listeners,
+                sockets.senders,
+                topics.publications if topics else {},
+                {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {},
+                state,
+            )
+            built = self.plane.build(program, opened)
+            gateways = self._prepare_gateways(built, undo)
+            return Change(sockets, topics, built, gateways, undo.pop_all())
 
-    def take_over(self, change: Change) -> None:
-        """Replace the running program by the prepared one, between two messages.
-
-        Raises StuckError or StartError, with nothing changed. A failure after the swap is a bug, and logged.
-        """
-        earlier = self.wiring
+    def adopt(self, change: Change) -> None:
+        """Have all threads change to the prepared program. Raises StuckError or StartError, with nothing changed."""
         try:
-            change.wiring.check_gateways(earlier, self._context.timers)
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
-            self.datapath.between(change.wiring, lambda: self._swap(change))
+            self.plane.adopt(change.built, self.sockets.left(change.sockets))
         except BaseException:
             change.undo.close()
             raise
-        try:
-            self._finish(change, earlier)
-        except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
-            fault(error, "kept it from closing what it does not use").log()
+        self.sockets.apply(change.sockets)
+        if self._ros is not None and change.topics is not None:
+            self._ros.apply(change.topics)
 
-    def _swap(self, change: Change) -> None:
-        """Replace the program, while the thread of ROS is paused."""
-        with self._ros.paused() if self._ros else nullcontext():
-            if self._ros is not None and change.topics is not None:
-                self._ros.apply(change.topics, change.wiring.take)  # first: it may still fail
-            left = self.sockets.left(change.sockets)
-            self.sockets.apply(change.sockets)
-            self.datapath.adopt(change.wiring, self.wiring, left, list(change.sockets.listeners.values()))
-            self.wiring = change.wiring
-
-    def _finish(self, change: Change, earlier: Wiring | None) -> None:
+    def finish(self, change: Change, earlier: Built | None) -> None:
         """Watch the peers of new topics, and close what only the earlier program used.
 
         If a thread is stuck there, as in the middleware, that stays open until it goes on. All of it is done even if
@@ -164,15 +170,27 @@ class Runtime:
             if self._ros is not None and change.topics is not None:
                 self._ros.watch(change.topics)
 
-    def _close_passed(self, change: Change, earlier: Wiring | None) -> None:
+    def take_over(self, change: Change) -> None:
+        """Adopt the prepared program, and finish. Raises StuckError or StartError, with nothing changed.
+
+        A failure after the adoption is a bug, and logged.
+        """
+        earlier = self.plane.now
+        self.adopt(change)
+        try:
+            self.finish(change, earlier)
+        except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
+            fault(error, "kept it from closing what it does not use").log()
+
+    def _close_passed(self, change: Change, earlier: Built | None) -> None:
         """Close what all threads have passed, in this reload and in those before."""
         self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
-            if self.datapath.has_passed(change.wiring):
-                last_first.callback(self._context.counts.replace, change.wiring.program.counters)
+            if self.plane.has_passed():
+                last_first.callback(self._counts.replace, change.program.counters)
                 last_first.callback(self._close_unfinished)
             else:
-                last_first.callback(self._context.counts.adopt, change.wiring.program.counters)
+                last_first.callback(self._counts.adopt, change.program.counters)
             if self.gateways is not None and change.gateways is not None:
                 last_first.callback(self.gateways.finish, change.gateways)
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
@@ -184,15 +202,16 @@ class Runtime:
                 last_first.callback(close)
             self._unfinished = []
 
-    def _close_left(self, change: Change, earlier: Wiring | None) -> None:
+    def _close_left(self, change: Change, earlier: Built | None) -> None:
         with ExitStack() as last_first:
-            if earlier is not None:
-                last_first.callback(earlier.free)
             last_first.callback(change.sockets.left.close)
             if self._ros is not None and change.topics is not None:
                 last_first.callback(self._ros.finish, change.topics)
-            last_first.callback(change.wiring.states.forget_previous)
-            last_first.callback(change.wiring.settle_pacers, self._context.timers)
+            last_first.callback(change.built.state.forget_previous)
+            if earlier is not None:
+                last_first.callback(self.plane.end, earlier)
+
+    # ROS and gateways
 
     def _prepare_topics(self, program: Program, undo: ExitStack) -> RosChange | None:
         if self._ros is None and not _needs_ros(program):
@@ -200,21 +219,21 @@ class Runtime:
         if self._ros is None:
             self._ros = _open_ros(program, self._ros_args, self._incompatible, self._subscriber_joined)
             undo.callback(self._close_ros)
-            self._ros.start({}, self._context.reporter.failed)
         change = self._ros.prepare(program.publishers, program.subscriptions, _topic_spans(program))
         undo.callback(self._ros.abandon, change)
         return change
 
-    def _prepare_gateways(self, program: Program, wiring: Wiring, undo: ExitStack) -> GatewayChange | None:
-        if self._ros is None or not (program.gateways or self.gateways):
+    def _prepare_gateways(self, built: Built, undo: ExitStack) -> GatewayChange | None:
+        if self._ros is None or not (built.program.gateways or self.gateways):
             return None
         if self.gateways is None:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
-            reporter, counts = self._context.reporter, self._context.counts.gateways
-            self.gateways = GatewayThread(self._ros, load(), counts, reporter.report, reporter.failed)
+            reporter, counts = self._reporter, self._counts.gateways
+            self.gateways = GatewayThread(self._ros, self._library, counts, reporter.report, reporter.failed)
             undo.callback(self._stop_gateways)
-        change = self.gateways.prepare(program, wiring.feed)
+        feed = {name: deadman.feed for name, deadman in built.client_deadmen.items()}
+        change = self.gateways.prepare(built.program, feed)
         undo.callback(self.gateways.abandon, change)
         return change
 
@@ -228,28 +247,28 @@ class Runtime:
 
     def _incompatible(self, topic: str, policy: str, peers: int) -> None:
         """Count peers with an incompatible QoS policy, for each route and gateway that names the topic."""
-        if self.wiring is None:
+        if (program := self.program) is None:
             return
-        program = self.wiring.program
         for name in _users_of_topics(program).get(topic, ()):
-            self._context.counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
+            self._counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
 
     def _subscriber_joined(self, topic: str) -> None:
-        if self.wiring is not None:
-            self.wiring.subscriber_joined(topic, self._context.timers)
+        self.plane.subscriber_joined(topic)
 
-    def _is_subscribed(self) -> bool:
-        """Whether a topic has subscribers."""
-        return self._ros is not None and bool(self._ros.subscribed)
+    # the end
 
     def _stop_gateways(self) -> None:
         if self.gateways is not None:
             self.gateways.stop()
             self.gateways = None
 
-    def _stop_ros(self) -> None:
-        if self._ros is not None:
-            self._ros.stop_receiving()
+    def _stop_plane(self) -> None:
+        if not self.plane.stop(list(self.sockets.listeners.values())) and self._ros is not None:
+            self._ros.leave_open()
+
+    def _close_plane(self) -> None:
+        if not self.plane.close() and self._ros is not None:
+            self._ros.leave_open()
 
     def _close_ros(self) -> None:
         if self._ros is not None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
+from router.carrier.sender import NativeSender
 from router.compiler.network import LOOPBACK, WILDCARD, sent_from
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.udp import Listener, Sender, absence, usual_source, why_unreachable
+from router.net.udp import Listener, absence, usual_source, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 
@@ -26,8 +28,8 @@ class SocketChange:
 
     program: Program
     listeners: dict[str, Listener]
-    senders: dict[str, Sender]
-    moves: list[tuple[Sender, Listener | None, socket.socket]]
+    senders: dict[str, NativeSender]
+    moves: list[tuple[NativeSender, Listener | None, socket.socket]]
     opened: ExitStack
     left: ExitStack = field(default_factory=ExitStack)
 
@@ -54,7 +56,7 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 
-def _check_source(endpoint: model.Endpoint, sender: Sender) -> None:
+def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
     """Warn of datagrams that are sent from an address which their route does not lead back to."""
     own, usual = sender.leaves_from, usual_source(endpoint.address.value)
     if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
@@ -80,7 +82,7 @@ _Destination = tuple[Address, model.EndpointKind]
 
 
 def _destination(endpoint: model.Endpoint) -> _Destination:
-    """What a Sender depends on."""
+    """What a sender depends on."""
     return endpoint.address.value, endpoint.kind
 
 
@@ -112,21 +114,14 @@ class KernelDrops:
 class Sockets:
     """Open listeners by name, and senders by endpoint; none before the first change is applied.
 
-    `open_listener` opens a socket and raises StartError; it has to know whether senders are bound to the port.
-    `open_sender` opens one to an endpoint, to send from the port of a listener, or of none. It gets all that are open.
+    `library` is the carrier's, which sends.
     """
 
-    def __init__(
-        self,
-        drops: KernelDrops,
-        open_listener: Callable[[model.Listener, bool], Listener],
-        open_sender: Callable[[model.Endpoint, Listener | None, Sequence[Listener]], Sender],
-    ) -> None:
-        self._open_listener = open_listener
-        self._open_sender = open_sender
+    def __init__(self, drops: KernelDrops, library: ctypes.CDLL) -> None:
+        self._library = library
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
-        self._senders: dict[str, tuple[_Destination, Sender]] = {}
+        self._senders: dict[str, tuple[_Destination, NativeSender]] = {}
         self._drops = drops
 
     def prepare(self, program: Program) -> SocketChange:
@@ -136,12 +131,12 @@ class Sockets:
             for plan in program.listeners:
                 listener = self._bound.get(plan.bound_to)
                 if listener is None or listener.is_replaceable():
-                    listener = self._open_listener(plan, plan.address.value.port in self._sending_ports())
+                    listener = Listener(plan, has_senders=plan.address.value.port in self._sending_ports())
                     opening.callback(listener.close)
                 if listener.lacks_network():
                     _log_absence(plan)
                 listeners[plan.name] = listener
-            senders: dict[str, Sender] = {}
+            senders: dict[str, NativeSender] = {}
             moves = []
             every = [*self._bound.values(), *listeners.values()]
             for to in program.senders:
@@ -150,7 +145,7 @@ class Sockets:
                 is_new = sender is None or destination != _destination(to)
                 _check_reachable(to, is_new)
                 if sender is None or is_new:
-                    sender = self._open_sender(to, source, every)
+                    sender = NativeSender(self._library, to, source, every)
                     opening.callback(sender.close)
                 elif not sender.is_placed(source, every):
                     opened = sender.open_socket(source, every)

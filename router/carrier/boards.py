@@ -7,13 +7,8 @@ from collections.abc import Mapping
 from enum import IntFlag
 
 from router.carrier import structures as c
-from router.carrier.schema import CannotCarry, WireKind, wire_kind
+from router.carrier.schema import WireKind, wire_kind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
-
-_MOST_COUNTERS = 4096
-"""MOST_BOARD_COUNTERS in board.h."""
-
-_MOST_MESSAGES = 65536
 
 
 class _Flag(IntFlag):
@@ -26,10 +21,7 @@ class _Flag(IntFlag):
 
 
 class NativeBoards:
-    """A `struct board` for each endpoint that is a board. C may use them as long as this object lives.
-
-    Raises CannotCarry.
-    """
+    """A `struct board` for each endpoint that is a board. C may use them as long as this object lives."""
 
     def __init__(self, boards: Mapping[str, BoardLimits]) -> None:
         trees: dict[int, _Tree] = {}  # boards with the same firmware share one
@@ -55,8 +47,6 @@ class _Tree:
         self._arrays: list[object] = []
         self._counters = 0
         self._add(envelope)
-        if len(self._messages) > _MOST_MESSAGES or self._counters > _MOST_COUNTERS:
-            raise CannotCarry("the messages for boards have too many repeated fields")
         self.messages = (c.BoardMessage * len(self._messages))(*self._messages)
 
     def _add(self, message: BoardMessage) -> int:

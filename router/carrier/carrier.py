@@ -16,18 +16,23 @@ from router.errors import StartError
 class Carrier:
     """Receives datagrams and executes programs, in native threads that never wait for Python.
 
-    `counters` is the array of the receive thread, which writes losses and rejections to `events`. Deadmen are served
-    when they are due.
+    `counters` is the array of the receive thread, which writes losses and rejections to `events`, and what topics get
+    to `published`. Deadmen are served when they are due.
     """
 
     def __init__(
-        self, library: ctypes.CDLL, deadmen: int, counters: ctypes.Array[ctypes.c_int64], events: Ring
+        self,
+        library: ctypes.CDLL,
+        deadmen: int,
+        counters: ctypes.Array[ctypes.c_int64],
+        events: Ring,
+        published: Ring,
     ) -> None:
         """Raises MemoryError."""
         self._library = library
-        self._counters, self._events = counters, events
+        self._counters, self._keep = counters, (events, published)
         self._in_use = Lock()  # for those who may call while the carrier is closed
-        self._carrier: int = library.carrier_open(deadmen, counters, events.address)
+        self._carrier: int = library.carrier_open(deadmen, counters, events.address, published.address)
         self._running: tuple[object, ...] = ()
         if not self._carrier:
             raise MemoryError("the carrier cannot be opened")
@@ -47,20 +52,17 @@ class Carrier:
             self._library.carrier_counters(self._carrier, copy, count)
         return list(copy)
 
-    def start(self, program: NativeProgram) -> None:
-        """Start the threads. Raises StartError."""
-        change = c.Change(program=ctypes.pointer(program.structure))
+    def start(self, program: NativeProgram, timers: c.TimerChange) -> None:
+        """Start the threads, with the timers of the program. Raises StartError."""
+        change = c.Change(program=ctypes.pointer(program.structure), timers=timers)
         if error := self._library.carrier_start(self._carrier, ctypes.byref(change)):
             raise StartError(f"the carrier's threads cannot be started: {os.strerror(error)}")
         self._running = program, change
 
-    def change(
-        self, program: NativeProgram, replaced: Sequence[tuple[int, int]], timers: c.TimerChange, *, holds: bool
-    ) -> None:
-        """Execute another program from the next datagram on.
+    def change(self, program: NativeProgram, replaced: Sequence[tuple[int, int]], timers: c.TimerChange) -> None:
+        """Execute another program from the next datagram on. Listeners that it does not have are emptied before.
 
-        `replaced` has deadmen with those that they take over from; `timers` says what other timers are to do. With
-        `holds`, nothing is received until `resume` is called, or for a second.
+        `replaced` has deadmen with those that they take over from; `timers` says what other timers are to do.
         """
         pairs = [deadman for pair in replaced for deadman in pair]
         change = c.Change(
@@ -68,13 +70,9 @@ class Carrier:
             replaced=(ctypes.c_void_p * len(pairs))(*pairs),
             timers=timers,
             replaced_count=len(replaced),
-            holds=holds,
         )
         self._library.carrier_change(self._carrier, ctypes.byref(change))
         self._running = program, change
-
-    def resume(self) -> None:
-        self._library.carrier_resume(self._carrier)
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
         """Write what is received to `ring` from now on. `lost` is the counter of what had no room there.

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from router.carrier import structures as c
 from router.carrier.lowered import Programs
+from router.carrier.state import State
 from router.compiler.lowering import LoweredCollect
 from router.compiler.program import Handler
-from router.engine.binding import State
 
 
 class NativeCollector:

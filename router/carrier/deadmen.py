@@ -58,10 +58,6 @@ class Deadmen:
         if not self.address:
             raise MemoryError("the deadmen of the carrier cannot be opened")
 
-    def change(self, change: c.TimerChange) -> None:
-        """Adopt the timers of the first program."""
-        self._library.timers_change(self.address, ctypes.byref(change))
-
     def end(self) -> None:
         """Send what waits, then have deadmen send a last time. Nothing waits afterwards."""
         self._library.timers_end(self.address)

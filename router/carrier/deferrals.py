@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from router.carrier import structures as c
 from router.carrier.limits import period
+from router.carrier.state import State
 from router.compiler.program import Handler, TargetPlan
-from router.engine.binding import State
 from router.table.model import OnLimit, Priority
 
 PRIORITIES = tuple(Priority)
@@ -34,8 +34,9 @@ class NativePacer:
 class NativeDeferral:
     """What may hold back the messages of one target. `address` is that of its `struct deferral`."""
 
-    def __init__(self, library: ctypes.CDLL, pacer: NativePacer | None) -> None:
+    def __init__(self, library: ctypes.CDLL, pacer: NativePacer | None, *, is_topic: bool) -> None:
         """Raises MemoryError."""
+        self.is_topic = is_topic
         self._library = library
         self._keep = pacer
         self.address: int = library.deferral_open(pacer.address if pacer else None) or 0
@@ -49,7 +50,7 @@ class NativeDeferral:
 
 @dataclass(frozen=True, slots=True)
 class Deferrals:
-    """Pacers and deferrals of one program, which it shares with the previous one by key, in `state`.
+    """Pacers and deferrals of one program. It shares those that have the same key with the previous one, by `state`.
 
     `senders` are by endpoint, as are `bandwidths`, and `publications` by topic: what waits for one of them does not go
     to another.
@@ -61,21 +62,24 @@ class Deferrals:
     publications: Mapping[str, object]
     bandwidths: Mapping[str, int]
 
-    def pacer(self, endpoint: str) -> NativePacer | None:
-        bandwidth = self.bandwidths.get(endpoint)
-        if bandwidth is None:
-            return None
+    def pacers(self) -> list[NativePacer]:
+        """Those of all endpoints with a bandwidth."""
+        return [self._pacer(endpoint) for endpoint in self.bandwidths]
+
+    def _pacer(self, endpoint: str) -> NativePacer:
+        bandwidth = self.bandwidths[endpoint]
         key = "pacer", endpoint, bandwidth, self.senders[endpoint]
         return self.state.keep(key, lambda: NativePacer(self.library, bandwidth))
 
     def deferral(self, handler: Handler, target: TargetPlan) -> NativeDeferral | None:
         """The deferral of a target, if it needs one."""
-        pacer = None if target.is_topic else self.pacer(target.label)
+        is_paced = not target.is_topic and target.label in self.bandwidths
+        pacer = self._pacer(target.label) if is_paced else None
         if pacer is None and not held_period(target):
             return None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
         key = "deferral", handler.route, handler.topic, target.label, destination
-        return self.state.keep(key, lambda: NativeDeferral(self.library, pacer))
+        return self.state.keep(key, lambda: NativeDeferral(self.library, pacer, is_topic=target.is_topic))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,7 @@ from struct import Struct
 from router.carrier.outlets import Names
 from router.carrier.ring import Ring
 from router.carrier.structures import LOSSES, NO_NAME
-from router.compiler.metrics import REJECT_REASONS
-from router.engine.delivery import Report
+from router.compiler.metrics import REJECT_REASONS, Report
 from router.threads import Thread, join_or_leave
 
 _TRIPPED, _RELEASED, _DEADMAN_ERROR, _REJECTED, _LOST = range(1, 6)

@@ -161,9 +161,8 @@ class FromRosThread:
     def serve(self, messages: NativeFromRos, subscriptions: Mapping[str, Subscription]) -> None:
         """Serve the topics of `messages` from these subscriptions, and no others: between two messages.
 
-        What has arrived on subscriptions that are left is served before; they may be closed afterwards. Where another
-        subscription takes over a topic, a command that comes meanwhile may be sent twice. Raises StuckError after 1 s,
-        OSError or one of `ros.node.RCL_ERRORS`, with nothing changed.
+        What has arrived on subscriptions that are left is served before; they may be closed afterwards. Raises
+        StuckError after 1 s, OSError or one of `ros.node.RCL_ERRORS`, with nothing changed.
         """
         earlier = self._served
         eventfds = dict(earlier.eventfds) if earlier else {}

@@ -6,7 +6,6 @@ A library of other sources than those beside it is refused: its structures may d
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Iterator, Mapping
 from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
 from functools import cache
@@ -16,11 +15,6 @@ from router.assets import asset, is_installed
 from router.carrier import structures
 from router.carrier.build import LIBRARY, checksum
 from router.errors import StartError
-from router.log import logger
-
-VARIABLE = "ROUTER_CARRIER"
-NATIVE, PYTHON = "native", "python"
-"""The values of that environment variable. Without it the library is used if it can be."""
 
 FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "board_takes": (c_bool, (c_void_p, c_void_p, c_size_t, c_void_p)),
@@ -28,9 +22,8 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "carrier_close": (None, (c_void_p,)),
     "carrier_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "carrier_mirror": (None, (c_void_p, c_void_p, c_uint32)),
-    "carrier_open": (c_void_p, (c_void_p, c_void_p, c_void_p)),
+    "carrier_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p)),
     "carrier_pulse": (None, (c_void_p,)),
-    "carrier_resume": (None, (c_void_p,)),
     "carrier_start": (c_int, (c_void_p, c_void_p)),
     "carrier_stop_receiving": (None, (c_void_p,)),
     "carrier_turns": (c_uint64, (c_void_p,)),
@@ -76,7 +69,6 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "publish_change": (None, (c_void_p, c_void_p)),
     "publish_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "publish_has_reached": (c_bool, (c_void_p, c_uint32)),
-    "publish_hold": (None, (c_void_p, c_uint32)),
     "publish_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)),
     "publish_since": (c_int64, (c_void_p, c_void_p)),
     "publish_stop": (c_bool, (c_void_p,)),
@@ -139,7 +131,6 @@ STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
     "node": structures.Node,
     "node_field": structures.NodeField,
     "operation": structures.Operation,
-    "part": structures.Part,
     "payload_case": structures.Case,
     "peer": structures.Peer,
     "program": structures.Program,
@@ -155,16 +146,11 @@ STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
     "timer_change": structures.TimerChange,
     "topic": structures.Topic,
     "value": structures.Value,
-    "waiting": structures.Waiting,
     "wire_field": structures.WireField,
     "wire_schema": structures.Schema,
     "wire_type": structures.WireType,
 }
 """The structures that both sides declare, by their names in C."""
-
-
-class LibraryError(Exception):
-    """The library cannot be used; says why and what to do."""
 
 
 class _StructureSize(ctypes.Structure):
@@ -173,48 +159,25 @@ class _StructureSize(ctypes.Structure):
     _fields_ = (("name", c_char_p), ("size", c_size_t))
 
 
-def chosen_library(variables: Mapping[str, str] = os.environ) -> ctypes.CDLL | None:
-    """Return the library, or None if Python is to do its work: ROUTER_CARRIER says which, or what there is.
-
-    Logs a warning if the library cannot be used and was not asked for. Raises StartError if it was, and for any other
-    value.
-    """
-    choice = variables.get(VARIABLE, "")
-    if choice == PYTHON:
-        return None
-    if choice not in {"", NATIVE}:
-        raise StartError(f"{VARIABLE} is '{choice}'", f"set it to '{NATIVE}' or '{PYTHON}', or unset it")
-    try:
-        return load()
-    except LibraryError as error:
-        if choice:
-            raise StartError(f"{VARIABLE} is '{choice}', but {error}") from None
-        logger.warning("the carrier's library cannot be used: Python does its work, and more slowly", why=str(error))
-        return None
-
-
 @cache
 def library() -> ctypes.CDLL:
     """The library, loaded once. Raises StartError where it cannot be used."""
-    try:
-        return load()
-    except LibraryError as error:
-        raise StartError(f"the carrier's library cannot be used: {error}") from None
+    return load()
 
 
 def load(path: Path = LIBRARY) -> ctypes.CDLL:
-    """Load the library and declare its functions. Raises LibraryError."""
+    """Load the library, without which nothing runs, and declare its functions. Raises StartError."""
     if not path.exists():
-        raise LibraryError(f"{path} was not built; {_remedy()}")
+        raise StartError(f"{path} was not built, and nothing runs without it", _remedy())
     try:
         library = ctypes.CDLL(str(path))
         made_of = _text(library.carrier_checksum)
     except (OSError, AttributeError) as error:  # of another architecture, or no such library at all
-        raise LibraryError(f"{path} cannot be loaded: {error}; {_remedy()}") from None
+        raise StartError(f"{path} cannot be loaded: {error}", _remedy()) from None
     if made_of != checksum():
-        raise LibraryError(f"{path} was built from other sources; {_remedy()}")
+        raise StartError(f"{path} was built from other sources", _remedy())
     if differing := sorted(_differing_structures(library)):
-        raise LibraryError(f"C and Python differ about struct {', '.join(differing)}: correct structures.py")
+        raise StartError(f"C and Python differ about struct {', '.join(differing)}", "correct structures.py")
     for name, (returned, taken) in FUNCTIONS.items():
         function = getattr(library, name)
         function.restype, function.argtypes = returned, taken

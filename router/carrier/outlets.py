@@ -43,27 +43,13 @@ class Publication(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class PartTargets:
-    """The targets of a route that one thread serves, and the ring by which it gets the messages.
-
-    `is_native`: they are topics, and the native thread publishes on them.
-    """
-
-    ring: int
-    targets: Sequence[TargetPlan]
-    is_always_wanted: bool
-    is_native: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Outlets:
     """What is open for a program. Pointers are addresses of C structures.
 
     `senders` are by endpoint, `publications` by topic. `feeds(route, names)` returns the deadmen that a command feeds
     (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`, `deferral(handler,
-    target)` what may hold its messages back, `collector(handler)` what makes frames for its topics. `carried(handler)`
-    are the targets that the receive thread serves, `parts(handler)` all others. Without `boards`, endpoints that are
-    boards get everything.
+    target)` what may hold its messages back, `collector(handler)` what makes frames for its topics. Without `boards`,
+    endpoints that are boards get everything.
     """
 
     listeners: Mapping[str, Listener]
@@ -73,7 +59,5 @@ class Outlets:
     limit: Callable[[Handler, TargetPlan], c.Limit]
     deferral: Callable[[Handler, TargetPlan], NativeDeferral | None]
     collector: Callable[[Handler], NativeCollector]
-    carried: Callable[[Handler], Sequence[TargetPlan]]
-    parts: Callable[[Handler], Sequence[PartTargets]]
     names: Names
     boards: NativeBoards | None = None

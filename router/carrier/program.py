@@ -13,39 +13,34 @@ from typing import Any
 
 from router.carrier import structures as c
 from router.carrier.deferrals import Adoption
-from router.carrier.outlets import Outlets, PartTargets
+from router.carrier.outlets import Outlets
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetWriter
 from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
-from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
+from router.compiler.program import STRANGER, Handler, Program, source_label
 from router.table.model import Framing
 
 
 @dataclass(slots=True)
 class NativeProgram:
-    """`struct program` with all that it refers to. `handlers` by their number in messages for Python.
-
-    `adopted` are the deferrals of its targets.
-    """
+    """`struct program` with all that it refers to. `adopted` are the deferrals and collectors of its targets."""
 
     generation: int
-    handlers: Sequence[Handler]
-    sources: Sequence[str]
-    """The `source` label of each column."""
     adopted: Sequence[Adoption] = ()
     arrays: list[object] = field(default_factory=list)
     structure: c.Program = field(default_factory=c.Program)
 
 
 def native_program(program: Program, generation: int, outlets: Outlets) -> NativeProgram:
-    """Make the arrays of a program; `generation` numbers the programs of the process. Raises CannotCarry."""
+    """Make the arrays of a program; `generation` numbers the programs of the process."""
     schema = wire_schema(program.envelope, program.inbound.keys())
     handlers = [handler for several in program.inbound.values() for handler in several]
-    endpoints = list(program.table.endpoints)
-    made = NativeProgram(generation, handlers, [*endpoints, source_label(STRANGER)], arrays=[schema])
+    made = NativeProgram(generation, arrays=[schema])
     targets = TargetWriter(program, outlets, generation, made.arrays)
-    writer = _Writer(program, made, outlets, targets, {name: column for column, name in enumerate(endpoints)})
+    numbers = {handler.route: number for number, handler in enumerate(handlers)}
+    columns = {name: column for column, name in enumerate(program.table.endpoints)}
+    writer = _Writer(program, made, outlets, targets, numbers, columns)
     made.structure = c.Program(
         generation=generation,
         listener_count=len(program.listeners),
@@ -54,7 +49,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         schema=ctypes.addressof(schema.schema),
         listeners=writer.array(c.Listener, writer.listeners()),
         cases=writer.array(c.Case, writer.cases()),
-        routes=writer.array(c.Route, [writer.route(number, handler) for number, handler in enumerate(handlers)]),
+        routes=writer.array(c.Route, [writer.route(handler) for handler in handlers]),
     )
     made.adopted = targets.adopted
     return made
@@ -66,7 +61,10 @@ class _Writer:
     made: NativeProgram
     outlets: Outlets
     targets: TargetWriter
+    numbers: Mapping[str, int]
+    """Of the routes."""
     columns: Mapping[str, int]
+    """Of the endpoints; strangers have one more."""
 
     @property
     def counters(self) -> Counters:
@@ -110,7 +108,7 @@ class _Writer:
             peers=self.array(c.Peer, peers),
             entries=self.array(c.Entry, list(self._entries())),
             peer_count=len(peers),
-            columns=len(self.made.sources),
+            columns=len(self.columns) + 1,
             received=counters.index("datagrams_received", name),
             received_bytes=counters.index("received_bytes", name),
             padded=counters.index("datagrams_padded", name),
@@ -129,62 +127,34 @@ class _Writer:
 
     def _entries(self) -> Iterator[c.Entry]:
         """Row by row, as in `cases`: a column for each endpoint, and the last one for strangers."""
-        numbers = {handler.route: number for number, handler in enumerate(self.made.handlers)}
         for handlers in self.program.inbound.values():
             by_source = {source: handler for handler in handlers for source in handler.sources}
-            stranger = self._entry(numbers, by_source.get(STRANGER), STRANGER)
+            stranger = self._entry(by_source.get(STRANGER), STRANGER)
             for name in self.columns:
                 found = by_source.get(name)
-                yield self._entry(numbers, found, name) if found else stranger
+                yield self._entry(found, name) if found else stranger
             yield stranger
 
-    def _entry(self, numbers: Mapping[str, int], handler: Handler | None, source: str | None) -> c.Entry:
+    def _entry(self, handler: Handler | None, source: str | None) -> c.Entry:
         if handler is None:
             return c.Entry(route=-1)
         received = self.counters.index("messages_received", handler.route, source_label(source))
-        return c.Entry(route=numbers[handler.route], received=received)
+        return c.Entry(route=self.numbers[handler.route], received=received)
 
     # routes
 
-    def route(self, number: int, handler: Handler) -> c.Route:
-        parts = [self._part(number, handler, part) for part in self.outlets.parts(handler)]
-        conditions = self.program.lowered.conditions.get(handler.route)
-        return c.Route(
-            sends=self.targets.of_datagrams(handler, self.outlets.carried(handler), conditions),
-            parts=self.array(c.Part, parts),
-            part_count=len(parts),
+    def route(self, handler: Handler) -> c.Route:
+        lowered, of_datagrams = self.program.lowered, self.targets.of_datagrams
+        topics = [target for target in handler.targets if target.is_topic]
+        destinations = [target for target in handler.targets if not target.is_topic]
+        made = c.Route(
+            sends=of_datagrams(handler, destinations, lowered.conditions.get(handler.route)),
             last_message=self.counters.index("route_last_message_timestamp_seconds", handler.route),
             duration=self.counters.index("route_duration_seconds", handler.route),
         )
-
-    def _part(self, number: int, handler: Handler, part: PartTargets) -> c.Part:
-        topics = [self.outlets.publications[target.label].wanted for target in part.targets if target.is_topic]
-        flags = [ctypes.addressof(flag) for flag in topics]
-        self.made.arrays.append(topics)
-        targets = [self._waiting(handler, target) for target in part.targets]
-        return c.Part(
-            ring=part.ring,
-            publishes=ctypes.pointer(self._published(handler, part)) if part.is_native else None,
-            wanted=self.array(ctypes.c_void_p, flags),
-            targets=self.array(c.Waiting, targets),
-            wanted_count=len(flags),
-            target_count=len(targets),
-            is_always_wanted=part.is_always_wanted,
-            handler=number,
-            route=self.outlets.names.number(handler.route),
-        )
-
-    def _published(self, handler: Handler, part: PartTargets) -> c.Targets:
-        return self.targets.of_datagrams(handler, part.targets, self.program.lowered.topics[handler.route])
-
-    def _waiting(self, handler: Handler, target: TargetPlan) -> c.Waiting:
-        counters, place = self.counters, (handler.route, target.label)
-        return c.Waiting(
-            id=self.outlets.names.number(target.label),
-            waiting=counters.index("messages_waiting", *place),
-            queue_full=counters.index("messages_dropped", *place, "queue_full"),
-            filtered=counters.index("messages_filtered", *place),
-        )
+        if topics:
+            made.publishes = of_datagrams(handler, topics, lowered.topics[handler.route])
+        return made
 
 
 def _number(host: str) -> int:

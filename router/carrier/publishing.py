@@ -14,7 +14,7 @@ _POLL_S = 0.002
 
 
 class PublishThread:
-    """Publishes the messages of `ring`, whose parts say what they come to. It starts at once, and stops once.
+    """Delivers the messages of `ring` to topics. It starts at once, and stops once.
 
     `counters` is the array that it counts in; losses go to `events`. `functions` are the addresses of those in
     `ros.rcl.PublishFunctions`.
@@ -65,12 +65,6 @@ class PublishThread:
                     return True
             sleep(_POLL_S)
         return False
-
-    def hold(self, generation: int) -> None:
-        """Serve nothing of that generation or a later one, until this is called with 0."""
-        with self._in_use:
-            if self._address:
-                self._library.publish_hold(self._address, generation)
 
     def stalled(self) -> tuple[int, float] | None:
         """The topic in whose publisher the thread is now, by its number, and for how many seconds; None if in none."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from router import datagrams
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute
 from router.compiler.program import Program
-from router.engine.slow_path import Rejected, SlowPath
-from router.types.framing import MAX_DATAGRAM
+from router.table.model import Framing
 
 
 def why_rejected(program: Program, listener: str, data: bytes, length: int) -> str:
     """Say why a datagram of `length` bytes was rejected, of which `data` may be the beginning."""
-    if length > MAX_DATAGRAM:
-        return f"{length} bytes"
-    if listener not in program.table.listeners:
+    plan = program.table.listeners.get(listener)
+    if plan is None:
         return ""
-    routed = {number: handlers[0].case.name for number, handlers in program.inbound.items()}
-    try:
-        case, _, _ = SlowPath(program, program.counters.fresh_counts(), listener, routed).parse(data)
-    except Rejected as rejected:
-        return str(rejected)
-    return case
+    repairs = plan.framing is Framing.ZERO_TRIMMED
+    return datagrams.why_rejected(program.envelope, data, length, repairs=repairs)
 
 
 def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, place: int) -> str:

@@ -12,17 +12,18 @@ from typing import NamedTuple, Union
 
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
+from router.carrier.collectors import kept_collector
 from router.carrier.deadmen import NativeDeadman, open_deadman
 from router.carrier.deferrals import Adoption, Deferrals, timer_change
 from router.carrier.events import Changed, EventReader, Told
 from router.carrier.from_ros import NativeFromRos, native_from_ros
 from router.carrier.limits import open_limit
-from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.ring import Ring
+from router.carrier.state import State
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
-from router.engine.binding import State
 from router.table.model import Endpoint
 
 Peer = tuple[str, int]
@@ -85,7 +86,7 @@ class Stage:
         return self._opened.counters[:count]
 
     def adopt(self, program: Program) -> None:
-        """Go on with a program, which takes over what has the same key, as at a reload. Raises CannotCarry."""
+        """Go on with a program, which takes over what has the same key, as at a reload. Raises MemoryError."""
         earlier, state = self._running, State(self._state)
         self._generation += 1
         running = self._opened_for(program, state)
@@ -181,18 +182,13 @@ class Stage:
             assert target.max_rate is not None  # noqa: S101 - asked for by the caller
             return state.keep(("limit", handler.route, handler.topic, target), partial(open_limit, target.max_rate))
 
-        def parts(handler: Handler) -> Sequence[PartTargets]:
-            topics = [target for target in handler.targets if target.is_topic]
-            part = PartTargets(self._ring.address, topics, is_always_wanted=False, is_native=True)
-            return [part] if topics else []
-
         publications = {
             plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
             for plan in program.publishers
         }
         bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
         deferrals = Deferrals(self._library, state, senders, publications, bandwidths)
-        pacers = [pacer for endpoint in bandwidths if (pacer := deferrals.pacer(endpoint))]
+        pacers = deferrals.pacers()
         outlets = Outlets(
             listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
             senders={name: sender.address for name, sender in senders.items()},
@@ -200,8 +196,7 @@ class Stage:
             feeds=feeds,
             limit=limit,
             deferral=deferrals.deferral,
-            carried=lambda handler: [target for target in handler.targets if not target.is_topic],
-            parts=parts,
+            collector=partial(kept_collector, self._library, state),
             names=self._names,
             boards=NativeBoards(program.boards),
         )

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.carrier.structures import Schema, WireField, WireType
-from router.types.descriptors import container, message_of
+from router.types.descriptors import message_of
 from router.types.protobuf import Envelope
+from router.types.undecidable import all_fields, all_types
 from router.types.wire import I32, I64, VARINT, delimited, parses, validates_text, wire_type_of
-
-_MOST_TYPES = 65536
-
-
-class CannotCarry(Exception):
-    """The carrier cannot decide what protobuf decides about these messages; Python has to parse them."""
 
 
 class WireKind(IntEnum):
@@ -69,14 +64,10 @@ _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.
 
 
 def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
-    """Return the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route.
-
-    Raises CannotCarry.
-    """
+    """Return the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
     flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
-    _check_envelope(descriptor, flags)
-    indexes = _all_types(descriptor)
+    indexes = all_types(descriptor)
     arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
     types = (WireType * len(arrays))(
         *(
@@ -87,43 +78,6 @@ def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
     return WireSchema(Schema(types, len(types)), types, arrays)
 
 
-def _check_envelope(envelope: Descriptor, cases: Container[int]) -> None:
-    """Refuse what makes an envelope's fields unknown for other reasons than their wire type.
-
-    Where there is no payload, the reason depends on the unknown fields. Inside of payloads it does not matter.
-    """
-    for field in _fields(envelope):
-        if field.number in cases and field.type == FieldDescriptor.TYPE_GROUP:
-            raise CannotCarry(f"the payload case {field.name} is a group")
-        if field.enum_type is not None and field.enum_type.is_closed:
-            raise CannotCarry(f"{field.full_name} beside the payload is a closed enum")
-        if field.message_type is not None and field.message_type.GetOptions().map_entry:
-            raise CannotCarry(f"{field.full_name} beside the payload is a map")
-
-
-def _all_types(envelope: Descriptor) -> dict[Descriptor, int]:
-    """The envelope and all types that its fields lead to, with their indexes."""
-    indexes, pending = {envelope: 0}, [envelope]
-    while pending:
-        descriptor = pending.pop()
-        if descriptor.GetOptions().message_set_wire_format:
-            raise CannotCarry(f"{descriptor.full_name} is a message set")
-        for field in _fields(descriptor):
-            if field.message_type is not None and field.message_type not in indexes:
-                indexes[field.message_type] = len(indexes)
-                pending.append(field.message_type)
-    if len(indexes) > _MOST_TYPES:
-        raise CannotCarry(f"{envelope.full_name} leads to {len(indexes)} types of messages")
-    return indexes
-
-
-def _fields(descriptor: Descriptor) -> Iterator[FieldDescriptor]:
-    """The fields of a message and the extensions that its pool knows: protobuf parses both alike."""
-    yield from descriptor.fields
-    if descriptor.is_extendable:
-        yield from descriptor.file.pool.FindAllExtensions(descriptor)
-
-
 def _case_flags(number: int, routed: Container[int]) -> WireFlag:
     return WireFlag.CASE | WireFlag.ROUTED if number in routed else WireFlag.CASE
 
@@ -131,15 +85,13 @@ def _case_flags(number: int, routed: Container[int]) -> WireFlag:
 def _lowered(
     descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, WireFlag]
 ) -> ctypes.Array[WireField]:
-    fields = sorted(_fields(descriptor), key=lambda field: field.number)
+    fields = sorted(all_fields(descriptor), key=lambda field: field.number)
     lowered = [_lowered_field(field, indexes, flags.get(field.number, WireFlag(0))) for field in fields]
     return (WireField * len(lowered))(*lowered)
 
 
 def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: WireFlag) -> WireField:
     kind = _kind(field)
-    if kind is WireKind.GROUP and not parses(container(field), delimited(field.number, b"\xff")):
-        raise CannotCarry(f"protobuf before 7.36 takes {field.full_name}, a group, for a message")
     if kind in {WireKind.MESSAGE, WireKind.GROUP}:
         return WireField(field.number, kind, flags, indexes[message_of(field)])
     is_packable = field.is_repeated and kind in {WireKind.VARINT, WireKind.I64, WireKind.I32}

@@ -104,12 +104,6 @@ class Board(ctypes.Structure):
     _fields_ = (("messages", POINTER(BoardMessage)), ("longest", c_uint32), ("allows_non_finite", c_uint32))
 
 
-class Waiting(ctypes.Structure):
-    """`struct waiting` in carrier.h."""
-
-    _fields_ = (("id", c_uint32), ("waiting", c_uint32), ("queue_full", c_uint32), ("filtered", c_uint32))
-
-
 class Value(ctypes.Structure):
     """`struct value` in operations.h, with its union as bits."""
 
@@ -254,33 +248,14 @@ class Targets(ctypes.Structure):
     )
 
 
-class Part(ctypes.Structure):
-    """`struct part` in carrier.h."""
-
-    _fields_ = (
-        ("ring", c_void_p),
-        ("publishes", POINTER(Targets)),
-        ("wanted", POINTER(c_void_p)),
-        ("targets", POINTER(Waiting)),
-        ("wanted_count", c_uint32),
-        ("target_count", c_uint32),
-        ("is_always_wanted", c_uint32),
-        ("handler", c_uint32),
-        ("route", c_uint32),
-        ("reserved", c_uint32),
-    )
-
-
 class Route(ctypes.Structure):
     """`struct route` in carrier.h."""
 
     _fields_ = (
         ("sends", Targets),
-        ("parts", POINTER(Part)),
-        ("part_count", c_uint32),
+        ("publishes", Targets),
         ("last_message", c_uint32),
         ("duration", c_uint32),
-        ("reserved", c_uint32),
     )
 
 
@@ -368,7 +343,7 @@ class Change(ctypes.Structure):
         ("replaced", POINTER(c_void_p)),
         ("timers", TimerChange),
         ("replaced_count", c_uint32),
-        ("holds", c_uint32),
+        ("reserved", c_uint32),
     )
 
 
@@ -431,7 +406,7 @@ class MessageRecord(ctypes.Structure):
     _fields_ = (
         ("size", c_uint32),
         ("generation", c_uint32),
-        ("part", POINTER(Part)),
+        ("to", POINTER(Targets)),
         ("received_at", c_int64),
         ("now", c_int64),
         ("oldest", c_int64),
@@ -441,7 +416,7 @@ class MessageRecord(ctypes.Structure):
         ("length", c_uint32),
         ("start", c_uint32),
         ("payload_length", c_uint32),
-        ("handler", c_uint32),
+        ("reserved", c_uint32),
     )
 
 
@@ -514,7 +489,6 @@ __all__ = [
     "Node",
     "NodeField",
     "Operation",
-    "Part",
     "Peer",
     "Program",
     "PublishChange",
@@ -530,7 +504,6 @@ __all__ = [
     "TimerChange",
     "Topic",
     "Value",
-    "Waiting",
     "WireField",
     "WireType",
 ]

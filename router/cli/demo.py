@@ -22,7 +22,7 @@ from router.cli.run import route
 from router.cli.tool_options import say
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.log import configure_log
 from router.tools.simulator import Simulator
 

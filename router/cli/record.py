@@ -57,7 +57,7 @@ def _save_last(args: argparse.Namespace) -> int:
 
 
 def _record(args: argparse.Namespace) -> int:
-    from router.engine.wire import wire_of_table
+    from router.datagrams import wire_of_table
     from router.table import read_table
     from router.threads import background_threads
     from router.tools.recordings import TapRecording

@@ -86,7 +86,7 @@ def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str])
     with Router(program, ["--ros-args", *ros_args], environ) as router:
         tune_interpreter()
         _show_places(router)
-        with supervised(router.progress, router.feed_watchdog):
+        with supervised(router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once

@@ -37,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from router.engine.wire import framed
+    from router.datagrams import framed
     from router.tools import udp
     from router.tools.udp import Sent, send
     from router.values import payload

@@ -54,7 +54,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from router.compiler import check_table
-    from router.engine.wire import Wire
+    from router.datagrams import Wire
     from router.tools.sim_view import SimView
     from router.tools.simulator import Simulator, parse_silence
 

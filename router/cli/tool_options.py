@@ -21,7 +21,7 @@ from router.errors import TableError, UsageError
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
-    from router.engine.wire import Wire
+    from router.datagrams import Wire
     from router.table.model import RouteTable
     from router.tools.tap import TappedDatagram, TappedMessage
 
@@ -94,7 +94,7 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
 
     Raises TableError and UsageError.
     """
-    from router.engine.wire import wire_of_protos, wire_of_table
+    from router.datagrams import wire_of_protos, wire_of_table
     from router.table import read_table
 
     if args.protos is not None and args.table is not None:

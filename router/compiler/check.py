@@ -5,7 +5,7 @@ The same check serves `validate`, `explain` and `run`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,10 +19,10 @@ from router.compiler.network import network_findings
 from router.compiler.program import GatewayPlan, Program
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
-from router.errors import Diagnostic, Severity, TableError
+from router.errors import Code, Diagnostic, Severity, TableError
 from router.table import in_order, load_table
 from router.table.model import EndpointKind, RouteTable, Topic
-from router.types.board_limits import BoardLimits, board_fields
+from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, places
 from router.types.lock import LockComparison
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
@@ -101,6 +101,7 @@ def check_table(
         *schema.warnings,
         *(lock.findings(table.envelope.lock) if lock and table.envelope else ()),
         *network_findings(table),
+        *_board_findings(table, boards),
         *lookup.findings,
         *clash_findings(table),
         *topic_findings(table, [checked.route for checked in routes]),
@@ -123,6 +124,15 @@ def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: i
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
     return {each.name: BoardLimits(fields, limit, each.allow_non_finite) for each in boards}
+
+
+def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:
+    for name, limits in boards.items():
+        messages, lists = places(limits.fields)
+        if messages > MOST_MESSAGES or lists > MOST_LISTS:
+            what = f"an envelope for '{name}' has {messages:,} places of messages and {lists:,} of repeated fields"
+            hint = f"the router takes {MOST_MESSAGES:,} and {MOST_LISTS:,}: make it another kind of endpoint"
+            yield Diagnostic(table.endpoints[name].span, Code.TOO_LARGE, what, hint)
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:

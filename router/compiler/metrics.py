@@ -192,6 +192,23 @@ class Series:
 HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
 
 
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
+
+    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is how many such
+    losses there were since the last report of them.
+    """
+
+    kind: str
+    place: str
+    target: str
+    reason: str
+    error: BaseException | None = None
+    detail: str = ""
+    times: int = 1
+
+
 @dataclass(slots=True)
 class Counters:
     """The index of each series in the lists of integers in which threads count.

@@ -201,5 +201,10 @@ class Program:
         return chain.from_iterable((*self.inbound.values(), *self.outbound.values()))
 
     @property
+    def client_deadmen(self) -> list[DeadmanPlan]:
+        """Those of topics that clients of gateways may publish on."""
+        return [each.deadman for gateway in self.gateways for each in gateway.inbound.values() if each.deadman]
+
+    @property
     def protos_sha256(self) -> str:
         return self.protos.sha256

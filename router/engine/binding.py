@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import FunctionType
 from typing import Any, Protocol, TypeVar, cast
 
-from router.compiler.metrics import Counters
+from router.compiler.metrics import Counters, Report
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
 from router.engine.deadman import CommandMaker
@@ -16,7 +16,6 @@ from router.engine.delivery import (
     Deliver,
     FrameOutcome,
     Outcome,
-    Report,
     Stale,
     checked,
     immediately,

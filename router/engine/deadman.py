@@ -6,9 +6,9 @@ import errno
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from router.compiler.metrics import Counters
+from router.compiler.metrics import Counters, Report
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Command, EarlierRefused, Feed, Report, Stale
+from router.engine.delivery import Command, EarlierRefused, Feed, Stale
 from router.engine.timers import Locked, Timer
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import errno
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from router.compiler.metrics import DROP_REASONS, Counters
+from router.compiler.metrics import DROP_REASONS, Counters, Report
 from router.compiler.program import TargetPlan
 from router.errors import MappingError, NonFiniteError
 from router.types.board_limits import BoardLimits, Refusal
@@ -54,23 +53,6 @@ class BoardRefuses(OSError):
     def __init__(self, refusal: Refusal) -> None:
         super().__init__(refusal.text)
         self.reason = refusal.reason
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
-
-    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is how many such
-    losses there were since the last report of them.
-    """
-
-    kind: str
-    place: str
-    target: str
-    reason: str
-    error: BaseException | None = None
-    detail: str = ""
-    times: int = 1
 
 
 class Outcome:

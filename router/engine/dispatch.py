@@ -11,17 +11,17 @@ from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
 from router.compiler import STRANGER, source_label
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS, Report
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program, TargetPlan
+from router.datagrams import Peer
 from router.engine.binding import EngineContext, Handle, bind, unbind
-from router.engine.delivery import Outcome, Report
+from router.engine.delivery import Outcome
 from router.engine.freshness import Born, Freshness
 from router.engine.slow_path import Rejected, SlowPath
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
 
-Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], str]
 """Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from typing import Generic, TypeVar
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
-from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.compiler.metrics import UNKNOWN_CASE
 from router.compiler.program import Program
+from router.datagrams import why_no_payload
 from router.table.model import Framing
 from router.types.framing import MAX_DATAGRAM, restored
 
@@ -72,17 +72,3 @@ class SlowPath(Generic[Case]):
 
     def _count_unhandled(self, case: str) -> None:
         self._counts[self._counters.index("unhandled", case)] += 1
-
-
-def why_no_payload(envelope: Message, cases: Container[int]) -> tuple[str, str]:
-    """Return the reason why a parsed envelope has no payload, and the field that causes it, or "".
-
-    `cases` are the field numbers of the payload cases: one of them among the unknown fields has the wrong wire type.
-    """
-    fields = UnknownFieldSet(envelope)
-    numbers = [fields[index].field_number for index in range(len(fields))]
-    if not numbers:
-        return "no_payload", ""
-    if known := [number for number in numbers if number in cases]:
-        return "malformed", f"field {known[0]} is no message here"
-    return "unknown_case", f"field {numbers[0]}"

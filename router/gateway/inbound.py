@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from router.carrier.limits import Freshness, RateLimit
-from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters
+from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters, Report
 from router.compiler.program import GatewayPlan, InboundPlan
-from router.engine import Report
 from router.gateway.documents import PublishRequest, SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.json_codec import InvalidMessageError, decoder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-from collections.abc import Callable, Coroutine, Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import boottime_ns, wall_ns
-from router.compiler.metrics import Counters
+from router.compiler.metrics import Counters, Report
 from router.compiler.program import GatewayPlan, Program
-from router.engine import Report
-from router.engine.deadman import FeedMaker
 from router.errors import StartError
 from router.gateway.clients import ClientQueue
 from router.gateway.context import GatewayContext
@@ -96,13 +94,13 @@ class GatewayThread:
         self._context = GatewayContext(self._subscriptions, self._converting, failed, boottime_ns, wall_ns)
         self._thread.start()
 
-    def prepare(self, program: Program, feed: FeedMaker) -> GatewayChange:
+    def prepare(self, program: Program, feed: Mapping[str, Callable[[int], None]]) -> GatewayChange:
         """Open the gateways of `program` that are not open. Raises StartError, and then all is as it was.
 
-        `feed` makes the functions that feed deadmen. A gateway that is the same as before keeps its clients. One that
-        has changed loses them here: its socket has to be closed before the new one can be opened.
+        `feed` has what feeds a deadman, by the deadman's route. A gateway that is the same as before keeps its clients.
+        One that has changed loses them here: its socket has to be closed before the new one can be opened.
         """
-        return self._call(self._prepare(program, _outputs(program, self._ros, self._library, feed, self._report)))
+        return self._call(self._prepare(program, _outputs(self._ros, self._library, feed, self._report)))
 
     async def _prepare(self, program: Program, outputs: InboundOutputs) -> GatewayChange:
         kept = {
@@ -256,15 +254,16 @@ def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
 
 
 def _outputs(
-    program: Program, ros: RouterNode, library: ctypes.CDLL, feed: FeedMaker, report: Callable[[Report], None]
+    ros: RouterNode,
+    library: ctypes.CDLL,
+    feed: Mapping[str, Callable[[int], None]],
+    report: Callable[[Report], None],
 ) -> InboundOutputs:
-    inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
-    guarded = [each.deadman.route for each in inbound if each.deadman]
     return InboundOutputs(
         library=library,
         publish=ros.publish,
         publish_errors=ros.publish_errors,
-        feed_deadman={route: feed(route, (route,)) for route in guarded},
+        feed_deadman=feed,
         report=report,
         clock_ns=boottime_ns,
         wall_ns=wall_ns,

@@ -21,11 +21,8 @@ SO_ATTACH_FILTER = 26
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_MEMINFO = 55
-IP_PKTINFO = 8
 IP_RECVERR = 11
 IP_FREEBIND = 15
-IPV6_RECVERR = 25
-PKTINFO_SIZE = 12
 SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
 SIOCGIFADDR = 0x8915
@@ -38,24 +35,19 @@ _MEMINFO_DROPS = 8
 _INODE = 9
 """The column of /proc/net/udp and /proc/net/tcp."""
 
-_EXTENDED_ERROR = struct.Struct("@IBBB")
-"""The beginning of struct sock_extended_err: errno, origin, ICMP type and code."""
-_OF_ICMP, _UNREACHABLE, _NET_OR_HOST = 2, 3, (0, 1)
-_MOST_ERRORS = 32
-
 _BOUND = {"udp": "07", "tcp": "0A"}
 """The state of a socket that receives from anybody, in /proc/net."""
 
 
-def send_arrivals(opened: socket.socket, *, wanted: bool) -> None:
-    """Have the kernel send the time of its arrival with each datagram, or only tell it when asked, as by `arrivals`."""
+def send_arrivals(opened: socket.socket) -> None:
+    """Have the kernel send the time of its arrival with each datagram; where it does not, have it tell when asked."""
     try:
-        opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, wanted)
+        opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     except OSError as error:
         if error.errno != errno.ENOPROTOOPT:
             raise
-        if wanted:
-            _warn_once("the kernel sends no arrival times with datagrams: each takes one more system call")
+        _warn_once("the kernel sends no arrival times with datagrams: each takes one more system call")
+        arrivals(opened)
 
 
 def arrivals(opened: socket.socket) -> Callable[[], int]:
@@ -126,25 +118,6 @@ def bound_interface(opened: socket.socket) -> str | None:
 def report_sending_errors(opened: socket.socket) -> None:
     """Have the kernel report ICMP errors about datagrams that were sent from the socket's port."""
     opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
-
-
-def sending_errors(opened: socket.socket) -> Iterator[tuple[tuple[str, int], int]]:
-    """Yield the waiting errors, each with the destination of its datagram as the socket's family writes it.
-
-    The errno is 0 if the receiver has not refused the datagram: routers report passing troubles too.
-    """
-    for _ in range(_MOST_ERRORS):
-        try:
-            _, found, _, destination = opened.recvmsg(0, 256, socket.MSG_ERRQUEUE | socket.MSG_DONTWAIT)
-        except OSError:
-            return
-        kinds = (socket.IPPROTO_IP, IP_RECVERR), (socket.IPPROTO_IPV6, IPV6_RECVERR)
-        errors = [data for level, kind, data in found if (level, kind) in kinds]
-        number, origin, kind, code = _EXTENDED_ERROR.unpack_from(errors[0])
-        is_refusal = origin == _OF_ICMP and kind == _UNREACHABLE and code not in _NET_OR_HOST
-        yield destination, number if is_refusal else 0
-    for wanted in (0, 1):  # discards the others: what a flood leaves would keep datagrams out of the receive buffer
-        opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, wanted)
 
 
 def refuse_input(opened: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""UDP sockets: listeners, inherited ones among them, and senders that account for every datagram."""
+"""UDP sockets: listeners, inherited ones among them, and those to send from."""
 
 from __future__ import annotations
 
@@ -9,14 +9,10 @@ from collections.abc import Collection, Iterable, Iterator, MutableMapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
-from router.engine.delivery import EarlierRefused
 from router.errors import StartError
 from router.log import logger
 from router.net.kernel import (
     IP_FREEBIND,
-    IP_PKTINFO,
-    PKTINFO_SIZE,
-    arrivals,
     ask_for_receive_buffer,
     bound_interface,
     drops,
@@ -25,7 +21,6 @@ from router.net.kernel import (
     refuse_input,
     report_sending_errors,
     send_arrivals,
-    sending_errors,
 )
 from router.table import model
 from router.table.addresses import Address, not_one_machine
@@ -51,16 +46,11 @@ class Inherited:
         self._taken: set[str] = set()
 
     def take(self, bound: str) -> socket.socket | None:
-        """Return a duplicate of the socket that is bound so, or None. It can be taken again.
-
-        If the socket unit says Timestamping=ns, what waits in it keeps the time at which the kernel got it.
-        """
+        """Return a duplicate of the socket that is bound so, or None. It can be taken again."""
         held = self._sockets.get(bound)
         if held is None or _bound_to(held) != bound:  # the interface may have gone since
             return None
         self._taken.add(bound)
-        # Without the option, stamps are read by `arrivals`, and no longer come with each datagram.
-        send_arrivals(held, wanted=False)
         held.setblocking(True)
         return held.dup()
 
@@ -128,26 +118,23 @@ class Listener:
     While its address or interface is not there, as that of a tunnel that comes up later, it is waiting: the socket is
     not bound and receives nothing, and another Listener has to replace it. Any other failure raises StartError with the
     position in the table and a remedy. Datagrams that are not received from an inherited
-    socket wait for the next process, and its kernel drops may be older than this process. `is_stamped`: each datagram
-    comes with the time at which the kernel got it; else `arrived_at` returns that of the last one. `has_senders`:
-    some that are bound to its port are open.
+    socket wait for the next process, and its kernel drops may be older than this process. Each datagram comes with the
+    time at which the kernel got it, where the kernel has it. `has_senders`: some that are bound to its port are open.
     """
 
-    def __init__(self, settings: model.Listener, *, is_stamped: bool = False, has_senders: bool = False) -> None:
+    def __init__(self, settings: model.Listener, *, has_senders: bool = False) -> None:
         self._settings = settings
         handed_over = inherited().take(settings.bound_to)
         self.is_inherited = handed_over is not None
         self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            if is_stamped:
-                send_arrivals(self.socket, wanted=True)
+            send_arrivals(self.socket)
             # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
             # would steal the port unnoticed.
             with self.shared() if has_senders else nullcontext():
                 self.is_waiting = handed_over is None and not self._try_to_bind()
             report_sending_errors(self.socket)
             self._request_receive_buffer(settings)
-            self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
             raise _refused(settings, error) from error
@@ -161,11 +148,6 @@ class Listener:
     @property
     def bound_to(self) -> str:
         return bound_to(self.address, self._settings.interface)
-
-    @property
-    def coalesce(self) -> int:
-        """The longest pause between two reads, in ns."""
-        return self._settings.coalesce
 
     @property
     def interface(self) -> str | None:
@@ -212,13 +194,6 @@ class Listener:
             yield
         finally:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
-
-    def note_errors(self) -> bool:
-        """Tell senders of ICMP errors about what they have sent from its port. Return whether there were any."""
-        errors = list(sending_errors(self.socket))
-        for destination, refused in errors:
-            any(sender.note(refused, Address(*destination)) for sender in list(_open_senders) if refused)
-        return bool(errors)
 
     def end_input(self) -> None:
         """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
@@ -307,9 +282,6 @@ def _is_broadcast(address: Address) -> bool:
         return probe.connect_ex(address) == 0
 
 
-_open_senders: set[Sender] = set()
-
-
 class Sender:
     """A non-blocking socket for one destination, which it is not connected to.
 
@@ -322,12 +294,9 @@ class Sender:
         self, endpoint: model.Endpoint, source: Listener | None = None, listeners: Collection[Listener] = ()
     ) -> None:
         self.endpoint = endpoint.name
-        self._to = endpoint.address.value
         self._is_board = endpoint.kind is model.EndpointKind.BOARD
-        self._refused = 0  # errno of an earlier datagram
         self.source = source
         self.socket = self.open_socket(source, listeners)
-        _open_senders.add(self)
 
     def open_socket(self, source: Listener | None, listeners: Collection[Listener]) -> socket.socket:
         """Open a socket to move to."""
@@ -370,84 +339,8 @@ class Sender:
         """Whether it sends from the port of its listener."""
         return self.socket.family == socket.AF_INET6
 
-    def send(self, data: bytes) -> int:
-        """Send a datagram and return its size, or raise OSError: then exactly one is lost.
-
-        With EarlierRefused that is an earlier datagram, which was counted as sent and which its receiver has refused.
-        This one was sent, so the counters balance.
-        """
-        try:
-            sent = self._send_once(data)
-        except OSError as error:
-            sent = self._send_again(data, error)
-        self._raise_refused()
-        return sent
-
-    def send_checked(self, data: bytes) -> int:
-        """As `send`, for deadmen. A send buffer that commands have filled does not stop the datagram.
-
-        Errors of this datagram that are known at once are raised as well: no process listens on a local port. With
-        `send`, a later datagram would raise that error.
-        """
-        self._note_errors()
-        try:
-            sent = self.send(data)
-        except BlockingIOError:
-            sent = self._send_beyond_room(data)
-        self._note_errors()
-        self._raise_refused()
-        return sent
-
-    def note(self, refused: int, destination: Address) -> bool:
-        """Return whether the sender has taken the error: it has to be its own, and it holds one at a time."""
-        if destination == self._to and not self._refused:
-            self._refused = refused
-            return True
-        return False
-
     def close(self) -> None:
-        _open_senders.discard(self)
         self.socket.close()
-
-    def _send_once(self, data: bytes) -> int:
-        host, port = self._to
-        return self.socket.sendto(data, (f"::ffff:{host}" if self.is_bound else host, port))
-
-    def _send_again(self, data: bytes, error: OSError) -> int:
-        """Try again after an error, if it is of an earlier datagram, or if this computer may have lost the address that
-        the socket is bound to: a brake has to leave from another one."""
-        if self._note_own_errors():
-            return self._send_once(data)
-        if self.is_bound and error.errno in (errno.EINVAL, errno.ENETUNREACH):
-            host, port = self._to
-            any_address = [(socket.IPPROTO_IP, IP_PKTINFO, bytes(PKTINFO_SIZE))]
-            return self.socket.sendmsg([data], any_address, 0, (f"::ffff:{host}", port))
-        raise error
-
-    def _send_beyond_room(self, data: bytes) -> int:
-        """Send though the socket keeps all that it may. That still counts, so commands are refused as before."""
-        room = self.socket.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, (1 << 30) - 1)  # net.core.wmem_max is granted
-        try:
-            return self._send_once(data)
-        finally:  # the kernel doubles what is asked for, and returns the doubled value
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, room // 2)
-
-    def _note_errors(self) -> None:
-        """They reach the listener; without one, or if they come by another interface than its, the socket itself."""
-        self._note_own_errors()
-        if self.source is not None and self.is_bound:
-            self.source.note_errors()
-
-    def _note_own_errors(self) -> bool:
-        refused = [error for _, error in sending_errors(self.socket)]
-        self._refused = self._refused or next(filter(None, refused), 0)
-        return bool(refused)
-
-    def _raise_refused(self) -> None:
-        if self._refused:
-            refused, self._refused = self._refused, 0
-            raise EarlierRefused(refused, os.strerror(refused))
 
 
 def _open_sending(family: socket.AddressFamily) -> socket.socket:

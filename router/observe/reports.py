@@ -6,7 +6,7 @@ import errno
 import threading
 from collections.abc import Callable
 
-from router.engine import Report
+from router.compiler.metrics import Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import nobody_listens
 from router.table.addresses import Address

@@ -15,7 +15,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.types.protobuf import PayloadCase
 
 DATAGRAMS = "raw/datagrams"

@@ -21,7 +21,7 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 from mcap.records import Chunk as ChunkRecord
 
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.recording.channels import Channels, Datagram
 from router.recording.mirror import Classifier, Mirrored
 from router.types.framing import MAX_DATAGRAM

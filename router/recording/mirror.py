@@ -1,21 +1,19 @@
 """The mirror: what listeners receive, and what routing decided about it, for recordings, taps and pages.
 
-While no consumer is attached, the receive path has nothing of it. The carrier has a ring of its own in place of `tee`.
+While no consumer is attached, the receive thread does nothing for it.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
-from router.clock import wall_ns
 from router.compiler.network import recognisers
-from router.engine.dispatch import Peer, Receive
+from router.datagrams import Peer
 from router.table.model import Framing, RouteTable
 from router.threads import Thread, join_or_leave
 from router.types.framing import MAX_DATAGRAM, restored
@@ -25,16 +23,13 @@ from router.types.wire import LEN, varint
 PERIOD = 0.05
 """Seconds between two batches: waking a consumer for each datagram would cost more than routing it."""
 
-MOST_WAITING = 8192
-"""Datagrams. More are dropped and counted, so that a slow consumer never holds up routing."""
-
 
 class MirroredDatagram(NamedTuple):
     """A datagram: when the router took it (wall clock, ns), on which listener, from whom, and its bytes as received.
 
     `endpoint` is what the table calls the sender, "" for a stranger. `reason` is why no route took the datagram, one of
-    REJECT_REASONS, "" for one that a route took. Of one that is longer than the router takes there are the first
-    `limit` + 1 bytes.
+    REJECT_REASONS, "" for one that a route took. Of one longer than MAX_DATAGRAM there are as many bytes and one
+    more.
     """
 
     at: int
@@ -54,22 +49,28 @@ Consumer = Callable[[Sequence[Mirrored]], None]
 class Mirror:
     """One thread calls the consumers, up to PERIOD after a datagram; none may keep it for long.
 
-    `rewire` is called when the first consumer has attached and when the last one has detached: the receiver then asks
-    `tee` again for what to call. Datagrams are cut to `limit` + 1 bytes. What a consumer raises goes to `failed`.
+    `rewire` is called when the first consumer has attached and when the last one has detached. What a consumer raises
+    goes to `failed`.
     """
 
-    def __init__(self, limit: int, rewire: Callable[[], None], failed: Callable[[Exception], None]) -> None:
-        self.lost = 0
-        """Datagrams that were routed, but not mirrored."""
-        self._limit = limit
+    def __init__(self, rewire: Callable[[], None], failed: Callable[[Exception], None]) -> None:
         self._rewire = rewire
         self._failed = failed
-        self._waiting: deque[Mirrored] = deque()
-        self._drain = self._drain_waiting
+        self._drain: Callable[[], Sequence[Mirrored]] = tuple
+        self._lost: Callable[[], int] = int
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
         self._stopping = threading.Event()
         self._thread: Thread | None = None
+
+    def show(self, drain: Callable[[], Sequence[Mirrored]], lost: Callable[[], int]) -> None:
+        """Show what `drain` returns: what was received since its last call. `lost` is how many were not mirrored."""
+        self._drain, self._lost = drain, lost
+
+    @property
+    def lost(self) -> int:
+        """Datagrams that were routed, but not mirrored."""
+        return self._lost()
 
     @property
     def is_observed(self) -> bool:
@@ -103,34 +104,6 @@ class Mirror:
                     self._drain()
 
         return detach
-
-    def tee(self, listener: str, receive: Receive, sender: Callable[[Peer], str]) -> Receive:
-        """Return what to call in place of `receive` for datagrams of `listener`, until `rewire` is called.
-
-        `sender` returns the table's name of a peer, as `Classifier.sender` does.
-        """
-        if not self._consumers:
-            return receive
-        waiting, append, most = self._waiting, self._waiting.append, self._limit + 1
-
-        def mirrored(data: bytes, peer: Peer) -> str:
-            at = wall_ns()
-            reason = receive(data, peer)
-            if len(waiting) < MOST_WAITING:
-                append((at, listener, peer, sender(peer), reason, data[:most]))
-            else:
-                self.lost += 1
-            return reason
-
-        return mirrored
-
-    def drain_by(self, drain: Callable[[], list[Mirrored]]) -> None:
-        """Have `drain` return what was received since its last call, in place of what `tee` has kept."""
-        self._drain = drain
-
-    def _drain_waiting(self) -> list[Mirrored]:
-        pop = self._waiting.popleft
-        return [pop() for _ in range(len(self._waiting))]
 
     def close(self) -> None:
         """Deliver what waits, and end the thread. To be called when nothing is received any more."""

@@ -17,7 +17,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
 
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.errors import UsageError
 from router.recording.channels import Datagram, Holds
 from router.recording.writer import LIBRARY, METADATA

@@ -10,8 +10,7 @@ from typing import NamedTuple, Union
 
 from router.compiler import Checked
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
-from router.engine.wire import Wire
+from router.datagrams import Peer, Wire
 from router.errors import DecodeError, MappingError
 from router.recording.mirror import Classifier
 from router.recording.reader import Recorded

@@ -10,7 +10,7 @@ from router.compiler import Checked
 from router.compiler.checked import CheckedTarget
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.compiler.program import Program
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
 from router.rehearsal.fields import Difference, Path, offset, path_text, shown

@@ -14,7 +14,7 @@ from router.carrier.library import library
 from router.carrier.rehearsal import Counted, Left, Stage, Time
 from router.compiler.metrics import Series
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 
 START = 1_767_225_600_000_000_000
 """Where the clock stands at first unless another time is given: the beginning of 2026, in ns of the wall clock."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from router.compiler.program import Program
-from router.engine.wire import Wire, framed
+from router.datagrams import Wire, framed
 from router.errors import Code, Diagnostic, UsageError
 from router.rehearsal import cdr
 from router.rehearsal.comparing import Comparison, Failure, Outcome

@@ -13,7 +13,7 @@ from functools import cached_property
 from router.compiler import Checked
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields, invalid
 from router.table.addresses import BadAddressError, parse_address

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from threading import get_ident
@@ -23,7 +23,7 @@ from router.ros.events import PeerEvents, WantedFlag
 from router.ros.node import RCL_ERRORS
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
 from router.ros.rcl import RCL, ErrorString, SerializedMessage, function
-from router.ros.receiving import MessageThread, RawSubscription
+from router.ros.receiving import RawSubscription
 from router.ros.types import checked_class
 
 _DISCOVERY_S, _POLL_S, _OTHERS_S = 0.5, 0.005, 0.1
@@ -32,9 +32,6 @@ publishers after the first."""
 
 CLOSING_S = 1.0
 """How long closing a publisher waits for the middleware."""
-
-_IN_TRANSIT_S = 0.005
-"""Time in which the middleware passes a message to the second of two subscriptions."""
 
 
 # rclpy publishes with the interpreter lock held, and Fast DDS may block for seconds, waiting for a reader that has gone
@@ -212,33 +209,3 @@ def opened_beside(
 def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
     """The open endpoints that are not kept."""
     return [each for topic, each in now.items() if kept.get(topic) is not each]
-
-
-def hand_over(
-    messages: MessageThread,
-    now: Mapping[str, Subscription],
-    then: Mapping[str, Subscription],
-    received: Container[str],
-) -> list[tuple[str, bytes, int]]:
-    """Serve what has arrived on subscriptions of `messages` that are not kept, while it is paused.
-
-    A topic whose subscription is replaced receives each message twice: those that came until now are served from the
-    old subscription. Returns those that only the new one has, of topics that are `received`: topic, CDR bytes and time
-    at which they set out.
-    """
-    left = [each for each in left_by(then, now) if messages.serves(each.raw)]
-    replaced = {each.plan.label: then[each.plan.label] for each in left if each.plan.label in then}
-    if replaced:
-        sleep(_IN_TRANSIT_S)  # then what was served before the pause has reached the new subscription as well
-    for each in replaced.values():
-        each.raw.take_all()
-    if replaced:
-        sleep(_IN_TRANSIT_S)
-    served = {each.plan.label: messages.finish(each.raw) for each in left}
-    return [
-        (topic, *message)
-        for topic, each in replaced.items()
-        if topic in received
-        for message in each.raw.take_all()
-        if message not in served[topic]
-    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -45,12 +45,10 @@ WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
 class PeerEvents:
     """Event callbacks of publishers and subscriptions about their peers. For one thread.
 
-    `subscribed` has the topics with subscribers; other threads may test whether it is empty. `subscriber_joined(topic)`
-    is called for each new subscriber.
+    `subscriber_joined(topic)` is called for each new subscriber.
     """
 
     def __init__(self, incompatible: Incompatible, subscriber_joined: SubscriberJoined) -> None:
-        self.subscribed: set[str] = set()
         self._subscriber_joined = subscriber_joined
         self._incompatible = incompatible
         self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: how many checks are left
@@ -59,7 +57,6 @@ class PeerEvents:
         """Callbacks that also keep `wanted` up to date: whether there are subscribers."""
 
         def on_matched(status: Any) -> None:
-            (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.label)
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
             if status.total_count_change > 0:
                 self._subscriber_joined(plan.label)
@@ -74,10 +71,6 @@ class PeerEvents:
         return PublisherEventCallbacks(
             matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
         )
-
-    def forget_all_but(self, published: Collection[str]) -> None:
-        """Remove topics that are no longer published. To be called while no thread calls the callbacks."""
-        self.subscribed.intersection_update(published)
 
     def check(
         self, node: Node, publishers: Mapping[str, Publication], subscriptions: Mapping[str, Subscription]

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
-from router.engine.freshness import Freshness
-from router.errors import SourceSpan, StartError
-from router.ros.endpoints import Publication, RosChange, Subscription, hand_over, left_by, opened_beside
+from router.errors import SourceSpan
+from router.ros.endpoints import Publication, RosChange, Subscription, left_by, opened_beside
 from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
-from router.ros.node import RCL_ERRORS, close_node, open_node
-from router.ros.receiving import MessageThread, Receive
+from router.ros.node import close_node, open_node
 from router.ros.topics import RosTopics
 from router.table.model import NodeSettings
 
 
 class RouterNode:
-    """The node, its publishers and subscriptions, and the threads that serve them. Opening raises StartError.
+    """The node, its publishers and subscriptions, and the thread of their events. Opening raises StartError.
 
     `publish[topic]` takes CDR bytes. `wanted[topic]`, a byte that is updated in place, is whether the
-    topic has subscribers or serves late joiners. `subscribed` has the topics with subscribers. `topics` are those that
-    the node has discovered. `name` has the namespace: `rover1/rover_router`.
+    topic has subscribers or serves late joiners. `topics` are those that the node has discovered. `name` has the
+    namespace: `rover1/rover_router`. Others take the messages of its subscriptions.
 
     `incompatible(topic, policy, peers)` is called by the thread of events, once per second for a topic that has peers
-    with an incompatible QoS, and for some seconds after that. `subscriber_joined(topic)` is called there too. Nothing
-    is received before `start`.
+    with an incompatible QoS, and for some seconds after that. `subscriber_joined(topic)` is called there too.
 
     Topics are replaced in four steps: `prepare` opens what is new, `apply` uses it, `watch` waits for its events,
     `finish` closes what is no longer used. After `prepare`, `abandon` undoes it.
@@ -51,13 +48,9 @@ class RouterNode:
         self.wanted: dict[str, WantedFlag] = {}
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._messages: MessageThread | None = None
-        self.freshness = Freshness()
         self._is_stuck = False
         self._is_left = False  # a thread uses subscriptions or publishers
-        self._failed: Callable[[Exception], None] | None = None
         self._peers = PeerEvents(incompatible, subscriber_joined)
-        self.subscribed: Collection[str] = self._peers.subscribed
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(self._close_node)
@@ -71,28 +64,12 @@ class RouterNode:
             opening.callback(self._stop_events)
             self._open = opening.pop_all()
 
-    def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
-        """Pass each message to `receive[topic]`, in one thread. `failed` is called with what that raises.
-
-        Subscriptions of other topics are left to the code that takes their messages. Raises StartError.
-        """
-        self._failed = failed
-        self._receive(self._subscriptions, receive)
-
-    def stop_receiving(self) -> None:
-        """Serve what has arrived, and stop receiving. Publishing goes on."""
-        if self._messages:
-            if not self._messages.stop():
-                self.leave_open()
-            self._messages = None
-
     def leave_open(self) -> None:
         """Have `close` leave everything open: a thread is stuck where it takes messages, or publishes them."""
         self._is_left = self._is_stuck = True
 
     def close(self) -> None:
-        """To be called when no thread publishes."""
-        self.stop_receiving()
+        """To be called when no thread publishes, or takes messages."""
         self._open.close()
 
     def prepare(
@@ -132,32 +109,18 @@ class RouterNode:
             if seconds := publication.stalled():
                 yield topic, seconds
 
-    def paused(self) -> AbstractContextManager[None]:
-        """No message is received inside; none is lost. Raises StuckError."""
-        return self._messages.paused() if self._messages else nullcontext()
-
-    def apply(self, change: RosChange, receive: Mapping[str, Receive]) -> None:
-        """Use the endpoints of the change. To be called while paused; `receive` is as in `start`.
-
-        What has arrived on subscriptions that will be closed is served before, as until now. Raises StartError, with
-        the topics unchanged.
-        """
+    def apply(self, change: RosChange) -> None:
+        """Use the endpoints of the change."""
         change.left = [
             *left_by(change.publications, self._publications),
             *left_by(change.subscriptions, self._subscriptions),
         ]
-        messages, now = self._messages, self._subscriptions
-        more = hand_over(messages, now, change.subscriptions, receive) if messages else ()
-        self._receive(change.subscriptions, receive)
         self._use(change)
-        for topic, cdr, sent_at in more:
-            receive[topic](cdr, sent_at, False)
 
     def watch(self, change: RosChange) -> None:
         """Wait for events of the endpoints in use: `wanted` follows new subscribers from now on."""
         if change.left or change.opened:
             self._events.stop()
-            self._peers.forget_all_but(self._publications)
             self._events = self._event_thread()
             self._events.start()
 
@@ -172,17 +135,6 @@ class RouterNode:
         self._publications, self._subscriptions = change.publications, change.subscriptions
         self.publish.update((topic, each.publish) for topic, each in change.publications.items())
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
-
-    def _receive(self, subscriptions: Mapping[str, Subscription], receive: Mapping[str, Receive]) -> None:
-        served = {each.raw: receive[topic] for topic, each in subscriptions.items() if topic in receive}
-        try:
-            if self._messages:
-                self._messages.serve(served)
-            elif served:
-                assert self._failed is not None  # noqa: S101 - set by `start`
-                self._messages = MessageThread.serving(served, self._failed, self.freshness)
-        except (*RCL_ERRORS, OSError) as error:
-            raise StartError(f"ROS messages cannot be received: {error}") from error
 
     def _event_thread(self) -> EventThread:
         return EventThread(

@@ -18,7 +18,6 @@ from router.table.addresses import LOCAL, REMOTE, Address
 from router.table.keys import Named, Words
 from router.table.nodes import TextPlace
 from router.table.units import (
-    COALESCE,
     DATA_RATE,
     DATAGRAM_SIZE,
     DISK_SIZE,
@@ -102,7 +101,7 @@ class NodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """`span` is the listener's name in the table. `receive_buffer` is in bytes, `coalesce` in ns.
+    """`span` is the listener's name in the table. `receive_buffer` is in bytes.
 
     With an `interface`, only what comes in by that network interface is received.
     """
@@ -112,7 +111,6 @@ class Listener:
     address: Annotated[Located[Address], LOCAL]
     framing: Framing = Framing.ZERO_TRIMMED
     receive_buffer: Annotated[int, SIZE] = 4 << 20
-    coalesce: Annotated[int, COALESCE] = 1_000_000
     interface: str | None = None
 
     @property

@@ -25,8 +25,6 @@ _HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
 MAX_DURATION = (1 << 63) - 1
 """ROS durations are 64-bit nanoseconds."""
 
-MAX_COALESCE = 10_000_000
-"""Longer than that, what waits no longer pays: the wake-ups that 10 ms leave cost next to nothing."""
 
 MAX_SIZE = (1 << 30) - 1
 """The largest receive buffer that the kernel takes, which doubles what it is asked for."""
@@ -252,7 +250,6 @@ def _bytes(units: Mapping[str, int], base: str, largest: int, smallest: int = 1)
 
 DURATION = Quantity(parse_duration, duration)
 PATIENCE = _or(NEVER, DURATION, instead=None)
-COALESCE = _or(NEVER, Quantity(lambda text: _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE), duration))
 PERIOD = _or(EACH, Quantity(parse_period, duration))
 INTERVAL = Quantity(parse_interval, duration)
 RATE = Quantity(parse_rate, rate)

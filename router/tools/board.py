@@ -10,9 +10,8 @@ from typing import Any
 from google.protobuf.message import Message
 
 from router.compiler.program import DeadmanPlan
-from router.engine.collecting import Collector, PartOutcome
-from router.engine.wire import Decoded, Wire
-from router.errors import DecodeError, MappingError
+from router.datagrams import Decoded, Wire
+from router.errors import DecodeError
 from router.table.model import EndpointKind, Priority, RouteTable
 from router.types.model import MessageType
 from router.values import compact
@@ -155,41 +154,49 @@ PART = ("frame_id", "total_count", "index")
 FRAME_TIMEOUT = 1_000_000_000
 """Nanoseconds from the first part of a frame after which the others are given up."""
 
+MOST_FRAMES, MOST_PARTS = 64, 8192
+"""Frames that are assembled at a time, and parts of one."""
+
 
 def is_part(kind: MessageType) -> bool:
     return all(kind.field(name) for name in PART)
 
 
-class Frames(PartOutcome):
+class Frames:
     """Counts the frames that a simulated basestation assembles of one payload case. `astray` are parts of no frame."""
 
     def __init__(self) -> None:
         self.complete = 0
         self.incomplete = 0
         self.astray = 0
-        self._collector = Collector(FRAME_TIMEOUT, [self])
+        self._missing: dict[tuple[int, int], tuple[float, set[int]]] = {}
+        """By number of the frame and of its parts, the oldest first: until when which parts are waited for.
+
+        A complete frame stays as long: what comes of it then are copies.
+        """
 
     def take(self, now: int, part: Any) -> None:
         """Add a part; `now` in monotonic ns."""
-        try:
-            whole = self._collector.offer(now, part.frame_id, part.total_count, part.index, part)
-        except MappingError:
+        self.advance(now)
+        if not 0 <= part.index < part.total_count <= MOST_PARTS:
             self.astray += 1
-        else:
-            self.complete += whole is not None
+            return
+        frame = part.frame_id, part.total_count
+        _, missing = self._missing.setdefault(frame, (now + FRAME_TIMEOUT, set(range(part.total_count))))
+        if missing == {part.index}:
+            self.complete += 1
+        missing.discard(part.index)
+        if len(self._missing) > MOST_FRAMES:
+            self._forget_oldest()
 
     def advance(self, now: int) -> None:
         """Give up frames that are overdue."""
-        self._collector.due(now)
+        while self._missing and next(iter(self._missing.values()))[0] <= now:
+            self._forget_oldest()
 
-    def collected(self) -> None:
-        """A part that does not complete its frame."""
-
-    def filtered(self) -> None:
-        """A duplicate part."""
-
-    def dropped(self, reason: str, *, detail: str) -> None:
-        self.incomplete += 1
+    def _forget_oldest(self) -> None:
+        _, missing = self._missing.pop(next(iter(self._missing)))
+        self.incomplete += bool(missing)
 
 
 @dataclass(slots=True)

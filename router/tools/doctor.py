@@ -43,7 +43,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     if program is None:
         return
     running = _health(program)
-    yield from carrier(variables)
+    yield from carrier()
     yield from ros(program)
     yield from listeners(program)
     yield from ports(program, running=running is not None)
@@ -66,7 +66,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     needed = [_table(checked)]
     program = checked.program
     if program is not None:
-        needed += [carrier(variables), ros(program), ports(program, running=False, with_listeners=False)]
+        needed += [carrier(), ros(program), ports(program, running=False, with_listeners=False)]
         needed += [recordings(program)]
     yield from (result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM)
     if program is not None:

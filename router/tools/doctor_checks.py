@@ -17,7 +17,7 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
-from router.carrier.library import NATIVE, PYTHON, VARIABLE, LibraryError, load
+from router.carrier.library import load
 from router.compiler.program import Program
 from router.errors import Located, StartError, plural
 from router.net.kernel import interface_is_up, port_holder
@@ -372,22 +372,12 @@ def ros(program: Program) -> Iterator[CheckResult]:
         yield fine("ROS", f"{middleware()} in domain {domain}, and {types} of the table")
 
 
-def carrier(variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Tell what would receive, forward and brake: the carrier's library, or Python in its place."""
-    choice = variables.get(VARIABLE, "")
-    if choice not in {"", NATIVE, PYTHON}:
-        yield problem("carrier", f"{VARIABLE} is '{choice}'", f"set it to '{NATIVE}' or '{PYTHON}', or unset it")
-        return
-    if choice == PYTHON:
-        yield fine("carrier", f"Python, as {VARIABLE} says")
-        return
+def carrier() -> Iterator[CheckResult]:
+    """Check the carrier's library, which receives, forwards, publishes and brakes."""
     try:
         load()
-    except LibraryError as error:
-        if choice:
-            yield problem("carrier", f"{VARIABLE} is '{choice}', and its library cannot be used", str(error))
-        else:
-            yield warning("carrier", "its library cannot be used: Python does its work, and more slowly", str(error))
+    except StartError as error:
+        yield problem("carrier", error.what, error.hint)
     else:
         yield fine("carrier", "its library is up to date")
         yield from _priority()

@@ -10,7 +10,7 @@ from google.protobuf.json_format import MessageToDict
 from rich.table import Table
 from rich.text import Text
 
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.tools.board import Arrivals, Change, State
 from router.tools.simulator import Statistics
 from router.values import compact, rate_text

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.program import DeadmanPlan
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address
 from router.table.model import ANY, Endpoint, RouteTable

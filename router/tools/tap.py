@@ -18,8 +18,8 @@ from router.compiler.expressions.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
+from router.datagrams import Decoded, Wire
 from router.engine.delivery import MAPPING_FAILURES
-from router.engine.wire import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
 from router.recording.mirror import MirroredDatagram

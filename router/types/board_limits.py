@@ -22,6 +22,9 @@ from router.types.wire import I32_SIZE, I64, I64_SIZE, LEN, VARINT, wire_fields,
 TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 """Those of DROP_REASONS for which a datagram is not sent to a board."""
 
+MOST_MESSAGES, MOST_LISTS = 65536, 4096
+"""Places of messages and of lists in the envelope of a board."""
+
 _FLOATS = (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE)
 
 
@@ -48,6 +51,13 @@ class BoardField:
 
 BoardMessage = Mapping[int, BoardField]
 """The fields of a message that are checked, by number."""
+
+
+def places(message: BoardMessage) -> tuple[int, int]:
+    """How many places of messages and of lists there are in a message, with its own."""
+    below = [places(field.message) for field in message.values() if field.message is not None]
+    lists = sum(field.most is not None for field in message.values())
+    return 1 + sum(messages for messages, _ in below), lists + sum(lists for _, lists in below)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, Messa
 from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reached, read_folder
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
+from router.types.undecidable import undecidable
 from router.types.wire import validates_text
 
 MessageClass = type[Message]
@@ -97,6 +98,13 @@ class ProtoSchema:
     def span(self, message: str, field: str | None = None) -> SourceSpan:
         """The place of a declaration in its `.proto` file: of a message or enum, of a field or enum value."""
         return self.sources.span(message if field is None else f"{message}.{field}", Part.NAME)
+
+    def place(self, name: str) -> SourceSpan:
+        """The same, by full name; of what is declared outside of these files, that of the envelope."""
+        try:
+            return self.sources.span(name, Part.NAME)
+        except LookupError:
+            return self.span(self.envelope)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +254,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Dia
 def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     """The message that the schema was loaded for, with its oneof `named`.
 
-    Raises TableError: an oneof that does not exist, a member of it that is no message.
+    Raises TableError: an oneof that does not exist, a member of it that is no message, what the router cannot decide.
     """
     name = schema.envelope
     descriptor = schema.descriptor(name)
@@ -257,6 +265,8 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
         raise TableError([Diagnostic(named.span, Code.BAD_VALUE, message, hint)])
     if scalars := [field for field in oneof.fields if field.message_type is None]:
         raise TableError([_scalar_finding(schema, field) for field in scalars])
+    if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
+        raise TableError(refused)
     cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
     # A case without a bound is reported where a board shall take it.
     bounded = [framed_size(case.number, case.max_size) for case in cases.values() if case.max_size is not None]

@@ -24,11 +24,6 @@ class Rover:
     table: Path
 
 
-@pytest.fixture(params=["native", "python"])
-def plane(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 @pytest.fixture(name="site")
 def rover_on_two_networks(tmp_path: Path) -> Iterator[two_networks.Rover]:
     with two_networks.rover_with_networks(tmp_path) as found:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
-from router.engine.wire import wire_of_protos
+from router.datagrams import wire_of_protos
 from router.types.wire import delimited, varint
 from tests.tables import PROTOS
 

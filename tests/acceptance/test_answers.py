@@ -46,29 +46,29 @@ def exchange(site: Rover, to: tuple[str, int] = RADIO) -> tuple[str, int]:
     return str(where_from[0]), int(where_from[1])
 
 
-def test_an_answer_to_where_a_command_came_from_is_routed_and_counted(site: Rover, plane: str) -> None:
+def test_an_answer_to_where_a_command_came_from_is_routed_and_counted(site: Rover) -> None:
     """The listener is on all networks of a computer that has several."""
-    with site.router(TABLE, plane):
+    with site.router(TABLE):
         assert exchange(site) == LAN
         assert site.count("messages_received_total", route="drive_diag", source="driving_board") == 1
         assert site.count("datagrams_received_total", listener="rover") == 2
         assert site.seen("driving_board")
 
 
-def test_datagrams_leave_from_the_address_of_the_listener(site: Rover, plane: str) -> None:
+def test_datagrams_leave_from_the_address_of_the_listener(site: Rover) -> None:
     """The computer has two in the boards' network, and would choose the other one."""
     site.rover.ip("address", "flush", "dev", "lan0")
     for address in ("10.78.1.7/24", "10.78.1.1/24"):
         site.rover.ip("address", "add", address, "dev", "lan0")
-    with site.router(TABLE.replace("0.0.0.0:5000", "10.78.1.1:5000"), plane):
+    with site.router(TABLE.replace("0.0.0.0:5000", "10.78.1.1:5000")):
         site.radio.ip("route", "add", "10.78.1.0/24", "via", RADIO[0])
         assert exchange(site, LAN) == LAN
 
 
-def test_a_firewall_that_lets_only_answers_in_lets_them_in(site: Rover, plane: str) -> None:
+def test_a_firewall_that_lets_only_answers_in_lets_them_in(site: Rover) -> None:
     """It is the rover's own: what the board sends is part of the exchange that the command has begun."""
     only_answers(site.rover)
-    with site.router(TABLE, plane):
+    with site.router(TABLE):
         exchange(site)
 
 
@@ -102,11 +102,9 @@ table inet filter {
         "several on one port",
     ],
 )
-def test_of_several_listeners_the_table_chooses(
-    site: Rover, plane: str, keys: str, lan: int, leaves_from: int | None
-) -> None:
+def test_of_several_listeners_the_table_chooses(site: Rover, keys: str, lan: int, leaves_from: int | None) -> None:
     text = SEVERAL.replace("0.0.0.0:5000, interface: lan0", f"0.0.0.0:{lan}, interface: lan0")
-    with site.router(text.replace("kind: board", f"kind: board, {keys}".rstrip(", ")), plane):
+    with site.router(text.replace("kind: board", f"kind: board, {keys}".rstrip(", "))):
         site.basestation.sendto(DRIVE, RADIO)
         _, where_from = site.board.recvfrom(1000)
         assert where_from[0] == LAN[0]
@@ -115,13 +113,13 @@ def test_of_several_listeners_the_table_chooses(
 
 @pytest.mark.parametrize("is_reloaded", [False, True], ids=["at the start", "at a reload"])
 def test_what_is_for_the_address_of_one_listener_and_comes_to_another_is_received(
-    site: Rover, plane: str, is_reloaded: bool
+    site: Rover, is_reloaded: bool
 ) -> None:
     """The sender has the port of `lan`, but the basestation reaches that address by the radio, as by a route."""
     text = SEVERAL.replace("0.0.0.0:5000, interface: lan0", "10.78.1.1:5000, interface: lan0")
     text = text.replace("kind: board", "kind: board, listener: lan")
     site.radio.ip("route", "add", "10.78.1.0/24", "via", RADIO[0])
-    with site.router(text.replace("0.0.0.0:5000", "0.0.0.0:5001") if is_reloaded else text, plane) as router:
+    with site.router(text.replace("0.0.0.0:5000", "0.0.0.0:5001") if is_reloaded else text) as router:
         if is_reloaded:
             site.table(text)
             router.process.send_signal(signal.SIGHUP)
@@ -129,20 +127,20 @@ def test_what_is_for_the_address_of_one_listener_and_comes_to_another_is_receive
         assert exchange(site, LAN) == LAN
 
 
-def test_the_log_warns_of_a_listener_in_another_network_than_a_board(site: Rover, plane: str) -> None:
+def test_the_log_warns_of_a_listener_in_another_network_than_a_board(site: Rover) -> None:
     """A board, or a router on the way, may drop what comes from an address that no route leads back to."""
     warning = "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them"
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
-    with site.router(text, plane) as router:
+    with site.router(text) as router:
         assert [(line["endpoint"], line["address"], line["route"]) for line in router.events(warning)] == [
             ("driving_board", RADIO[0], LAN[0])
         ]
-    with site.router(text.replace("kind: board", "kind: board, send_from: ephemeral"), plane) as router:
+    with site.router(text.replace("kind: board", "kind: board, send_from: ephemeral")) as router:
         assert not router.events(warning)
 
 
-def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
-    with site.router(TABLE, plane) as router:
+def test_the_port_changes_with_the_table(site: Rover) -> None:
+    with site.router(TABLE) as router:
 
         def leaves_from(table: str, port: int) -> int:
             reloads = len(router.events("table reloaded"))
@@ -158,24 +156,24 @@ def test_the_port_changes_with_the_table(site: Rover, plane: str) -> None:
         exchange(site)
 
 
-def test_nobody_else_gets_the_port(site: Rover, plane: str) -> None:
-    with site.router(TABLE, plane):
+def test_nobody_else_gets_the_port(site: Rover) -> None:
+    with site.router(TABLE):
         with pytest.raises(OSError, match="Address already in use") as caught:
             site.rover.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).bind(("0.0.0.0", 5000)))
         assert caught.value.errno == errno.EADDRINUSE
         folder = site.folder / "second"
         folder.mkdir()
-        second = site.rover.inside(lambda: RouterProcess(folder, site.folder / "table.yaml", ROUTER_CARRIER=plane))
+        second = site.rover.inside(lambda: RouterProcess(folder, site.folder / "table.yaml"))
         assert second.wait() == 78
         assert "has the port" in second.text()
 
 
 @pytest.mark.parametrize("table", [TABLE, SEVERAL], ids=["one listener", "one for each interface"])
-def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane: str, table: str) -> None:
+def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, table: str) -> None:
     """Each datagram is refused by the board's computer; the next one reports it, and the last one has no next."""
     site.board.close()
     labels = {"route": "manual_drive"}
-    with site.router(table, plane) as router:
+    with site.router(table) as router:
 
         def counted() -> tuple[float, float]:
             found = site.samples()
@@ -196,9 +194,9 @@ def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, plane:
         assert "nobody listens at 10.78.1.222:8" in router.text()
 
 
-def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover, plane: str) -> None:
+def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover) -> None:
     """ICMP messages that say that nobody listens, about datagrams that the listener's port has never sent."""
-    with site.router(TABLE, plane), site.radio.inside(raw_icmp) as forging:
+    with site.router(TABLE), site.radio.inside(raw_icmp) as forging:
         for _ in range(20):
             for _ in range(500):
                 forging.sendto(REFUSAL, (RADIO[0], 0))
@@ -211,12 +209,12 @@ def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover, plane: str
         wait_until(lambda: site.count("messages_dropped_total", **refused) == 1, "the report of what they say")
 
 
-def test_forged_errors_about_the_board_keep_no_brake_away(site: Rover, plane: str) -> None:
+def test_forged_errors_about_the_board_keep_no_brake_away(site: Rover) -> None:
     """Each command leaves, and the board obeys it, though its computer is said to have refused the one before."""
     text = TABLE.replace(
         "{{none: a test}}", "{{timeout: 500ms, at_start: silent, send: {{manual_brake: {{brake: true}}}}}}"
     )
-    with site.router(text, plane), site.radio.inside(raw_icmp) as forging:
+    with site.router(text), site.radio.inside(raw_icmp) as forging:
         refused = {"route": "manual_drive", "target": "driving_board", "reason": "send_error"}
 
         def refusals() -> float:

@@ -19,7 +19,7 @@ import pytest
 from google.protobuf.unknown_fields import UnknownFieldSet
 from hypothesis import settings
 
-from router.engine.wire import wire_of_protos
+from router.datagrams import wire_of_protos
 from router.types.wire import delimited, varint
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import ROUTER

@@ -1,4 +1,4 @@
-"""Lists, calculations and conditions through a router, on both planes: sockets on one side, ROS on the other."""
+"""Lists, calculations and conditions through a router: sockets on one side, ROS on the other."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ class Lidar(NamedTuple):
         return self.envelope.message_class(**payload)
 
 
-@pytest.fixture(params=["native", "python"])
-def lidar(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Lidar]:
+@pytest.fixture
+def lidar(tmp_path: Path) -> Iterator[Lidar]:
     (tmp_path / "protos").mkdir()
     (tmp_path / "protos" / "lidar.proto").write_text(PROTO)
     port, listen = free_port(), free_port()
@@ -108,7 +108,7 @@ def lidar(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Lidar]:
         boards[name].bind((f"127.0.0.{host}", port))
         boards[name].settimeout(PATIENCE)
     with (
-        RouterProcess(tmp_path, table, ROUTER_CARRIER=request.param),
+        RouterProcess(tmp_path, table),
         RosPeer({"scan": "sensor_msgs/msg/LaserScan"}) as peer,
     ):
         peer.open_heard({"cmd_vel": "geometry_msgs/msg/Twist", "path": "geometry_msgs/msg/PoseArray"})

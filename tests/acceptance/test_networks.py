@@ -67,11 +67,11 @@ FORBIDDEN = {
 
 @pytest.mark.parametrize(("route", "why"), FORBIDDEN.values(), ids=FORBIDDEN)
 def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
-    site: Rover, plane: str, route: tuple[str, ...], why: str
+    site: Rover, route: tuple[str, ...], why: str
 ) -> None:
     if route:
         site.rover.ip("route", "add", *route)
-    with site.router(TABLE, plane) as router:
+    with site.router(TABLE) as router:
         [warning] = router.events(UNREACHABLE)
         assert (warning["endpoint"], warning["address"], warning["why"]) == ("other", "10.79.9.9:9000", why)
         assert warning["remedy"]
@@ -86,10 +86,10 @@ def test_an_endpoint_that_cannot_be_reached_keeps_nothing_else_from_working(
             assert other.recv(100) == DRIVE
 
 
-def test_a_board_that_the_start_could_not_reach_is_stopped_when_it_can_be_reached(site: Rover, plane: str) -> None:
+def test_a_board_that_the_start_could_not_reach_is_stopped_when_it_can_be_reached(site: Rover) -> None:
     """Nobody commands it, and it may obey a router that was killed."""
     site.rover.ip("route", "add", "unreachable", "10.78.1.222/32")
-    with site.router(TABLE, plane) as router:
+    with site.router(TABLE) as router:
         wait_until(lambda: bool(router.events(UNREACHABLE)), "the warning")
         site.rover.ip("route", "del", "unreachable", "10.78.1.222/32")
         assert site.board.recv(100) == BRAKE
@@ -98,25 +98,25 @@ def test_a_board_that_the_start_could_not_reach_is_stopped_when_it_can_be_reache
 
 
 @pytest.mark.parametrize(("route", "why"), FORBIDDEN.values(), ids=FORBIDDEN)
-def test_nor_does_one_that_a_reload_brings(site: Rover, plane: str, route: tuple[str, ...], why: str) -> None:
+def test_nor_does_one_that_a_reload_brings(site: Rover, route: tuple[str, ...], why: str) -> None:
     if route:
         site.rover.ip("route", "add", *route)
-    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60"), plane) as router:
+    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
         log = reload(site, router, TABLE)
         assert "table reloaded" in log
         assert [each["why"] for each in router.events(UNREACHABLE)] == [why]
         drives(site)
 
 
-def test_the_broadcast_address_of_an_interface_is_refused(site: Rover, plane: str) -> None:
+def test_the_broadcast_address_of_an_interface_is_refused(site: Rover) -> None:
     said = "10.78.1.255 is not the address of one machine"
     wrong = TABLE.replace("10.79.9.9", "10.78.1.255")
     path = site.table(wrong)
-    refused = site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane))
+    refused = site.rover.inside(lambda: RouterProcess(site.folder, path))
     assert refused.wait() == 78
     assert f"{path}:8:20: {said}" in refused.text()
     assert "broadcast and multicast are not supported" in refused.text()
-    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60"), plane) as router:
+    with site.router(TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
         assert said in reload(site, router, wrong)
         assert not router.events("table reloaded")
         drives(site)
@@ -164,11 +164,11 @@ Act = Callable[[Rover], None]
 @pytest.mark.parametrize(("tunnel", "goes", "why", "comes"), ABSENT.values(), ids=ABSENT)
 @pytest.mark.parametrize("is_reloaded", [False, True], ids=["at the start", "at a reload"])
 def test_a_listener_waits_for_its_network_and_the_others_serve(
-    site: Rover, plane: str, is_reloaded: bool, tunnel: str, goes: Act, why: str, comes: Act
+    site: Rover, is_reloaded: bool, tunnel: str, goes: Act, why: str, comes: Act
 ) -> None:
     goes(site)
     text = TUNNEL.replace("{tunnel}", tunnel)
-    with site.router(TABLE.replace("0.0.0.0", LAN[0]) if is_reloaded else text, plane) as router:
+    with site.router(TABLE.replace("0.0.0.0", LAN[0]) if is_reloaded else text) as router:
         assert site.board.recv(100) == BRAKE
         if is_reloaded:
             reload(site, router, text)
@@ -202,10 +202,10 @@ def status(site: Rover) -> str:
     )
 
 
-def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rover, plane: str) -> None:
+def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rover) -> None:
     gone_address(site)
     text = TUNNEL.replace("{tunnel}", ABSENT["address"][0]).replace("kind: board", "kind: board, send_from: tunnel")
-    with site.router(text, plane) as router:
+    with site.router(text) as router:
         assert site.board.recvfrom(100)[1][1] != 5001  # the brake of the start leaves all the same
         new_address(site)
         wait_until(lambda: bool(router.events(THERE)), "the binding")
@@ -214,19 +214,19 @@ def test_what_is_sent_moves_to_the_port_of_a_listener_that_was_waiting(site: Rov
         assert site.board.recvfrom(100) == (DRIVE, (RADIO[0], 5001))
 
 
-def test_of_listeners_on_one_port_one_that_is_there_serves_for_those_that_wait(site: Rover, plane: str) -> None:
+def test_of_listeners_on_one_port_one_that_is_there_serves_for_those_that_wait(site: Rover) -> None:
     gone_interface(site)
     text = TUNNEL.replace("{tunnel}", "{{address: 0.0.0.0:5000, interface: radio0}}")
     text = text.replace("10.78.1.1:5000", "0.0.0.0:5000, interface: lan0")
-    with site.router(text.replace("kind: board", "kind: board, send_from: tunnel"), plane):
+    with site.router(text.replace("kind: board", "kind: board, send_from: tunnel")):
         assert site.board.recvfrom(100) == (BRAKE, LAN)
 
 
-def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane: str) -> None:
+def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover) -> None:
     """The only listener is at the address of a tunnel, by which commands come; the board is in another network."""
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
     site.lan.ip("route", "add", "10.78.2.0/24", "via", LAN[0])
-    with site.router(text, plane) as router:
+    with site.router(text) as router:
         assert site.board.recvfrom(100) == (BRAKE, RADIO)
         drives(site)
         gone_address(site)
@@ -238,9 +238,9 @@ def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover, plane
         drives(site)
 
 
-def test_a_port_that_is_taken_still_ends_the_start(site: Rover, plane: str) -> None:
+def test_a_port_that_is_taken_still_ends_the_start(site: Rover) -> None:
     with udp(site.rover, LAN):
         path = site.table(TABLE)
-        refused = site.rover.inside(lambda: RouterProcess(site.folder, path, ROUTER_CARRIER=plane))
+        refused = site.rover.inside(lambda: RouterProcess(site.folder, path))
         assert refused.wait() == 78
         assert "has the port" in refused.text()

@@ -57,25 +57,23 @@ def warnings(router: RouterProcess) -> list[str]:
     return [line["event"] for line in router.log() if "arrival times" in line["event"]]
 
 
-def test_without_stamps_in_messages_it_asks_for_them(place: Site, kernel: Mapping[str, str], plane: str) -> None:
-    with RouterProcess(place.folder, place.table(TABLE), ROUTER_CARRIER=plane, **kernel) as router:
+def test_without_stamps_in_messages_it_asks_for_them(place: Site, kernel: Mapping[str, str]) -> None:
+    with RouterProcess(place.folder, place.table(TABLE), **kernel) as router:
         assert given_while_it_stands_still(place, router) == (0, OLD)
         place.send("basestation", DRIVE)
         assert place.receive("driving_board") == DRIVE
-        assert warnings(router) == ([ASKS] if plane == "native" else [])
+        assert warnings(router) == [ASKS]
 
 
-def test_without_any_stamps_datagrams_count_from_when_they_are_read(
-    place: Site, kernel: Mapping[str, str], plane: str
-) -> None:
-    environment = {**kernel, "ROUTER_CARRIER": plane, "NO_STAMPS": "1"}
+def test_without_any_stamps_datagrams_count_from_when_they_are_read(place: Site, kernel: Mapping[str, str]) -> None:
+    environment = {**kernel, "NO_STAMPS": "1"}
     with RouterProcess(place.folder, place.table(TABLE), **environment) as router:
         assert given_while_it_stands_still(place, router) == (OLD, 0)
         assert warnings(router)[-1:] == [LACKS]
 
 
-def test_without_its_count_for_a_socket_drops_are_known(place: Site, kernel: Mapping[str, str], plane: str) -> None:
-    with RouterProcess(place.folder, place.table(TABLE), ROUTER_CARRIER=plane, **kernel) as router:
+def test_without_its_count_for_a_socket_drops_are_known(place: Site, kernel: Mapping[str, str]) -> None:
+    with RouterProcess(place.folder, place.table(TABLE), **kernel) as router:
         with router.standing_still():
             place.send("basestation", *FLOOD * [DRIVE])
         wait_until(lambda: _received_or_lost(place) == FLOOD, "the flood")

@@ -18,7 +18,7 @@ import pytest
 from google.protobuf.message import Message
 from mcap.reader import make_reader
 
-from router.engine.wire import wire_of_protos
+from router.datagrams import wire_of_protos
 from router.recording.reader import Recording
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import ROUTER

@@ -38,9 +38,9 @@ class Rover:
         return path
 
     @contextmanager
-    def router(self, text: str, plane: str = "native") -> Iterator[RouterProcess]:
+    def router(self, text: str) -> Iterator[RouterProcess]:
         path = self.table(text)
-        with self.rover.inside(lambda: RouterProcess(self.folder, path, ROUTER_CARRIER=plane)) as router:
+        with self.rover.inside(lambda: RouterProcess(self.folder, path)) as router:
             yield router
 
     def samples(self) -> dict[str, float]:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import signal
 import socket
 import struct
+import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
-if os.environ.get("ROUTER_CARRIER") == "python":
-    pytest.skip("is about the carrier", allow_module_level=True)
 
-from router.app import Router
-from router.app.native_datapath import NativeWiring
 from router.carrier.from_ros import FromRosThread
 from router.threads import StuckError
 from tests.app.conftest import BRAKE, Site
@@ -43,7 +39,7 @@ def drive(
 """
 
 
-IN_PYTHON = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
+HELD = drive(more=", max_rate: 1000000000 Hz, on_limit: latest")
 CALCULATED = drive(
     fields='{distance_to_go: "float32(round(clamp(100 * distance_to_go, -700, 700)) // 100)"}',
     more=", when: turning_radius > 0.5",
@@ -65,12 +61,6 @@ def numbers(site: Site, until: int) -> list[int]:
     return got
 
 
-def is_carried(router: Router) -> bool:
-    wiring = router._runtime.wiring
-    assert isinstance(wiring, NativeWiring)
-    return "drive_motor" not in wiring.take
-
-
 def thread_names() -> list[str]:
     return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
 
@@ -86,7 +76,6 @@ def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher
     python, process = ctypes.PyDLL(None), publisher.process  # calls through PyDLL keep the interpreter lock
     buffer, at_start = ctypes.create_string_buffer(1000), len(BRAKE)
     with site.router(table) as router:
-        assert is_carried(router)
         assert "ros commands" in thread_names()
         assert publisher.line() == "matched"
         assert len(site.basestation.recv(1000)) == at_start
@@ -107,10 +96,10 @@ def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher
 def test_commands_stay_whole_and_in_order_while_tables_change(site: Site, publisher: Publisher) -> None:
     tables = [
         drive(),
-        IN_PYTHON,
+        HELD,
         drive(more=", max_rate: 1000000 Hz"),
         drive(timeout="40s"),
-        IN_PYTHON.replace("30s", "20s"),
+        HELD.replace("30s", "20s"),
         drive(),
     ]
     with site.router(drive()) as router:
@@ -122,7 +111,6 @@ def test_commands_stay_whole_and_in_order_while_tables_change(site: Site, publis
             site.write(table)
             result = router.reload()
             assert result.ok, result
-            assert is_carried(router) == ("latest" not in table)
         assert numbers(site, sent) == list(range(1, sent + 1))
         wait_until(lambda: router.total("datagrams_sent") == sent)
         assert router.total("messages_received") == sent
@@ -134,12 +122,69 @@ def test_none_is_lost_where_another_subscription_takes_over(site: Site, publishe
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
         sent = 0
-        for table in (drive(depth=900), IN_PYTHON, drive(depth=900), drive(depth=800)):
+        for table in (drive(depth=900), HELD, drive(depth=900), drive(depth=800)):
             publisher.publish(map(command, range(sent + 1, sent + COUNT + 1)))
             sent += COUNT
             site.write(table)
             assert router.reload().ok
         assert sorted(set(numbers(site, sent))) == list(range(1, sent + 1))
+
+
+@contextmanager
+def commands_coming(publisher: Publisher) -> Iterator[list[int]]:
+    """Commands with their numbers come all the time; yields those that were published."""
+    ended, sent = threading.Event(), list[int]()
+
+    def publish() -> None:
+        while not ended.wait(0.001):
+            sent.append(len(sent) + 1)
+            publisher.publish([command(sent[-1])])
+
+    publishing = threading.Thread(target=publish)
+    publishing.start()
+    try:
+        yield sent
+    finally:
+        ended.set()
+        publishing.join()
+
+
+def test_each_is_sent_once_and_in_order_while_subscriptions_take_over(site: Site, publisher: Publisher) -> None:
+    """Both subscriptions receive what comes meanwhile."""
+    with site.router(drive()) as router:
+        assert publisher.line() == "matched"
+        with commands_coming(publisher) as sent:
+            for depth in (900, 1000, 900, 1000):
+                site.write(drive(depth=depth))
+                assert router.reload().ok
+        assert numbers(site, sent[-1]) == sent
+
+
+def test_a_deadman_that_goes_while_commands_come_has_the_last_word_and_then_none(
+    site: Site, publisher: Publisher
+) -> None:
+    with site.router(drive(timeout="200ms") + NOBODY) as router:
+        assert publisher.line() == "matched"
+        with commands_coming(publisher):
+            for turn in range(3):
+                assert site.basestation.recv(1000)
+                site.write(NOBODY)
+                assert router.reload().ok
+                site.basestation.settimeout(0.4)  # longer than a deadman waits that was fed once more
+                got = list(iter(lambda: _received(site), None))
+                site.basestation.settimeout(10)
+                assert got[-1] == BRAKE, turn
+                assert got[:-1].count(BRAKE) <= (turn == 0)  # that of the start
+                site.write(drive(timeout="200ms") + NOBODY)
+                assert router.reload().ok
+        assert router.total("deadman_trips") == 0
+
+
+def _received(site: Site) -> bytes | None:
+    try:
+        return site.basestation.recv(1000)
+    except TimeoutError:
+        return None
 
 
 def test_a_topic_comes_and_goes(site: Site) -> None:
@@ -172,15 +217,13 @@ def test_a_reload_is_refused_while_the_middleware_holds_the_thread(
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
         monkeypatch.setattr(FromRosThread, "serve", stuck_once)
-        site.write(IN_PYTHON)
+        site.write(HELD)
         result = router.reload()
         assert not result.ok
         assert result.text.endswith("try again")
-        assert is_carried(router)
         publisher.publish([command(1)])
         assert numbers(site, 1) == [1]
         assert router.reload().ok
-        assert not is_carried(router)
 
 
 def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(

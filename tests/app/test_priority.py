@@ -11,9 +11,6 @@ import pytest
 
 from tests.acceptance.site import RouterProcess, site, wait_until
 
-if os.environ.get("ROUTER_CARRIER") == "python":
-    pytest.skip("Python has no such threads", allow_module_level=True)
-
 THREADS = {"receive", "timers", "ros commands"}
 UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
 

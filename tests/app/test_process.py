@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
-from router.app.process import Watchdog, notify, reloading, supervised
+from router.app.process import notify, reloading, supervised
 from router.errors import SourceSpan
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
@@ -38,8 +38,12 @@ def said(manager: socket.socket) -> list[str]:
     return manager.recv(1000).decode().splitlines()
 
 
+def _not_asked(*_: int) -> None:
+    raise AssertionError("the watchdog is not ours")
+
+
 def test_it_is_ready_inside_and_stops_at_the_end(manager: socket.socket) -> None:
-    with supervised(lambda: 0):
+    with supervised():
         assert said(manager) == ["READY=1"]
     assert said(manager)[0] == "STOPPING=1"
 
@@ -63,7 +67,7 @@ def test_an_abstract_socket_is_one_too(stack: ExitStack, monkeypatch: pytest.Mon
 
 def test_without_a_service_manager_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    with capture_logs() as log, supervised(lambda: 0), reloading():
+    with capture_logs() as log, supervised(), reloading():
         pass
     assert log == []
 
@@ -87,33 +91,25 @@ def test_a_service_manager_that_does_not_listen_holds_nobody_up(
     assert [entry["event"] for entry in logged] == ["the service manager cannot be notified"]
 
 
-def test_the_watchdog_is_fed_only_while_there_is_progress(manager: socket.socket) -> None:
-    reached = 7
-    watchdog = Watchdog(lambda: reached, 100, now=1000)
-    assert watchdog.next_due == 1100
-    watchdog.due(1100)
-    assert said(manager) == ["WATCHDOG=1"]
-    watchdog.due(1200)
-    watchdog.due(1300)
-    reached = 8
-    watchdog.due(1450)
-    assert said(manager) == ["WATCHDOG=1"]
-    assert watchdog.next_due == 1550
-    manager.setblocking(False)
-    with pytest.raises(BlockingIOError):
-        said(manager)
-
-
-def test_the_watchdog_is_fed_from_the_start_to_the_end(manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_native_threads_feed_the_watchdog_from_the_start_to_the_end(
+    manager: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "40000")
-    numbers = iter(range(1_000_000))
-    with supervised(lambda: next(numbers)):
-        assert [said(manager) for _ in range(3)] == [["READY=1"], ["WATCHDOG=1"], ["WATCHDOG=1"]]
+    fed: list[tuple[str, int]] = []
+
+    def feed(descriptor: int, interval: int) -> None:
+        fed.append((str(Path(f"/proc/self/fd/{descriptor}").readlink()) if descriptor >= 0 else "", interval))
+
+    with supervised(feed):
+        assert said(manager) == ["READY=1"]
+        [(opened, interval)] = fed
+        assert (opened.startswith("socket:"), interval) == (True, 10_000_000)
+    assert fed[1:] == [("", 0)]
 
 
 def test_the_watchdog_of_another_process_is_not_ours(manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "1000")
     monkeypatch.setenv("WATCHDOG_PID", "1")
-    with supervised(lambda: 1):
+    with supervised(_not_asked):
         assert said(manager) == ["READY=1"]
     assert said(manager)[0] == "STOPPING=1"

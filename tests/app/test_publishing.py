@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import socket
 import struct
 import threading
@@ -15,11 +14,9 @@ import pytest
 from structlog.testing import capture_logs
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
-if os.environ.get("ROUTER_CARRIER") == "python":
-    pytest.skip("is about the carrier", allow_module_level=True)
 
 from router.app import Router
-from router.app.native_datapath import NativeDatapath
+from router.errors import StartError
 from tests.app.conftest import Site, numbered
 from tests.ports import free_port
 from tests.ros.peers import Subscriber, wait_until
@@ -50,12 +47,6 @@ def await_subscriber(router: Router, subscriber: Subscriber) -> None:
     wait_until(lambda: ros.wanted["published_ph"][0])
 
 
-def next_number(subscriber: Subscriber) -> float:
-    while (line := subscriber.line()) == "matched":
-        pass  # a publisher of an earlier test, which has not gone yet
-    return number(line)
-
-
 def number(line: str) -> float:
     (found,) = struct.unpack("<xxxxf", bytes.fromhex(line))
     return float(found)
@@ -83,7 +74,7 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
     site: Site, subscriber: Subscriber, stuck: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_in, goes_on = stuck
-    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
+    monkeypatch.setattr("router.app.plane._PATIENCE_S", 0.05)
     later = f"{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}"
     with site.router(KEPT) as router, capture_logs() as logs:
         site.send(numbered(1))
@@ -99,7 +90,7 @@ def test_a_reload_opens_again_what_a_stuck_thread_kept_open(
     site: Site, stuck: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_in, goes_on = stuck
-    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
+    monkeypatch.setattr("router.app.plane._PATIENCE_S", 0.05)
     with site.router(KEPT) as router:
         site.send(numbered(1))
         assert is_in.wait(20)
@@ -112,21 +103,10 @@ def test_a_reload_opens_again_what_a_stuck_thread_kept_open(
         assert result.ok, result.text
 
 
-def test_python_publishes_where_rcl_is_not_as_expected(
-    site: Site, subscriber: Subscriber, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rcl_that_is_not_as_expected_ends_the_start(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("router.ros.rcl.publish_functions", lambda: None)
-    with capture_logs() as logs, site.router(ROUTES) as router:
-        assert isinstance(router._runtime.datapath, NativeDatapath)
-        assert "publish" not in thread_names()
-        await_subscriber(router, subscriber)
-        for turn in range(3):
-            site.send(*(numbered(10 * turn + each) for each in range(10)))
-            assert [next_number(subscriber) for _ in range(10)] == [10 * turn + each for each in range(10)]
-            site.write(ROUTES + f"    ttl: {turn + 1}s\n")
-            assert router.reload().ok
-        wait_until(lambda: router.total("messages_published") == 30)
-    warnings = [line for line in logs if line["log_level"] == "warning" and "rcl" in line["event"]]
-    assert [line["event"] for line in warnings] == [
-        "rcl is not as the carrier expects it, and Python publishes, more slowly"
-    ]
+    with pytest.raises(StartError, match="rcl, by which ROS publishes, has other structures"), site.router(ROUTES):
+        pass
+    monkeypatch.undo()
+    with site.router(ROUTES):  # nothing was left open
+        pass

@@ -21,15 +21,12 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.app import Router, reloading, watching
-from router.app.native_datapath import NativeDatapath
+from router.app.counts import ThreadCounts
+from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.app.watching import watched_files
-from router.app.wiring import ThreadCounts
-from router.carrier.library import chosen_library
-from router.carrier.schema import CannotCarry
 from router.compiler import check_table
 from router.compiler.metrics import Counters
-from router.net.receiver import ReceiveThread
 from router.observe.http import HttpServer
 from router.observe.snapshot import Snapshot, parse_metrics, snapshot
 from tests.acceptance.site import wait_until
@@ -43,12 +40,6 @@ TOPIC = """\
     source: sensor_board
     destinations: [basestation]
     topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}]
-"""
-FROM_ROS = """\
-  rock_measure_result:
-    source: {topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}
-    fields: auto
-    destinations: [{endpoint: basestation, max_rate: 1000000000 Hz, on_limit: latest}]   # which needs Python
 """
 
 
@@ -122,7 +113,7 @@ def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Si
         first = router.listeners["rover"].socket
         with site.under_load():
             for _ in range(25):
-                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, coalesce: never}}"])
+                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, receive_buffer: 2MiB}}"])
                 routes = choice.choice([PH, TOPIC, PH + turns("1s"), PH.replace("}", ", ttl: 5s}")])
                 site.write(routes, listen=listen, endpoints=choice.choice(["", tool]))
                 assert router.reload().ok
@@ -189,18 +180,13 @@ def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
     with site.router(PH) as router:
         site.write(PH, listen=both)
         assert router.reload().ok
-        finish, adopt = ReceiveThread.finish, NativeDatapath.adopt
+        adopt = Plane.adopt
 
-        def finish_late(thread: ReceiveThread, listener: object) -> None:
-            site.send(*map(numbered, range(50)), port=second)  # while nobody receives
-            finish(thread, listener)  # type: ignore[arg-type]
-
-        def adopt_late(datapath: NativeDatapath, *change: Any) -> None:
+        def adopt_late(plane: Plane, *change: Any) -> None:
             site.send(*map(numbered, range(50)), port=second)
-            adopt(datapath, *change)
+            adopt(plane, *change)
 
-        monkeypatch.setattr(ReceiveThread, "finish", finish_late)
-        monkeypatch.setattr(NativeDatapath, "adopt", adopt_late)
+        monkeypatch.setattr(Plane, "adopt", adopt_late)
         site.write(PH)
         assert router.reload().ok
         assert [site.basestation.recv(1000) for _ in range(50)] == [numbered(number) for number in range(50)]
@@ -417,14 +403,14 @@ def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, mo
     with site.router(held.format(0.001)) as router:
         site.send(*map(numbered, range(2)))
         wait_until(lambda: router.total("datagrams_received") >= 2)
-        finish = Runtime._finish
+        finish = Runtime.finish
 
         def finish_late(edges: Runtime, *args: object) -> None:
             site.send(numbered(2))
             wait_until(lambda: router.total("datagrams_received") >= 3)
             finish(edges, *args)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(Runtime, "_finish", finish_late)
+        monkeypatch.setattr(Runtime, "finish", finish_late)
         site.write(held.format(1000))
         assert router.reload().ok
         assert [site.basestation.recv(1000) for _ in range(3)] == [numbered(number) for number in range(3)]
@@ -456,91 +442,69 @@ def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) ->
         assert router.total("deadman_datagrams_sent") == 1
 
 
+TRUE = b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n'
+
+
 def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
     gateway = operator(port, "10ms")
-    with site.router(turns("500ms") + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
-        is_in, go_on = threading.Event(), threading.Event()
-
-        def blocked(_: bytes) -> None:
-            is_in.set()
-            go_on.wait()
-
-        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
-        wait_until(lambda: router.total("messages_published") == 1)
-        assert router._runtime._ros is not None
-        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
+    is_in, _ = stuck
+    site.basestation.settimeout(20)
+    with site.router(turns("500ms") + gateway), socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(TRUE)
         assert is_in.wait(20)
         site.send(DRIVE)
-        site.basestation.settimeout(20)
-        try:
-            assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
-        finally:
-            go_on.set()
+        assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
 
 
-def test_a_reload_is_refused_while_the_deadman_of_a_gateway_that_it_replaces_is_stuck(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+def test_neither_clients_nor_a_reload_wait_for_the_deadman_of_a_gateway_that_is_stuck(
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
+    is_in, goes_on = stuck
     with (
+        capture_logs() as logged,
         site.router(PH + operator(port, "10ms")) as router,
         socket.create_connection(("127.0.0.1", port)) as client,
     ):
-        is_in, go_on = threading.Event(), threading.Event()
-
-        def blocked(_: bytes) -> None:
-            is_in.set()
-            go_on.wait(20)
-
-        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
-        wait_until(lambda: router.total("messages_published") == 1)
-        assert router._runtime._ros is not None
-        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
-        try:
-            assert is_in.wait(20)
-            site.write(PH + operator(port, "20ms"))
-            result = router.reload()
-            assert (result.ok, "stuck" in result.text) == (False, True)
-        finally:
-            go_on.set()
+        client.sendall(TRUE)
+        assert is_in.wait(20)
+        wait_until(lambda: router.total("deadman_active") == 1)
+        site.write(PH + operator(port, "1h"))
         assert router.reload().ok
+        assert [entry["threads"] for entry in logged if "stays open" in entry["event"]] == [["client deadmen"]]
+        with socket.create_connection(("127.0.0.1", port)) as another:
+            another.sendall(TRUE)
+            wait_until(lambda: router.total("messages_published") == 2)
+            wait_until(lambda: router.total("deadman_active") == 0)
+        goes_on.set()
+        assert router.reload().ok
+        assert (router.total("deadman_trips"), router.total("deadman_datagrams_sent")) == (1, 1)
+    assert router.total("deadman_datagrams_sent") == 2  # at the stop, as a client had published
 
 
-def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+def test_a_stop_leaves_the_deadman_of_a_gateway_that_is_stuck(
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2")
-    from router.ros.receiving import MessageThread
-
-    go_on, do_tasks = threading.Event(), MessageThread._do_tasks
-
-    def stand_still(thread: MessageThread) -> None:
-        go_on.wait(10)
-        do_tasks(thread)
-
-    with site.router(PH + FROM_ROS) as router:
-        site.write(PH + FROM_ROS + turns("1h"))
-        with monkeypatch.context() as stuck:
-            stuck.setattr("router.threads.PAUSE_TIMEOUT_S", 0.05)
-            stuck.setattr(MessageThread, "_do_tasks", stand_still)
-            result = router.reload()
-        assert (result.ok, "is stuck" in result.text) == (False, True)
-        assert reloads(router, "failed") == 1
-        assert [route.name for route in router.program.table.routes] == ["ph_info", "rock_measure_result"]
-        site.send(numbered(1))
-        assert site.basestation.recv(1000) == numbered(1)
-        go_on.set()
-        assert router.reload().text == "route manual_drive added"
-        site.send(numbered(2), DRIVE)
-        assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
+    port = free_port(kind=socket.SOCK_STREAM)
+    is_in, _ = stuck
+    with (
+        capture_logs() as logged,
+        site.router(turns("1h") + operator(port, "10ms")),
+        socket.create_connection(("127.0.0.1", port)) as client,
+    ):
+        site.send(DRIVE)
+        assert site.basestation.recv(64) == DRIVE
+        client.sendall(TRUE)
+        assert is_in.wait(20)
+    assert site.basestation.recv(64) == BRAKE
+    left = [entry["threads"] for entry in logged if "the router ends without it" in entry["event"]]
+    assert left == [["client deadmen"]]
 
 
-@pytest.mark.parametrize("late", ["router.app.wiring.Counters.settle", "router.app.router.Router._watch"])
+@pytest.mark.parametrize("late", ["router.app.counts.Counters.settle", "router.app.router.Router._watch"])
 def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
     site: Site, monkeypatch: pytest.MonkeyPatch, late: str
 ) -> None:
@@ -644,19 +608,5 @@ def test_a_reload_agrees_with_validate_about_stray_protos_and_a_lock_elsewhere(s
         (protos / "stray.proto").unlink()
         lock.unlink()
         assert router.reload().text == "the table has 1 error"
-        site.send(numbered(1))
-        assert site.basestation.recv(1000) == numbered(1)
-
-
-def test_messages_that_the_running_carrier_cannot_take_are_refused(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise CannotCarry("a closed enum")
-
-    with site.router(PH) as router:
-        monkeypatch.setattr("router.carrier.program.wire_schema", refuse)
-        site.write(PH + turns("1h"))
-        result = router.reload()
-        assert result.ok == (chosen_library() is None)
-        assert result.ok or "the carrier, which runs, cannot take these messages: a closed enum" in result.text
         site.send(numbered(1))
         assert site.basestation.recv(1000) == numbered(1)

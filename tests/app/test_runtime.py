@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from queue import SimpleQueue
@@ -21,15 +20,12 @@ from structlog.testing import capture_logs
 
 from router import threads
 from router.app import Router
-from router.app.native_datapath import NativeDatapath
+from router.app.plane import Plane
+from router.app.publishing import Publishing
 from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
-from router.carrier.worker import Worker
 from router.compiler.metrics import REJECT_REASONS
-from router.engine.dispatch import Receive
 from router.errors import StartError
-from router.net.receiver import ReceiveThread
-from router.net.udp import Listener
 from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
@@ -161,19 +157,13 @@ def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeyp
 def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     router = Router(site.program(ROUTE))
     seen: list[bytes] = []
-    serve, adopt = ReceiveThread.serve, NativeDatapath.adopt
+    adopt = Plane.adopt
 
-    def serve_late(thread: ReceiveThread, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
-        if listeners:
-            router.mirror.attach(lambda batch: seen.extend(data for *_, data in batch))
-        serve(thread, listeners, receive)
-
-    def adopt_late(datapath: NativeDatapath, *change: Any) -> None:
+    def adopt_late(plane: Plane, *change: Any) -> None:
         router.mirror.attach(lambda batch: seen.extend(data for *_, data in batch))
-        adopt(datapath, *change)
+        adopt(plane, *change)
 
-    monkeypatch.setattr(ReceiveThread, "serve", serve_late)
-    monkeypatch.setattr(NativeDatapath, "adopt", adopt_late)
+    monkeypatch.setattr(Plane, "adopt", adopt_late)
     with router:
         site.send(PH)
         assert site.basestation.recv(1000) == PH
@@ -208,24 +198,26 @@ def test_who_watches_is_told_what_was_decided_about_each_datagram_in_the_order_o
     assert counted == {("rover", reason): 1 for reason in REJECT_REASONS}
 
 
-def test_a_scrape_reads_what_was_served_before_what_was_received(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else what is received and served in between would be served without having waited: fewer than none would wait."""
+def test_a_scrape_reads_what_was_published_before_what_was_received(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else what is received and published in between would be published without having waited."""
     read: list[str] = []
 
-    def noted(kind: type[Carrier | Worker], name: str) -> None:
-        original = getattr(kind, name)
+    def noted(kind: type[Carrier | Publishing]) -> None:
+        original = kind.counters
 
-        def note(of: Carrier | Worker, size: int) -> Any:
+        def note(of: Any, size: int) -> Any:
             read.append(kind.__name__)
             return original(of, size)
 
-        monkeypatch.setattr(kind, name, note)
+        monkeypatch.setattr(kind, "counters", note)
 
-    noted(Carrier, "counters")
-    noted(Worker, "copy_counts")
+    noted(Carrier)
+    noted(Publishing)
     with Router(site.program(ROUTE)) as router:
         list(router.collect())
-    assert read in ([], ["Worker", "Worker", "Carrier"])
+    assert read == ["Publishing", "Carrier"]
 
 
 def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
@@ -234,13 +226,13 @@ def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
     """A thread that is stuck in the middleware delays that."""
     scraped: list[set[str]] = []
     with Router(site.program(ROUTE)) as router:
-        passed = router._runtime.datapath.has_passed
+        passed = router._runtime.plane.has_passed
 
-        def scrape(wiring: Any) -> bool:
+        def scrape() -> bool:
             scraped.append({sample.labels.get("route", "") for family in router.collect() for sample in family.samples})
-            return passed(wiring)
+            return passed()
 
-        monkeypatch.setattr(router._runtime.datapath, "has_passed", scrape)
+        monkeypatch.setattr(router._runtime.plane, "has_passed", scrape)
         site.program(ROUTE + TURNS)
         let_rest(router.program.table.path)
         assert router.reload().ok
@@ -280,7 +272,7 @@ def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypat
             return {sample.labels["topic"]: sample.value for sample in samples}
 
         assert stalled() == {"ph": 0, "other": 0}
-        monkeypatch.setattr(runtime.datapath, "stalled", lambda: ("ph", 2.5))
+        monkeypatch.setattr(runtime.plane, "stalled", lambda: iter([("ph", 2.5)]))
         monkeypatch.setattr(runtime._ros, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
         assert stalled() == {"ph": 2.5, "other": 0}
 
@@ -291,8 +283,6 @@ def test_metrics_tell_where_the_native_thread_is_stuck_while_forwarding_goes_on(
     _, goes_on = stuck
     wanted = TOPIC.replace("queue_depth: 10", "qos: {durability: transient_local}")
     with Router(site.program(ROUTE + wanted)) as router:
-        if not isinstance(router._runtime.datapath, NativeDatapath):
-            pytest.skip("of the carrier")
 
         def stalled() -> float:
             return router._runtime.stalled()["ph"]
@@ -322,15 +312,7 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
         site.send(NAN_PH, NAN_PH, NAN_PH)
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
     assert [(line["reason"], line.get("more")) for line in lines] == [("non_finite", None), ("non_finite", 2)]
-    if program.executors["ph_info", "ph", None].is_carrier and isinstance(router._runtime.datapath, NativeDatapath):
-        assert lines[0]["detail"] == f"{program.table.path}:17:18: state"
-    else:
-        frames = []
-        traceback = lines[0]["exc_info"].__traceback__
-        while traceback:
-            frames.append((Path(traceback.tb_frame.f_code.co_filename).name, traceback.tb_lineno))
-            traceback = traceback.tb_next
-        assert ("table.yaml", 17) in frames
+    assert lines[0]["detail"] == f"{program.table.path}:17:18: state"
     assert router.totals()["datagrams_sent"] == router.totals()["messages_dropped"] == 3
 
 
@@ -345,13 +327,11 @@ def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program
         fields: {data: ph_value}
 """
     with capture_logs() as logged, Router(site.program(ROUTE + failing)) as router:
-        datapath = router._runtime.datapath
-        if not isinstance(datapath, NativeDatapath):
-            pytest.skip("of the carrier")
+        plane = router._runtime.plane
         site.send(NAN_PH)
         wait_until(lambda: router.totals()["messages_dropped"] == 1)
-        generation = datapath._wiring.native.generation if datapath._wiring else 0
-        told = [datapath._where_refused("ph_info", None, "ph", each, 1) for each in (generation, generation + 1)]
+        generation = plane.now.native.generation if plane.now else 0
+        told = [plane._where_refused("ph_info", None, "ph", each, 1) for each in (generation, generation + 1)]
     place = f"{router.program.table.path}:16:15: when"
     assert told == [place, ""]
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
@@ -363,8 +343,6 @@ def test_the_place_of_a_condition_of_a_destination_is_told(site: Site) -> None:
         "destinations: [basestation]", "destinations: [{endpoint: basestation, when: 1 / temperature > 0}]"
     )
     with capture_logs() as logged, Router(site.program(table)) as router:
-        if not isinstance(router._runtime.datapath, NativeDatapath):
-            pytest.skip("of the carrier")
         site.send(NAN_PH)
         wait_until(lambda: router.totals()["messages_dropped"] == 1)
     (line,) = [entry for entry in logged if entry["event"] == "message dropped"]
@@ -403,7 +381,7 @@ def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize("place", ["_stop_gateways", "_stop_ros"])
+@pytest.mark.parametrize("place", ["_stop_gateways", "_stop_plane"])
 def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
     site: Site, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:

@@ -158,11 +158,15 @@ def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> N
             station.recv(100)
 
 
-def test_a_carrier_that_there_is_not_ends_the_start(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_its_library_it_says_so_and_ends(table: Path, tmp_path: Path) -> None:
     """With no thread left that keeps the process alive, while signals are blocked."""
-    monkeypatch.setenv("ROUTER_CARRIER", "rust")
-    said = "router run: ROUTER_CARRIER is 'rust'\nhelp: set it to 'native' or 'python', or unset it"
-    assert ended("run", table) == (78, said.split("\n"))
+    nowhere = tmp_path / "libcarrier.so"
+    (tmp_path / "sitecustomize.py").write_text(
+        "from pathlib import Path; from router.carrier.library import load; "
+        f"load.__defaults__ = (Path({str(nowhere)!r}),)"
+    )
+    said = [f"router run: {nowhere} was not built, and nothing runs without it", "help: run 'make setup'"]
+    assert ended("run", table, path=str(tmp_path)) == (78, said)
 
 
 def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.types.wire import delimited, varint
 
 _NUMBERS = (0, 1, 127, 128, 16384, 2**31 - 1)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from router.carrier.build import NATIVE, build, compile_c, sources
+from router.carrier.library import load
 
 MEMORY = "address,undefined"
 RACES = "thread"
@@ -45,6 +46,16 @@ def seams(output: Path) -> ctypes.CDLL:
         function = getattr(loaded, name)
         function.restype, function.argtypes = returned, taken
     return loaded
+
+
+def clocked_library(output: Path) -> ctypes.CDLL:
+    """The library with clocks that are set: `seam_boottime` and `seam_wall`."""
+    here = Path(__file__).parent
+    clock = output.with_suffix(".c")
+    clock.write_text("#include <stdint.h>\nint64_t seam_boottime, seam_wall;\n")
+    flags = ["-O2", "-fPIC", "-shared", "-include", str(here / "clocked.h"), f"-I{NATIVE}"]
+    compile_c([*flags, str(clock), *map(str, sources()), "-o", str(output)])
+    return load(output)
 
 
 def program(output: Path, main: Path, flags: Sequence[str], compiler: str | None = None) -> Path:

@@ -1,4 +1,4 @@
-/* In place of clock.h, for tests of what the receive thread does with a datagram: clocks that are set. */
+/* In place of clock.h, for tests: clocks that are set. */
 #ifndef CLOCK_H
 #define CLOCK_H
 

@@ -24,8 +24,8 @@ from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
+from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine.binding import State
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 16
@@ -154,14 +154,13 @@ class Commanding:
             limit=self._limit,
             deferral=self._deferrals.deferral,
             collector=lambda _: pytest.fail("no route from ROS has one"),
-            carried=lambda _: (),
-            parts=lambda _: (),
             names=self.names,
             boards=NativeBoards(program.boards),
         )
         self.messages = native_from_ros(program, 1, outlets)
-        pacers = [Adoption(pacer.address) for name in self.boards if (pacer := self._deferrals.pacer(name))]
-        self.deadmen.change(timer_change([*pacers, *self.messages.adopted], ()))
+        pacers = [Adoption(pacer.address) for pacer in self._deferrals.pacers()]
+        timers = timer_change([*pacers, *self.messages.adopted], ())
+        library.timers_change(self.deadmen.address, ctypes.byref(timers))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
         assert take

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from ctypes import c_int64, c_void_p
 from functools import partial
@@ -13,19 +13,18 @@ from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router.app.parts import Part, divided
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen
 from router.carrier.deferrals import timer_change
 from router.carrier.limits import open_limit
-from router.carrier.outlets import Names, Outlets, PartTargets
+from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
+from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine.binding import State
 from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 12
@@ -79,14 +78,14 @@ class Publishing:
         self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
         self._peer = stack.enter_context(_bound())
         self._limits: dict[object, c.Limit] = {}
-        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16))
+        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
         self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
         self._changes: list[c.PublishChange] = []
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
         self.thread = PublishThread(library, self._ring, self._published, self._events, cast("Any", addresses))
         stack.callback(self._close)
         self._change_topics()
-        self._carrier.start(self._programs[0])
+        self._carrier.start(self._programs[0], timer_change((), ()))
         self.sent = 0
 
     def send(self, *datagrams: bytes, listener: str = "exact") -> None:
@@ -101,7 +100,7 @@ class Publishing:
         self._state = State(self._state)
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
-        self._carrier.change(self._programs[-1], (), timer_change((), ()), holds=False)
+        self._carrier.change(self._programs[-1], (), timer_change((), ()))
         self.thread.advance(generation)
 
     def _change_topics(self) -> None:
@@ -148,14 +147,6 @@ class Publishing:
         return (self._names.name(stalled[0]), stalled[1]) if stalled else None
 
     def _made(self, program: Program, generation: int) -> NativeProgram:
-        parts = divided(program, publishes=True)
-        assert not any(parts[part] for part in Part if part is not Part.PUBLISHED)
-
-        def parts_of(handler: Handler) -> Sequence[PartTargets]:
-            targets = parts[Part.PUBLISHED].get(handler.route, ())
-            collects = handler.collect_timeout is not None
-            return [PartTargets(self._ring.address, targets, collects, is_native=True)] if targets else ()
-
         listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         outlets = Outlets(
             listeners=cast("Any", listening),
@@ -165,8 +156,6 @@ class Publishing:
             limit=self._limit,
             deferral=lambda *_: None,
             collector=partial(kept_collector, self._library, self._state),
-            carried=lambda _: (),
-            parts=parts_of,
             names=self._names,
         )
         return native_program(program, generation, outlets)

@@ -12,12 +12,12 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.carrier.schema import CannotCarry, wire_schema
+from router.compiler import check_table
 from router.compiler.program import Program
+from router.errors import Code
 from router.types.framing import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
 from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
-from tests.engine.rig import program
 from tests.engine.wire import I32, I64, LEN, VARINT, damaged, framed, tag, varint
 
 Sides = tuple[Program, PythonSide, CarrierSide]
@@ -203,7 +203,7 @@ def test_a_listener_without_repairs_takes_no_zeros(sides: Mapping[str, Sides]) -
         ("oneof payload { Set set = 1; }", "Set is a message set"),
     ],
 )
-def test_what_it_cannot_decide_is_refused(tmp_path: Path, fields: str, complaint: str) -> None:
+def test_what_it_cannot_decide_is_a_finding(tmp_path: Path, fields: str, complaint: str) -> None:
     (tmp_path / "old.proto").write_text(
         'syntax = "proto2"; message Set { option message_set_wire_format = true; extensions 4 to max; }'
     )
@@ -212,6 +212,8 @@ def test_what_it_cannot_decide_is_refused(tmp_path: Path, fields: str, complaint
         "enum Closed { option features.enum_type = CLOSED; ZERO = 0; }\n"
         f"message PBEnvelope {{ {fields} }}"
     )
-    made = program(tmp_path, "", HEAD.removesuffix("routes:\n") + "routes: {}\n", tmp_path)
-    with pytest.raises(CannotCarry, match=complaint):
-        wire_schema(made.envelope, made.inbound)
+    table = tmp_path / "table.yaml"
+    table.write_text(HEAD.removesuffix("routes:\n").replace("PROTOS", str(tmp_path)) + "routes: {}\n")
+    [finding] = [each for each in check_table(table).diagnostics if each.code is Code.BAD_PROTO]
+    assert complaint in finding.message
+    assert finding.span.file.endswith(("envelope.proto", "old.proto"))

@@ -99,8 +99,6 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
             limit=lambda *_: pytest.fail("no target has one"),
             deferral=lambda *_: None,
             collector=lambda _: pytest.fail("no route has one"),
-            carried=lambda _: (),
-            parts=lambda _: (),
             names=names,
         )
         (plan,) = made.subscriptions

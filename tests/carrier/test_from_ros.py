@@ -17,9 +17,8 @@ from router.carrier.from_ros import NativeFromRos
 from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
-from tests.carrier.building import MEMORY, RACES, run_program
+from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
-from tests.carrier.whole import library as clocked_library
 from tests.engine.rig import Ledger, Rig, program
 
 ROUTES = """\
@@ -442,22 +441,6 @@ def test_a_set_that_was_taken_back_is_not_used(tmp_path: Path) -> None:
 
 
 # ---- who serves what
-
-
-def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
-    """What one of its routes needs Python for, all of them do."""
-    earlier = "[driving_board]\n    deadman: {none: for tests}"
-    later = earlier.replace("driving_board", "{endpoint: driving_board, max_rate: 1 Hz, on_limit: latest}")
-    made = program(tmp_path, ROUTES.replace(earlier, later))
-    assert list(made.lowered.from_ros) == ["drive"]
-    reasons = {key: executor.reason for key, executor in made.executors.items()}
-    needs_it = "`on_limit: latest` needs it; its freshness is Python's"
-    assert reasons == {
-        ("drive_motor", "drive", "driving_board"): None,
-        ("drive_motor", "drive", "recorder"): None,
-        ("arm_target", "arm", "driving_board"): needs_it,
-        ("arm_ctrl", "arm", "driving_board"): needs_it,
-    }
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,8 @@ class Model:
         self._pacer = Pacer(bandwidth, self._fate) if bandwidth else None
         self._ranks = [each.rank for each in targets]
         self._deferrals = [Deferral(each.hertz, self._pacer, self._fate) for each in targets]
+        # A group serves first what was added last.
+        self._timers: list[Deferral | Pacer] = [*reversed(self._deferrals), *filter(None, [self._pacer])]
 
     def _fate(self, now: int, message: Message, fate: str) -> None:
         self.fates[fate] += 1
@@ -113,16 +115,14 @@ class Model:
             self.now = until
         while (due := self.next_due) is not None and due <= until:
             self.now = max(self.now, due)
-            # A group serves first what was added last.
-            for each in (*reversed(self._deferrals), *([self._pacer] if self._pacer else [])):
+            for each in self._timers:
                 if each.next_due is not None and each.next_due <= self.now:
                     each.serve(self.now)
         self.now = until
 
     @property
     def next_due(self) -> int | None:
-        timers = (*self._deferrals, *([self._pacer] if self._pacer else []))
-        return min((each.next_due for each in timers if each.next_due is not None), default=None)
+        return min((each.next_due for each in self._timers if each.next_due is not None), default=None)
 
     def change(self, change: Change) -> None:
         deferral = self._deferrals[change.target]

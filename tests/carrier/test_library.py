@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 import re
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from router.carrier import build, library, structures
-from router.carrier.library import FUNCTIONS, STRUCTURES, LibraryError, chosen_library, load
+from router.carrier.library import FUNCTIONS, STRUCTURES, load
 from router.errors import StartError
 
 HEADERS = "".join(path.read_text() for path in sorted(build.NATIVE.glob("*.h")))
@@ -26,8 +25,6 @@ KINDS = {
     "uint32_t": ctypes.c_uint32,
     "uint64_t": ctypes.c_uint64,
 }
-
-Choose = Callable[[str], "ctypes.CDLL | None"]
 
 
 def kind(declared: str) -> type | None:
@@ -73,63 +70,27 @@ def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
     ]
 
 
-@pytest.fixture
-def choose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Choose:
-    """Choose by a value of the variable; the library is to be at `tmp_path`."""
-    monkeypatch.setattr(load, "__defaults__", (tmp_path / "libcarrier.so",))
-    return lambda value: chosen_library({library.VARIABLE: value})
-
-
-def test_python_is_chosen_where_it_is_asked_for(choose: Choose) -> None:
-    assert choose("python") is None
-
-
-def test_the_library_is_used_where_it_was_built(
-    choose: Choose, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "libcarrier.so").symlink_to(built)
-    for value in ("", "native"):
-        assert isinstance(choose(value), ctypes.CDLL)
-    assert isinstance(chosen_library({}), ctypes.CDLL)
-    assert capsys.readouterr() == ("", "")
-
-
-def test_without_a_library_python_takes_its_place_with_a_warning(
-    choose: Choose, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert choose("") is None
-    [said] = capsys.readouterr().out.splitlines()
-    assert "the carrier's library cannot be used" in said
-    assert "was not built" in said
-
-
-def test_a_library_that_was_asked_for_has_to_be_there(choose: Choose) -> None:
-    with pytest.raises(StartError, match=r"ROUTER_CARRIER is 'native', but .*was not built; run 'make setup'"):
-        choose("native")
-
-
-@pytest.mark.parametrize("value", ["c", "Python", " "])
-def test_no_other_value_is_taken(choose: Choose, value: str) -> None:
-    with pytest.raises(StartError, match=f"ROUTER_CARRIER is '{value}'; set it to 'native' or 'python', or unset it"):
-        choose(value)
+def test_without_a_library_nothing_runs(tmp_path: Path) -> None:
+    with pytest.raises(StartError, match="was not built, and nothing runs without it; run 'make setup'"):
+        load(tmp_path / "libcarrier.so")
 
 
 def test_a_library_of_other_sources_is_refused(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "checksum", lambda: "0" * 64)
-    with pytest.raises(LibraryError, match="was built from other sources; run 'make setup'"):
+    with pytest.raises(StartError, match="was built from other sources; run 'make setup'"):
         load(built)
 
 
 def test_what_is_no_library_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "libcarrier.so"
     path.write_bytes(b"\x7fELF of another architecture")
-    with pytest.raises(LibraryError, match=r"cannot be loaded: .*; run 'make setup'"):
+    with pytest.raises(StartError, match=r"cannot be loaded: .*; run 'make setup'"):
         load(path)
 
 
 def test_structures_of_another_size_are_refused(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "STRUCTURES", {**STRUCTURES, "entry": structures.Feed, "more": structures.Feed})
-    with pytest.raises(LibraryError, match="C and Python differ about struct entry, more"):
+    with pytest.raises(StartError, match="C and Python differ about struct entry, more"):
         load(built)
 
 
@@ -151,6 +112,7 @@ typedef struct {
     int64_t source_timestamp, received_timestamp; uint64_t publication_sequence_number, reception_sequence_number;
     rmw_gid_t publisher_gid;
 } rmw_message_info_t;
+#define RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED UINT64_MAX
 """,
 }
 """Headers like those of rcl, as far as they are used."""
@@ -164,7 +126,11 @@ typedef struct {
         ("*allocate, *deallocate", "*deallocate, *allocate"),
         ("source_timestamp, received_timestamp", "received_timestamp, source_timestamp"),
         ("[1024]", "[2048]"),
-        ("uint64_t publication_sequence_number, reception_sequence_number;", "uint64_t sequence_number;"),
+        (
+            "publication_sequence_number, reception_sequence_number",
+            "reception_sequence_number, publication_sequence_number",
+        ),
+        ("UINT64_MAX", "0"),
         ("16u", "24u"),
     ],
 )

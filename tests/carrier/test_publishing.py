@@ -307,50 +307,6 @@ def test_a_generation_is_reached_without_messages(opened: Open) -> None:
         assert publishing.thread.wait_for(generation - 1, 10)
 
 
-def test_a_generation_that_is_held_begins_later(opened: Open) -> None:
-    """What came before is published; then the generation is reached, and others may serve what belongs in front."""
-    publishing = opened()
-    accel = publishing.publishers["accel"]
-    accel.impede(is_stuck=True)
-    publishing.send(imu(1.0), imu(2.0))
-    publishing.thread.hold(2)
-    publishing.change(2)
-    publishing.send(imu(3.0), imu(4.0))
-    accel.impede()
-    assert publishing.thread.wait_for(2, 10)
-    sleep(0.02)
-    assert [number(cdr) for cdr in accel.published()] == [1.0, 2.0]
-    assert publishing.count("messages_waiting", "imu_info", "accel") == 2
-    assert publishing.stalled() is None
-    publishing.thread.hold(0)
-    wait_until(lambda: not publishing.count("messages_waiting"))
-    assert [number(cdr) for cdr in accel.published()] == [1.0, 2.0, 3.0, 4.0]
-    check_books(publishing)
-
-
-def test_a_generation_without_messages_is_held_as_well(opened: Open) -> None:
-    publishing = opened()
-    publishing.thread.hold(2)
-    publishing.change(2)
-    assert publishing.thread.wait_for(2, 10)
-    publishing.send(imu())
-    sleep(0.02)
-    assert publishing.publishers["accel"].count == 0
-    publishing.thread.hold(0)
-    publishing.wait_for("messages_waiting", 0)
-
-
-def test_a_stop_does_not_wait_for_what_is_held(opened: Open) -> None:
-    publishing = opened()
-    publishing.thread.hold(2)
-    publishing.change(2)
-    publishing.send(imu(1.0), imu(2.0))
-    publishing.stop_receiving()
-    assert publishing.thread.stop()
-    assert [number(cdr) for cdr in publishing.publishers["accel"].published()] == [1.0, 2.0]
-    check_books(publishing)
-
-
 @pytest.mark.parametrize(
     "sanitizers",
     ["", pytest.param(RACES, marks=pytest.mark.slow), pytest.param(MEMORY, marks=pytest.mark.slow)],

@@ -8,37 +8,30 @@ import os
 import select
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from router.carrier.sender import NativeSender
 from router.net import udp
 from router.net.kernel import IP_FREEBIND
-from router.net.udp import Inherited, Listener, Sender
+from router.net.udp import Inherited, Listener
 from router.table.addresses import Address
 from router.table.model import EndpointKind
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
 
 PATIENCE = 10.0
-Make = Callable[..., Sender]
+Make = Callable[..., NativeSender]
 """Called with an endpoint, the listener that it sends from, and all listeners."""
 
 
 @pytest.fixture(scope="session")
-def native(library: ctypes.CDLL) -> Make:
+def make(library: ctypes.CDLL) -> Make:
     return partial(NativeSender, library)
-
-
-@pytest.fixture(params=["carrier", "python"])
-def make(request: pytest.FixtureRequest, native: Make) -> Make:
-    return native if request.param == "carrier" else Sender
 
 
 @pytest.fixture
@@ -61,68 +54,65 @@ def listener(stack: ExitStack) -> Listener:
 
 
 @pytest.fixture
-def sender(stack: ExitStack, make: Make, board: socket.socket, listener: Listener) -> Sender:
+def sender(stack: ExitStack, make: Make, board: socket.socket, listener: Listener) -> NativeSender:
     """It sends to the board, from the listener's port."""
     return stack.enter_context(closing(make(endpoint("board", Address(*board.getsockname())), listener, [listener])))
 
 
-class Link:
-    """A sender, and a board that comes and goes. `is_bound`: it sends from a listener's port."""
+def send_to(stack: ExitStack, make: Make, address: Address) -> NativeSender:
+    return stack.enter_context(closing(make(endpoint("board", address))))
 
-    def __init__(self, stack: ExitStack, make: Make, *, is_bound: bool) -> None:
-        self._boards = stack
-        board = self._bound(("127.0.0.1", 0))
-        self._address: tuple[str, int] = board.getsockname()
-        listener = stack.enter_context(closing(Listener(plan()))) if is_bound else None
-        made = make(endpoint("board", Address(*self._address)), listener, [listener] if listener else [])
-        self._sender = stack.enter_context(closing(made))
-        self._board: socket.socket | None = board
 
-    def _bound(self, address: tuple[str, int]) -> socket.socket:
-        board = self._boards.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        board.bind(address)
-        board.setblocking(False)
-        return board
+def test_news_of_an_old_loss_does_not_cost_a_healthy_datagram(stack: ExitStack, make: Make) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        address = Address(*absent.getsockname())
+    sender = send_to(stack, make, address)
+    sender.send(b"lost")  # nobody listens, and the kernel is told so
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
+        late.bind(address)
+        late.settimeout(5)
+        with pytest.raises(ConnectionRefusedError):
+            sender.send(b"arrives")
+        assert sender.send(b"arrives too") == 11
+        assert [late.recv(100), late.recv(100)] == [b"arrives", b"arrives too"]
 
-    def step(self, what: str) -> object:
-        """Do something; return what can be seen of it."""
-        if what == "toggle":
-            if self._board is not None:
-                self._board.close()
-                self._board = None
-            else:
-                self._board = self._bound(self._address)
-            return None
-        data = bytes(70000) if what == "send too much" else what.encode()
-        send = self._sender.send_checked if what == "send checked" else self._sender.send
+
+def test_who_looks_hears_of_his_own_loss_and_the_next_datagram_of_none(stack: ExitStack, make: Make) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = Address(*closed.getsockname())
+    sender = send_to(stack, make, address)
+    with pytest.raises(ConnectionRefusedError):
+        sender.send_checked(b"brake")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(address)
+        opened.settimeout(10)
+        assert sender.send(b"drive") == 5
+        assert sender.send_checked(b"brake") == 5
+        assert [opened.recv(100) for _ in range(2)] == [b"drive", b"brake"]
+
+
+def test_losses_are_counted_one_for_one(stack: ExitStack, make: Make) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        sender = send_to(stack, make, Address(*absent.getsockname()))
+    outcomes = []
+    for _ in range(10):
         try:
-            outcome: object = send(data)
-        except OSError as error:
-            outcome = error.errno
-        return outcome, self._received()
-
-    def _received(self) -> list[bytes]:
-        received = []
-        with suppress(BlockingIOError):
-            while self._board is not None:
-                received.append(self._board.recv(100))
-        return received
+            outcomes.append(sender.send(b"lost"))
+        except ConnectionRefusedError:
+            outcomes.append(0)
+    assert outcomes == [4] + 9 * [0]  # the loss of the tenth would be told by an eleventh
 
 
-@given(
-    steps=st.lists(st.sampled_from(["send", "send", "send checked", "send too much", "toggle"]), max_size=30),
-    is_bound=st.booleans(),
-)
-def test_it_sends_and_fails_as_python_does(native: Make, steps: list[str], is_bound: bool) -> None:
-    with ExitStack() as stack:
-        links = [Link(stack, make, is_bound=is_bound) for make in (Sender, native)]
-        for step in steps:
-            python, carrier = [link.step(step) for link in links]
-            assert carrier == python
+def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, make: Make, board: socket.socket) -> None:
+    with pytest.raises(OSError, match="too long"):
+        send_to(stack, make, Address(*board.getsockname())).send(bytes(70000))
 
 
 def test_it_sends_from_its_listeners_port_and_answers_reach_the_listener(
-    sender: Sender, board: socket.socket, listener: Listener
+    sender: NativeSender, board: socket.socket, listener: Listener
 ) -> None:
     sender.send(b"drive")
     data, where_from = board.recvfrom(100)
@@ -176,7 +166,7 @@ def test_it_shares_the_port_of_an_inherited_listener_also_while_the_address_is_n
 
 
 @pytest.mark.parametrize("shares", [0, 1])
-def test_nobody_else_can_have_the_port(listener: Listener, sender: Sender, shares: int) -> None:
+def test_nobody_else_can_have_the_port(listener: Listener, sender: NativeSender, shares: int) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, shares)
         with pytest.raises(OSError, match="Address already in use"):
@@ -218,7 +208,7 @@ def test_an_endpoint_without_a_listener_has_a_port_of_its_own_and_hears_no_answe
 
 
 def test_each_sender_hears_of_its_own_losses(
-    stack: ExitStack, library: ctypes.CDLL, make: Make, board: socket.socket, listener: Listener, sender: Sender
+    stack: ExitStack, library: ctypes.CDLL, make: Make, board: socket.socket, listener: Listener, sender: NativeSender
 ) -> None:
     """The kernel tells the listener, which passes it on, and receives on."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
@@ -229,10 +219,7 @@ def test_each_sender_hears_of_its_own_losses(
     board.sendto(b"telemetry", listener.address)
     with pytest.raises(ConnectionRefusedError):
         listener.socket.recv(100)
-    if isinstance(lost, NativeSender):
-        assert library.sender_note_errors(listener.socket.fileno())
-    else:
-        assert listener.note_errors()
+    assert library.sender_note_errors(listener.socket.fileno())
     assert listener.socket.recv(100) == b"telemetry"
     assert sender.send(b"drive") == 5
     with pytest.raises(ConnectionRefusedError):
@@ -271,16 +258,12 @@ def test_a_flood_of_errors_leaves_no_room_taken(
     lost = stack.enter_context(closing(make(endpoint("absent", address), listener, [listener])))
     for _ in range(100):
         lost.send(b"lost")
-    if isinstance(lost, NativeSender):
-        assert library.sender_note_errors(listener.socket.fileno())
-        assert not library.sender_note_errors(listener.socket.fileno())
-    else:
-        assert listener.note_errors()
-        assert not listener.note_errors()
+    assert library.sender_note_errors(listener.socket.fileno())
+    assert not library.sender_note_errors(listener.socket.fileno())
 
 
 def test_a_sender_moves_to_another_port_and_back(
-    stack: ExitStack, sender: Sender, board: socket.socket, listener: Listener
+    stack: ExitStack, sender: NativeSender, board: socket.socket, listener: Listener
 ) -> None:
     other = stack.enter_context(closing(Listener(plan("other"))))
     for source in (other, None, listener):
@@ -310,7 +293,7 @@ def test_without_ipv6_it_sends_from_another_port_and_says_so(
     assert [(each["log_level"], each["listener"]) for each in logged] == [("warning", "rover")]
 
 
-def fill(sender: Sender) -> int:
+def fill(sender: NativeSender) -> int:
     """Send until the buffer is full. Return how many datagrams it has taken."""
     for number in range(1000):
         try:
@@ -378,8 +361,8 @@ def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStac
     assert source_of(b"from its own again") == ("10.78.1.1", 5000)
 
 
-def test_nothing_is_sent_after_the_end(native: Make, board: socket.socket) -> None:
-    sender = native(endpoint("board", Address(*board.getsockname())))
+def test_nothing_is_sent_after_the_end(make: Make, board: socket.socket) -> None:
+    sender = make(endpoint("board", Address(*board.getsockname())))
     send = sender.send
     sender.close()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM):  # which usually gets the closed one's descriptor

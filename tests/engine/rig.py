@@ -12,9 +12,9 @@ from typing import ParamSpec, TypeVar
 
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.compiler.metrics import DROP_REASONS, HISTOGRAM_CELLS, Counters
+from router.compiler.metrics import DROP_REASONS, HISTOGRAM_CELLS, Counters, Report
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine import InboundEngine, OutboundEngine, Report
+from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, commander
 from router.engine.delivery import FrameOutcome, Outcome

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.compiler.metrics import Counters
+from router.compiler.metrics import Counters, Report
 from router.compiler.program import DeadmanPlan
 from router.engine.deadman import GREETING, START, START_AGAIN, Deadman, commander, feeder
-from router.engine.delivery import Report, Stale
+from router.engine.delivery import Stale
 from router.engine.timers import Timer
 
 P = ParamSpec("P")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from benchmarks.fuzz_engine import fuzz
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import (
     BASESTATION,

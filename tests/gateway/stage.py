@@ -15,8 +15,8 @@ from typing import Any, cast
 from router.carrier.library import load
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
+from router.compiler.metrics import Report
 from router.compiler.program import GatewayPlan, Program
-from router.engine import Report
 from router.errors import StartError
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters

@@ -34,7 +34,7 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path,
     message = CompressedImage(format="png", data=list(picture))
     with closing(open_ros()) as ros, closing(Publisher("camera/compressed", IMAGE)) as publisher:
         gateways = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print)
-        gateways.finish(gateways.prepare(made, lambda *_: lambda _: None))
+        gateways.finish(gateways.prepare(made, {}))
         try:
             page = browser.open(f"http://127.0.0.1:{port}/?topic=/camera/compressed")
             page.until(f"document.title === {json.dumps(f'Gateway camera · 127.0.0.1:{port}')}")

@@ -25,7 +25,7 @@ def opened(made: Program) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
     thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print)
     try:
-        thread.finish(thread.prepare(made, lambda *_: lambda _: None))
+        thread.finish(thread.prepare(made, {}))
     except BaseException:
         thread.stop()
         raise

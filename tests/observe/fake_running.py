@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -13,16 +14,15 @@ from prometheus_client.metrics_core import Metric as Family
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.errors import SourceSpan
 from router.observe.health import Look
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
 from router.observe.watch import LAST_SEEN, Health, Watch
-from router.recording.mirror import Classifier, Mirror
+from router.recording.mirror import Classifier, Mirror, Mirrored
 from router.table.addresses import Address
-from router.types.framing import MAX_DATAGRAM
 from tests.tables import ROUTES
 
 SPAN = SourceSpan("routes/sim.yaml", 8, 20, 34)
@@ -48,7 +48,10 @@ class FakeRunning:
         self.reloads = RELOADED
         self.failures: list[Exception] = []
         self.collected = 0
-        self.mirror = Mirror(MAX_DATAGRAM, lambda: None, self.failures.append)
+        self.mirror = Mirror(lambda: None, self.failures.append)
+        self.lost = 0
+        self.waiting: deque[Mirrored] = deque()
+        self.mirror.show(lambda: [self.waiting.popleft() for _ in range(len(self.waiting))], lambda: self.lost)
         self.counts = program.counters.fresh_counts()
         self._turns = 0
 
@@ -61,7 +64,8 @@ class FakeRunning:
     def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
         """`reason`: why no route takes it."""
         known = Classifier(self.program.envelope, self.program.table)
-        self.mirror.tee(listener, lambda *_: reason, partial(known.sender, listener))(data, peer)
+        if self.mirror.is_observed:
+            self.waiting.append((wall_ns(), listener, peer, known.sender(listener, peer), reason, data))
 
     def collect(self) -> Iterator[Family]:
         self.collected += 1

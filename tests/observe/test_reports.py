@@ -6,7 +6,7 @@ import errno
 
 import pytest
 
-from router.engine import Report
+from router.compiler.metrics import Report
 from router.log import logger
 from router.observe.reports import Reporter
 from router.table.addresses import Address

@@ -124,7 +124,7 @@ def test_what_no_route_took_is_no_last_value(running: FakeRunning, shown: Status
     running.receive(imu(accel_x=66.0), STRANGER, reason="source_mismatch")
     found = value(shown, "imu_info")
     running.receive(imu(accel_x=66.0), STRANGER, reason="source_mismatch")
-    wait_until(lambda: not running.mirror._waiting)
+    wait_until(lambda: not running.waiting)
     assert [found, value(shown, "imu_info")] == [found] * 2
     assert (found["source"], found["fields"]["accel_x"]) == ("sensor_board", 1.5)
 

@@ -117,7 +117,7 @@ def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(
         next(stream)
         for _ in range(50):
             running.receive(bytes(300), BOARD)
-        wait_until(lambda: not running.mirror._waiting)
+        wait_until(lambda: not running.waiting)
         running.receive(IMU, BOARD)
         reader, seen, lost = StreamReader(), 0, 0
         list(reader.take(MAGIC))

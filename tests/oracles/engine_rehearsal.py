@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from router.compiler.metrics import Series
+from router.compiler.metrics import Report, Series
 from router.compiler.program import DeadmanPlan, Program
+from router.datagrams import Peer
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, State, TimerGroup
 from router.engine.deadman import Deadman, commander
-from router.engine.delivery import Report
-from router.engine.dispatch import Peer
 from router.engine.freshness import Freshness
 from router.engine.pacing import Pacer
 from router.engine.timers import P, R, Timer

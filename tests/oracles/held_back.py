@@ -60,6 +60,7 @@ class Pacer:
         self._limit_savings(now)
         for each in sorted(filter(leaves, self._waiting), key=lambda each: each.rank):
             self._send(now, each)
+        self._limit_savings(now)
 
     def _first(self, rank: int) -> Message | None:
         return next((each for each in self._waiting if each.rank == rank), None)
@@ -79,12 +80,13 @@ class Pacer:
                     self.next_due = min([may_go_at + BURST // 2, *ends])
                     return
                 self._send(now, first)
+                if first.is_stale(now):
+                    self._limit_savings(now)
 
     def _send(self, now: int, message: Message) -> None:
         self._waiting.remove(message)
         if message.is_stale(now):
             self._fate(now, message, "stale")
-            self._limit_savings(now)
         else:
             self._paid_at += self.cost(message.size)
             self._fate(now, message, "sent")

@@ -13,8 +13,7 @@ from typing import Any, cast
 from hypothesis import strategies as st
 
 from router.compiler.program import Program
-from router.engine.dispatch import Peer
-from router.engine.wire import Wire, wire_of_protos
+from router.datagrams import Peer, Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
 from router.recording.encoder import Chunk, Encoder

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from router.engine.dispatch import Peer
+from router.datagrams import Peer
 from router.recording.channels import MOST_CHANNELS, Channels
 from router.recording.encoder import Encoder
 from router.types.framing import MAX_DATAGRAM

@@ -1,42 +1,37 @@
-"""The mirror shows consumers what is received, and is out of the way when there are none."""
+"""The mirror shows consumers what is received."""
 
 from __future__ import annotations
 
 import queue
-import threading
+from collections import deque
 from collections.abc import Sequence
 
 import pytest
 
-from router.engine.dispatch import Peer, Receive
-from router.recording.mirror import MOST_WAITING, Consumer, Mirror, Mirrored, MirroredDatagram
+from router.recording.mirror import Consumer, Mirror, Mirrored, MirroredDatagram
 
-PEER, STRANGER = ("127.0.0.2", 8), ("127.0.0.9", 8)
-LIMIT = 100
+PEER = ("127.0.0.2", 8)
 
 
 class Source:
-    """What receives: a function that counts and rejects strangers, rewired as a receive thread would be."""
+    """What receives: it keeps datagrams while somebody observes, as the carrier's ring does."""
 
     def __init__(self) -> None:
         self.failures: list[Exception] = []
-        self.routed: list[bytes] = []
-        self.mirror = Mirror(LIMIT, self._rewire, self.failures.append)
-        self.receive: Receive = self._route
+        self.mirror = Mirror(self._rewire, self.failures.append)
+        self.mirror.show(self._drain, lambda: 7)
         self.rewired = 0
+        self._kept: deque[Mirrored] = deque()
 
-    def _route(self, data: bytes, peer: Peer) -> str:
-        if peer == STRANGER:
-            return "source_mismatch"
-        self.routed.append(data)
-        return ""
+    def receive(self, data: bytes) -> None:
+        if self.mirror.is_observed:
+            self._kept.append((len(self._kept), "rover", PEER, "board", "", data))
 
-    def tee(self) -> Receive:
-        return self.mirror.tee("rover", self._route, {PEER: "board", STRANGER: ""}.__getitem__)
+    def _drain(self) -> list[Mirrored]:
+        return [self._kept.popleft() for _ in range(len(self._kept))]
 
     def _rewire(self) -> None:
         self.rewired += 1
-        self.receive = self.tee()
 
 
 def into(got: queue.SimpleQueue[MirroredDatagram]) -> Consumer:
@@ -52,29 +47,16 @@ def source() -> Source:
     return Source()
 
 
-def test_nothing_is_between_while_nobody_watches(source: Source) -> None:
-    assert source.tee() == source.receive == source._route
-
-
 def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> None:
     got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     detach = source.mirror.attach(into(got))
     for number in range(3):
-        source.receive(b"%d" % number, PEER)
+        source.receive(b"%d" % number)
     seen = [got.get(timeout=5) for _ in range(3)]
     detach()
-    assert [each.data for each in seen] == source.routed == [b"0", b"1", b"2"]
-    assert {(each.listener, each.peer) for each in seen} == {("rover", PEER)}
-    assert sorted(each.at for each in seen) == [each.at for each in seen]
-
-
-def test_consumers_see_what_was_decided_and_who_sent(source: Source) -> None:
-    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
-    source.mirror.attach(into(got))
-    assert [source.receive(b"x", peer) for peer in (PEER, STRANGER, PEER)] == ["", "source_mismatch", ""]
-    source.mirror.close()
-    seen = [got.get_nowait() for _ in range(3)]
-    assert [(each.endpoint, each.reason) for each in seen] == [("board", ""), ("", "source_mismatch"), ("board", "")]
+    assert [each.data for each in seen] == [b"0", b"1", b"2"]
+    assert {(each.listener, each.peer, each.endpoint, each.reason) for each in seen} == {("rover", PEER, "board", "")}
+    assert source.mirror.lost == 7
 
 
 def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> None:
@@ -85,15 +67,14 @@ def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> No
     assert source.rewired == 1
     second()
     assert source.rewired == 2
-    assert source.tee() == source.receive == source._route
 
 
 def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) -> None:
     got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     source.mirror.attach(into(got))()
-    source.receive(b"unseen", PEER)
+    source.receive(b"unseen")
     detach = source.mirror.attach(into(got))
-    source.receive(b"seen", PEER)
+    source.receive(b"seen")
     assert got.get(timeout=5).data == b"seen"
     detach()
     assert got.empty()
@@ -102,39 +83,9 @@ def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) 
 def test_closing_shows_what_waits(source: Source) -> None:
     got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     source.mirror.attach(into(got))
-    source.receive(b"last", PEER)
+    source.receive(b"last")
     source.mirror.close()
     assert got.get_nowait().data == b"last"
-
-
-def test_what_is_too_long_is_cut_one_byte_behind_the_limit(source: Source) -> None:
-    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
-    source.mirror.attach(into(got))
-    source.receive(bytes(1000), PEER)
-    assert len(got.get(timeout=5).data) == LIMIT + 1
-    assert len(source.routed[0]) == 1000
-    source.mirror.close()
-
-
-def test_a_slow_consumer_costs_datagrams_that_are_counted_and_no_routing(source: Source) -> None:
-    held, entered = threading.Event(), threading.Event()
-    seen: list[int] = []
-
-    def slow(batch: Sequence[Mirrored]) -> None:
-        entered.set()
-        held.wait(20)
-        seen.append(len(batch))
-
-    source.mirror.attach(slow)
-    source.receive(b"first", PEER)
-    assert entered.wait(5)
-    for _ in range(MOST_WAITING + 10):
-        source.receive(b"more", PEER)
-    assert len(source.routed) == MOST_WAITING + 11
-    assert source.mirror.lost == 10
-    held.set()
-    source.mirror.close()
-    assert sum(seen) == MOST_WAITING + 1
 
 
 def test_a_consumer_that_fails_is_told_of_and_spares_the_others(source: Source) -> None:
@@ -145,7 +96,7 @@ def test_a_consumer_that_fails_is_told_of_and_spares_the_others(source: Source) 
 
     source.mirror.attach(failing)
     source.mirror.attach(into(got))
-    source.receive(b"x", PEER)
+    source.receive(b"x")
     assert got.get(timeout=5).data == b"x"
     source.mirror.close()
     assert [str(error) for error in source.failures] == ["a bug"]

@@ -12,7 +12,7 @@ import pytest
 
 from router.app import Router
 from router.compiler import check_table
-from router.engine.wire import Wire, wire_of_protos
+from router.datagrams import Wire, wire_of_protos
 from router.rehearsal.rehearsal import (
     START,
     Collected,

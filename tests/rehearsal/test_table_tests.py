@@ -8,7 +8,7 @@ from textwrap import dedent, indent
 import pytest
 
 from router.compiler.lookup import Definitions
-from router.engine.wire import wire_of_protos
+from router.datagrams import wire_of_protos
 from router.errors import Code, Diagnostic, TableError
 from router.rehearsal.comparing import Failure
 from router.rehearsal.coverage import Coverage

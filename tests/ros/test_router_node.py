@@ -47,21 +47,19 @@ def subscribe() -> Iterator[Callable[..., Subscriber]]:
 def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic())) as ros:
         wanted = ros.wanted["greeting"]
-        assert (wanted[0], list(ros.subscribed)) == (0, [])
+        assert wanted[0] == 0
         peer = subscribe("greeting", "std_msgs/msg/String")
         wait_until(lambda: wanted[0])
-        assert list(ros.subscribed) == ["greeting"]
         assert peer.line() == "matched"
         ros.publish["greeting"](HELLO)
         assert bytes.fromhex(peer.line()) == HELLO
         peer.close()
         wait_until(lambda: not wanted[0])
-        assert not ros.subscribed
 
 
 def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
-        assert (ros.wanted["greeting"][0], list(ros.subscribed)) == (1, [])
+        assert ros.wanted["greeting"][0] == 1
         ros.publish["greeting"](HELLO)
         peer = subscribe("greeting", "std_msgs/msg/String", "--transient-local")
         assert {peer.line(), peer.line()} == {"matched", HELLO.hex()}
@@ -151,10 +149,8 @@ def test_two_of_our_own_that_do_not_go_together_are_counted() -> None:
         open_ros(string_topic(BEST_EFFORT), subscriptions=[string_topic(RELIABLE)], incompatible=apart)
     ) as ros:
         apart.wait_for("reliability", "reliability")
-        ros.start({"greeting": lambda *_: None}, failed=lambda _: None)
         change = ros.prepare([string_topic(RELIABLE)], [string_topic(RELIABLE)], {"greeting": SPAN})
-        with ros.paused():
-            ros.apply(change, {"greeting": lambda *_: None})
+        ros.apply(change)
         ros.watch(change)
         ros.finish(change)
         apart.wait_for()

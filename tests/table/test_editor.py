@@ -19,7 +19,7 @@ GOOD = """\
 version: 1
 envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
 listen:
-  rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}", coalesce: 500us}
+  rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}"}
 endpoints:
   sensor_board: {address: "${SENSOR:-192.168.0.30:8}", kind: board}
   basestation: {address: 192.168.0.10:9000, kind: basestation, bandwidth: 500kB/s}

@@ -30,7 +30,7 @@ def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
     assert table.http.value == Address("127.0.0.1", 9108)
     assert flat(table.node) == {"name": "rover_router", "namespace": "/"}
     assert flat(table.listeners["rover"]) == {
-        "name": "rover", "address": "0.0.0.0:5000", "framing": "exact", "receive_buffer": "64 kB", "coalesce": "1 ms",
+        "name": "rover", "address": "0.0.0.0:5000", "framing": "exact", "receive_buffer": "64 kB",
     }  # fmt: skip
     assert flat(table.endpoints["sensor_board"]) == {
         "name": "sensor_board", "address": "192.168.0.30:8", "kind": "board", "source_port": "9",
@@ -158,7 +158,6 @@ def test_what_is_left_out_has_defaults(tmp_path: Path) -> None:
     assert (flat(table.node), table.http) == ({"name": "rover_router", "namespace": "/"}, None)
     assert flat(table.listeners["rover"]) == {
         "name": "rover", "address": "0.0.0.0:5000", "framing": "zero_trimmed", "receive_buffer": "4 MiB",
-        "coalesce": "1 ms",
     }  # fmt: skip
     assert (table.record, table.foxglove, table.reload_on_change, table.node.diagnostics) == (None, None, False, None)
     assert table.endpoints["arm"].stale_after == 5 * 10**9

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from router.table import units
 from router.table.units import (
-    COALESCE,
     DATA_RATE,
     DATAGRAM_SIZE,
     DISK_SIZE,
@@ -32,7 +31,6 @@ from router.table.units import (
         (SIZE, {"4MiB": 4 << 20, "64kB": 64_000, "64 KiB": 65_536, "1.5MB": 1_500_000, "9B": 9}),
         (DATA_RATE, {"500kB/s": 500_000, "1 MiB/s": 1 << 20, "0.5kB/s": 500, "9B/s": 9}),
         (RATE, {"30 Hz": 30.0, "0.5Hz": 0.5, 10: 10.0, 0.25: 0.25}),
-        (COALESCE, {"1ms": 1_000_000, "250 us": 250_000, "never": 0}),
         (PERIOD, {"500ms": 500_000_000, "1ms": 1_000_000, "each": 0}),
         (TOPIC_RATE, {"50 Hz": 20_000_000, "0.5Hz": 2 * 10**9, 1000: 1_000_000, 3: 333_333_333, "each": 0}),
         (INTERVAL, {"10ms": 10_000_000}),
@@ -50,7 +48,6 @@ def test_numbers_are_parsed_exactly(quantity: Quantity, texts: dict[object, obje
     ("quantity", "texts"),
     [
         (DURATION, ["500", "5 parsecs", "-1s", "0s", "0.5ns", "999999999999999h", "1e3s"]),
-        (COALESCE, ["0ms", "11ms", "off"]),
         (SIZE, ["4", "4Mib", "0B", "1.5B", "1024MiB", "64kB/s"]),
         (DATA_RATE, ["64kB", "64 kbit/s", "0kB/s", "0.5B/s", "999999999999999MB/s"]),
         (PERIOD, ["999us", "never"]),
@@ -76,7 +73,6 @@ def test_what_means_nothing_is_refused(quantity: Quantity, texts: list[object]) 
         (DISK_SIZE, {4 << 20: "4 MiB", 8 << 30: "8 GiB", 1_500_000_000: "1500 MB", 64_000: "64 kB", 1400: "1400 B"}),
         (DATA_RATE, {500_000: "500 kB/s"}),
         (RATE, {30.0: "30 Hz", 0.5: "0.5 Hz", 33.3: "33.3 Hz", 1e-7: "0.0000001 Hz"}),
-        (COALESCE, {0: "never"}),
         (PERIOD, {0: "each"}),
         (TOPIC_RATE, {0: "each"}),
     ],
@@ -121,7 +117,6 @@ _ROUND = st.builds(
     [
         (DURATION, _DURATIONS | _ROUND),
         (PATIENCE, st.none() | _DURATIONS),
-        (COALESCE, st.integers(0, units.MAX_COALESCE)),
         (PERIOD, st.just(0) | st.integers(units.MIN_PERIOD, units.MAX_DURATION)),
         (SIZE, st.integers(1, units.MAX_SIZE) | st.integers(1, 1023).map(lambda count: count << 20)),
         (DISK_SIZE, st.integers(units.MIN_DISK_SIZE, 10**15 - 1)),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from router.engine.wire import Wire, wire_of_protos
+from router.datagrams import Wire, wire_of_protos
 from router.table import read_table
 from router.table.model import RouteTable
 from router.types.protobuf import PayloadCase

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from router.compiler.program import DeadmanPlan
-from router.engine.wire import Decoded, Wire, wire_of_protos
+from router.datagrams import Decoded, Wire, wire_of_protos
 from router.table.model import RouteTable
 from router.tools.board import FRAME_TIMEOUT, Board, Change, Frames, State, Stop, boards, is_part
 from router.values import payload
@@ -90,6 +90,14 @@ def part(frame_id: int, total_count: int, index: int) -> SimpleNamespace:
 
 def counts(frames: Frames) -> tuple[int, int, int]:
     return frames.complete, frames.incomplete, frames.astray
+
+
+def test_copies_of_parts_make_no_frame() -> None:
+    frames = Frames()
+    for index in (0, 0, 1, 1, 0):
+        frames.take(0, part(7, 2, index))
+    frames.advance(FRAME_TIMEOUT)
+    assert counts(frames) == (1, 0, 0)
 
 
 def test_frames_are_counted_when_their_last_part_comes_or_it_is_too_late() -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from router.carrier.library import LibraryError
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.errors import StartError
 from router.observe.health import Kind, Problem
 from router.table.addresses import Address
 from router.tools import doctor_checks
@@ -98,12 +98,9 @@ def test_message_types_are_counted(table: Path) -> None:
     assert found.text.endswith(", and 1 message type of the table")
 
 
-def test_what_carries_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_is_up_to_date_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_checks, "load", lambda: None)
-    assert gist(carrier({}), "up to date")[0] == (Grade.FINE, True)
-    assert gist(carrier({"ROUTER_CARRIER": "native"}), "up to date")[0] == (Grade.FINE, True)
-    assert gist(carrier({"ROUTER_CARRIER": "python"}), "Python, as ROUTER_CARRIER says") == [(Grade.FINE, True)]
-    assert gist(carrier({"ROUTER_CARRIER": "c"}), "ROUTER_CARRIER is 'c'") == [(Grade.PROBLEM, True)]
+    assert gist(carrier(), "up to date")[0] == (Grade.FINE, True)
 
 
 def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,7 +109,7 @@ def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeyp
 
     monkeypatch.setattr(doctor_checks, "load", lambda: None)
     monkeypatch.setattr(os, "sched_setscheduler", refused)
-    found = list(carrier({}))
+    found = list(carrier())
     assert [each.grade for each in found] == [Grade.FINE, Grade.WARNING]
     assert "rtprio 1" in found[1].remedy
 
@@ -120,20 +117,17 @@ def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeyp
 def test_asking_for_a_real_time_priority_leaves_the_one_that_was_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_checks, "load", lambda: None)
     before = os.sched_getscheduler(0)
-    assert len(list(carrier({}))) == len(("library", "priority"))
+    assert len(list(carrier())) == len(("library", "priority"))
     assert os.sched_getscheduler(0) == before
 
 
-def test_a_library_that_cannot_be_used_keeps_only_those_from_starting_who_asked_for_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_library_that_cannot_be_used_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> None:
-        raise LibraryError("libcarrier.so was not built; run 'make setup'")
+        raise StartError("libcarrier.so was not built, and nothing runs without it", "run 'make setup'")
 
     monkeypatch.setattr(doctor_checks, "load", missing)
-    [found], [asked_for] = carrier({}), carrier({"ROUTER_CARRIER": "native"})
-    assert (found.grade, asked_for.grade) == (Grade.WARNING, Grade.PROBLEM)
-    assert found.remedy == asked_for.remedy == "libcarrier.so was not built; run 'make setup'"
+    [found] = carrier()
+    assert (found.grade, found.remedy) == (Grade.PROBLEM, "run 'make setup'")
 
 
 @pytest.mark.parametrize("look", [examine, before_start])

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from router.engine.wire import Wire, wire_of_protos
+from router.datagrams import Wire, wire_of_protos
 from router.tools.payloads import PayloadModel, pose
 from router.types.protobuf import PayloadCase
 from tests.tables import PROTOS

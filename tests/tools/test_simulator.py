@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.errors import UsageError
 from router.table import read_table
 from router.table.addresses import Address

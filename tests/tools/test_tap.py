@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from router.engine.wire import Wire
+from router.datagrams import Wire
 from router.errors import UsageError
 from router.table.addresses import Address
 from router.tools.tap import Condition, listen, tapped_datagram

@@ -15,10 +15,11 @@
 static const int64_t PYTHON_TIMEOUT = 30000000000; /* ns for which the watchdog is fed while Python is stuck */
 static const char ALIVE[] = "WATCHDOG=1";
 
-struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events) {
+struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
     if (!carrier) return NULL;
     bool is_open = stage_open(&carrier->routing.stage, counters, events, timers);
+    carrier->routing.published = published;
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);
@@ -45,8 +46,6 @@ void carrier_change(struct carrier *carrier, const struct change *change) {
     atomic_store(&carrier->next, change);
     while (atomic_load(&carrier->adopted) != change) usleep(200);
 }
-
-void carrier_resume(struct carrier *carrier) { atomic_store(&carrier->is_held, false); }
 
 void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost) {
     atomic_store_explicit(&carrier->mirror_lost, lost, memory_order_relaxed);

@@ -1,4 +1,4 @@
-/* The carrier: receives datagrams, forwards them, and hands to Python what only Python can do.
+/* The carrier: receives datagrams, forwards them, and hands over to the publish thread what topics get.
  *
  * It executes a program: immutable arrays that router/carrier/program.py makes of a compiled table. All arrays belong to
  * the caller and must live until another program was adopted, the rings hold nothing that refers to them, and the receive
@@ -17,31 +17,10 @@
 #include "envelope.h"
 #include "ring.h"
 
-/* A target that gets its messages by a ring. */
-struct waiting {
-    uint32_t id;                            /* of the target, in events */
-    uint32_t waiting, queue_full, filtered; /* counters */
-};
-
-/* The targets of a route that one thread serves. */
-struct part {
-    struct ring *ring;
-    const struct targets *publishes; /* what the native thread does (publish.h); NULL for one of Python */
-    const uint8_t *const *wanted; /* flags, not 0 while somebody subscribes to a topic */
-    const struct waiting *targets;
-    uint32_t wanted_count, target_count;
-    uint32_t is_always_wanted;
-    uint32_t handler; /* as Python knows it */
-    uint32_t route;   /* in events */
-    uint32_t reserved;
-};
-
 struct route {
-    struct targets sends; /* destinations that the receive thread serves */
-    const struct part *parts;
-    uint32_t part_count;
+    struct targets sends;     /* destinations, which the receive thread serves */
+    struct targets publishes; /* topics, which the publish thread serves */
     uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
-    uint32_t reserved;
 };
 
 /* What a sender's messages of a payload case come to: the index of a route, or -1. */
@@ -94,21 +73,20 @@ struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
     struct timer_change timers;
-    uint32_t replaced_count;
-    uint32_t holds; /* receive nothing after the change before `carrier_resume`, for at most 1 s */
+    uint32_t replaced_count, reserved;
 };
 
-/* A message for a part, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
+/* A message for topics, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
 struct message_record {
     uint32_t size, generation;
-    const struct part *part;
+    const struct targets *to;
     int64_t received_at;  /* wall clock */
     int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct born */
     uint32_t column;      /* of the sender */
     uint32_t is_single;   /* the payload is the only field */
     uint32_t length;      /* of the datagram */
     uint32_t start, payload_length; /* of the payload, where it is the only field */
-    uint32_t handler;
+    uint32_t reserved;
 };
 
 /* A received datagram in the mirror, once it is decided what becomes of it. Up to MAX_DATAGRAM + 1 bytes follow, as they
@@ -127,8 +105,8 @@ enum { ROUTED = -1, STRANGER = -1 };
 struct carrier;
 
 /* Open a carrier that counts in `counters`, and writes losses and rejections to `events`: nobody else writes to either.
- * NULL for lack of memory. */
-struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events);
+ * `published` gets the messages for topics. NULL for lack of memory. */
+struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published);
 
 /* Start the threads. Return 0, or an errno. */
 int carrier_start(struct carrier *carrier, const struct change *first);
@@ -139,7 +117,6 @@ void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval);
 /* Adopt another program between two datagrams; return when that is done. Listeners that it does not have are emptied
  * before. To be called while the receive thread runs. */
 void carrier_change(struct carrier *carrier, const struct change *change);
-void carrier_resume(struct carrier *carrier);
 
 /* Show received datagrams in `mirror` from now on; NULL for none. `lost` is the counter of those that had no room. */
 void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost);

@@ -16,7 +16,7 @@ struct carrier {
     _Atomic(struct ring *) mirror;
     _Atomic uint32_t mirror_lost; /* counter */
     _Atomic(const struct change *) next, adopted;
-    _Atomic bool is_held, is_stopping, is_closing;
+    _Atomic bool is_stopping, is_closing;
     _Atomic uint64_t turns;
     _Atomic int64_t pulse; /* when Python was alive, monotonic */
     /* Of the timer thread: */

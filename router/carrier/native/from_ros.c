@@ -45,7 +45,7 @@ static void serve_message(struct from_ros *thread, const struct ros_topic *topic
     taken.published_at = info->source_timestamp;
     taken.arrived_at = info->received_timestamp;
     taken.publisher = find_publisher(&thread->routing, info->publisher);
-    route_ros_message(&thread->routing, topic, &taken);
+    if (is_new(taken.publisher, info->publication_sequence_number)) route_ros_message(&thread->routing, topic, &taken);
 }
 
 /* ---- the middleware ---- */

@@ -104,16 +104,17 @@ static const struct waiting_datagram *take_off(struct pacer *pacer, struct lane 
     return taken;
 }
 
-static void send_first(struct timers *timers, struct pacer *pacer, struct lane *lane, int64_t now) {
+/* Send the first datagram, or drop it if it has expired. Return whether it was sent. */
+static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *lane, int64_t now) {
     const struct waiting_datagram *first = take_off(pacer, lane);
     const struct route_target *of = first->of;
     if (now > first->expires) {
         lose_stale(timers->stage, of->to, of->target, now);
-        limit_savings(pacer, now);
-        return;
+        return false;
     }
     pacer->paid_at += first->cost;
     deliver_now(timers->stage, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);
+    return true;
 }
 
 static void send_affordable(struct timers *timers, struct pacer *pacer, int64_t now) {
@@ -129,7 +130,7 @@ static void send_affordable(struct timers *timers, struct pacer *pacer, int64_t 
                 if (first->expires != NEVER && first->expires + 1 < pacer->timer.due) pacer->timer.due = first->expires + 1;
                 return;
             }
-            send_first(timers, pacer, lane, now);
+            if (!send_first(timers, pacer, lane, now)) limit_savings(pacer, now);
         }
     }
 }
@@ -192,6 +193,7 @@ void pacer_release(struct timers *timers, struct pacer *pacer, const struct rout
             }
         }
     }
+    limit_savings(pacer, now);
 }
 
 struct pacer *pacer_open(int64_t bandwidth) {

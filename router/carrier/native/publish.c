@@ -14,7 +14,6 @@ struct publish_thread {
     pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
     pthread_cond_t changed;
     bool has_ended, is_left; /* under the lock */
-    uint32_t held;           /* likewise: a generation, or 0 */
     struct publish_change *changes; /* likewise: those that it has not reached, in order */
     _Atomic bool is_stopping;
     _Atomic uint32_t latest; /* generation */
@@ -85,7 +84,7 @@ static void serve_timers(struct publish_thread *thread) {
     edition_end(&thread->edition);
 }
 
-/* Go on to a generation, unless it was reached, and wait there while it is held. */
+/* Go on to a generation, unless it was reached. */
 static void reach(struct publish_thread *thread, uint32_t generation) {
     if (generation <= atomic_load(&thread->generation)) return;
     while (!thread->is_left && thread->changes && thread->changes->generation <= generation) {
@@ -96,8 +95,6 @@ static void reach(struct publish_thread *thread, uint32_t generation) {
         edition_end(&thread->edition);
     }
     atomic_store(&thread->generation, generation);
-    while (thread->held && thread->held <= generation && !atomic_load(&thread->is_stopping))
-        pthread_cond_wait(&thread->changed, &thread->lock);
 }
 
 /* Serve what was taken. Return false if the thread was left meanwhile. */
@@ -201,13 +198,6 @@ bool publish_has_reached(struct publish_thread *thread, uint32_t generation) {
     return atomic_load(&thread->generation) >= generation;
 }
 
-void publish_hold(struct publish_thread *thread, uint32_t generation) {
-    pthread_mutex_lock(&thread->lock);
-    thread->held = generation;
-    pthread_cond_broadcast(&thread->changed);
-    pthread_mutex_unlock(&thread->lock);
-}
-
 int64_t publish_since(struct publish_thread *thread, uint32_t *topic) {
     int64_t since = atomic_load_explicit(&thread->since, memory_order_acquire);
     *topic = atomic_load_explicit(&thread->topic, memory_order_relaxed);
@@ -219,7 +209,6 @@ bool publish_stop(struct publish_thread *thread) {
     atomic_store(&thread->is_stopping, true);
     ring_wake(thread->ring);
     pthread_mutex_lock(&thread->lock);
-    pthread_cond_broadcast(&thread->changed); /* if it is held */
     while (!thread->has_ended && !pthread_cond_timedwait(&thread->changed, &thread->lock, &until)) {}
     bool has_ended = thread->has_ended;
     thread->is_left = !has_ended;

@@ -13,7 +13,7 @@
 
 struct publish_thread;
 
-/* Start a thread that serves what comes into `ring`, where each message's part has targets to publish to. It counts in
+/* Start a thread that serves what comes into `ring`, which are messages for topics. It counts in
  * `counters`, and losses go to `events`. NULL for lack of memory, descriptors or threads. */
 struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
                                     error_function *error, reset_function *reset);
@@ -33,10 +33,6 @@ void publish_advance(struct publish_thread *thread, uint32_t generation);
 
 /* Whether the thread uses nothing of earlier generations any more. */
 bool publish_has_reached(struct publish_thread *thread, uint32_t generation);
-
-/* Have the thread serve nothing of that generation or a later one until this is called with 0: others serve first what
- * belongs in front. */
-void publish_hold(struct publish_thread *thread, uint32_t generation);
 
 /* The topic in whose publisher the thread is now, by its id, and since when (monotonic); 0 if in none. */
 int64_t publish_since(struct publish_thread *thread, uint32_t *topic);

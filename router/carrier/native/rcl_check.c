@@ -21,11 +21,12 @@ bool rcl_types_differ(void) {
            DIFFER(struct allocator, state, rcutils_allocator_t, state) ||
            DIFFER(struct message_info, source_timestamp, rmw_message_info_t, source_timestamp) ||
            DIFFER(struct message_info, received_timestamp, rmw_message_info_t, received_timestamp) ||
+           DIFFER(struct message_info, publication_sequence_number, rmw_message_info_t, publication_sequence_number) ||
            DIFFER(struct message_info, publisher, rmw_message_info_t, publisher_gid.data) ||
            (int)GID_SIZE != RMW_GID_STORAGE_SIZE || sizeof(struct serialized_message) != sizeof(rcutils_uint8_array_t) ||
            sizeof(struct message_info) < sizeof(rmw_message_info_t) ||
            sizeof(struct error_text) != sizeof(rcutils_error_string_t) ||
-           (int)TAKE_FAILED != RCL_RET_SUBSCRIPTION_TAKE_FAILED;
+           (int)TAKE_FAILED != RCL_RET_SUBSCRIPTION_TAKE_FAILED || NO_NUMBER != RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED;
 }
 #else
 bool rcl_types_differ(void) { return false; }

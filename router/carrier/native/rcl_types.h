@@ -27,6 +27,7 @@ struct serialized_message {
 };
 
 enum { GID_SIZE = 16 };
+#define NO_NUMBER UINT64_MAX /* RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED */
 
 /* rmw_message_info_t begins like this. Times of the wall clock, 0 where the middleware does not know. */
 struct message_info {

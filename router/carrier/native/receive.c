@@ -16,7 +16,6 @@ enum {
     MOST_DRAINED = 1 << 16,    /* datagrams: more than a receive buffer holds */
     LISTENERS_PER_WAIT = 16,
 };
-static const int64_t LONGEST_HOLD = 1000000000;
 
 /* ---- the mirror ---- */
 
@@ -127,15 +126,6 @@ static bool has_listener(const struct program *program, int fd) {
     return false;
 }
 
-static void wait_for_resume(struct carrier *carrier) {
-    int64_t until = monotonic_ns() + LONGEST_HOLD;
-    while (atomic_load(&carrier->is_held) && monotonic_ns() < until) {
-        serve_due(carrier);
-        usleep(200);
-    }
-    atomic_store(&carrier->is_held, false);
-}
-
 static void adopt(struct carrier *carrier, const struct change *change) {
     const struct program *earlier = carrier->routing.program;
     if (earlier)
@@ -145,16 +135,13 @@ static void adopt(struct carrier *carrier, const struct change *change) {
     for (uint32_t index = 0; index < change->program->listener_count; index++)
         setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
     route_by(&carrier->routing, change);
-    if (change->holds) atomic_store(&carrier->is_held, true);
     atomic_store(&carrier->adopted, change);
 }
 
 /* Adopt the next program if there is one. The caller must not use the earlier one any more: its memory may go. */
 static void adopt_next(struct carrier *carrier) {
     const struct change *next = atomic_exchange(&carrier->next, NULL);
-    if (!next) return;
-    adopt(carrier, next);
-    wait_for_resume(carrier);
+    if (next) adopt(carrier, next);
 }
 
 static bool is_stopping(struct carrier *carrier) {

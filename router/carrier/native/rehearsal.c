@@ -10,7 +10,7 @@ struct rehearsal {
     struct ros_routing ros;
     struct stage publishing, timing; /* of what topics get, and of what is due */
     struct timers *timers, *holding; /* of destinations, and of topics */
-    struct ring *ring, *events;
+    struct ring *events;
     const struct ros_topic *topics;
     int64_t now, ahead;   /* boot clock; how far the wall clock is ahead of it */
     int64_t noted_at;     /* the time that the records have reached */
@@ -105,7 +105,6 @@ static bool open_stage(struct rehearsal *rehearsal, struct stage *stage, counter
 struct rehearsal *rehearsal_open(counter *counters, struct ring *ring, int64_t now) {
     struct rehearsal *rehearsal = calloc(1, sizeof *rehearsal);
     if (!rehearsal) return NULL;
-    rehearsal->ring = ring;
     rehearsal->now = rehearsal->noted_at = now;
     rehearsal->events = ring_open(1 << 16);
     rehearsal->timers = timers_open_on(&rehearsal->timing);
@@ -115,6 +114,7 @@ struct rehearsal *rehearsal_open(counter *counters, struct ring *ring, int64_t n
     for (size_t index = 0; index < sizeof stages / sizeof *stages; index++)
         is_open &= open_stage(rehearsal, stages[index], counters);
     rehearsal->publishing.timers = rehearsal->holding;
+    rehearsal->routing.published = ring;
     if (is_open) return rehearsal;
     rehearsal_close(rehearsal);
     return NULL;
@@ -139,7 +139,7 @@ struct timers *rehearsal_timers(struct rehearsal *rehearsal) { return rehearsal-
 /* What the thread does that publishes. */
 static void publish_waiting(struct rehearsal *rehearsal) {
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
-    for (size_t size; (size = ring_take(rehearsal->ring, records, sizeof records, 0));)
+    for (size_t size; (size = ring_take(rehearsal->routing.published, records, sizeof records, 0));)
         for (size_t at = 0; at < size;) {
             const struct message_record *record = (const struct message_record *)(records + at);
             route_to_topics(&rehearsal->publishing, record);

@@ -35,7 +35,7 @@ struct left_record {
 
 struct rehearsal;
 
-/* Open a stage that counts in `counters`, at this time of the boot clock. `ring` is what parts with topics have. Returns
+/* Open a stage that counts in `counters`, at this time of the boot clock. `ring` is for what goes to topics. Returns
  * NULL for lack of memory or descriptors. */
 struct rehearsal *rehearsal_open(counter *counters, struct ring *ring, int64_t now);
 void rehearsal_close(struct rehearsal *rehearsal); /* when it has no timer left */

@@ -36,36 +36,38 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
     deliver_to_all(&routing->stage, to, &message);
 }
 
-static bool is_wanted(const struct part *part) {
-    if (part->is_always_wanted) return true;
-    for (uint32_t index = 0; index < part->wanted_count; index++)
-        if (__atomic_load_n(part->wanted[index], __ATOMIC_RELAXED)) return true;
+static bool is_wanted(const struct targets *to) {
+    if (to->collect) return true; /* a frame is counted also while nobody subscribes */
+    for (uint32_t index = 0; index < to->count; index++)
+        if (__atomic_load_n(to->targets[index].topic->wanted, __ATOMIC_RELAXED)) return true;
     return false;
 }
 
-static void drop_oldest(struct routing *routing, struct ring *ring, int64_t now) {
+static void drop_oldest(struct routing *routing, int64_t now) {
     struct message_record oldest;
-    if (!ring_drop(ring, &oldest, sizeof oldest)) return;
-    for (uint32_t index = 0; index < oldest.part->target_count; index++) {
-        const struct waiting *target = &oldest.part->targets[index];
+    if (!ring_drop(routing->published, &oldest, sizeof oldest)) return;
+    for (uint32_t index = 0; index < oldest.to->count; index++) {
+        const struct target *target = &oldest.to->targets[index];
+        uint32_t dropped = target->dropped[LOSS_QUEUE_FULL];
         stage_count(&routing->stage, target->waiting, -1);
-        stage_count(&routing->stage, target->queue_full, 1);
-        struct lost_event lost = {.route = oldest.part->route, .topic = NO_NAME, .target = target->id,
-                                  .reason = LOSS_QUEUE_FULL, .counter = target->queue_full};
+        stage_count(&routing->stage, dropped, 1);
+        struct lost_event lost = {.route = oldest.to->route, .topic = NO_NAME, .target = target->id,
+                                  .reason = LOSS_QUEUE_FULL, .counter = dropped};
         report_loss(&routing->stage.reporter, now, &lost, "");
     }
 }
 
-static void hand_over(struct routing *routing, const struct part *part, const struct received *received) {
-    if (!is_wanted(part)) {
-        for (uint32_t index = 0; index < part->target_count; index++)
-            stage_count(&routing->stage, part->targets[index].filtered, 1);
+/* Have the publish thread deliver to topics, if anybody subscribes to one of them. */
+static void hand_over(struct routing *routing, const struct targets *to, const struct received *received) {
+    if (!is_wanted(to)) {
+        for (uint32_t index = 0; index < to->count; index++)
+            stage_count(&routing->stage, to->targets[index].filtered, 1);
         return;
     }
     struct message_record *record = (struct message_record *)routing->record;
     *record = (struct message_record){.size = padded_to_word(sizeof *record + received->envelope.size),
                                       .generation = routing->program->generation,
-                                      .part = part,
+                                      .to = to,
                                       .received_at = received->received_at,
                                       .now = received->now,
                                       .oldest = received->born.oldest,
@@ -74,12 +76,11 @@ static void hand_over(struct routing *routing, const struct part *part, const st
                                       .is_single = received->envelope.is_single,
                                       .length = received->envelope.size,
                                       .start = received->envelope.start,
-                                      .payload_length = received->envelope.length,
-                                      .handler = part->handler};
+                                      .payload_length = received->envelope.length};
     memcpy(record + 1, routing->datagram, received->envelope.size);
-    for (uint32_t index = 0; index < part->target_count; index++)
-        stage_count(&routing->stage, part->targets[index].waiting, 1);
-    while (!ring_put(part->ring, record, record->size)) drop_oldest(routing, part->ring, received->now);
+    for (uint32_t index = 0; index < to->count; index++)
+        stage_count(&routing->stage, to->targets[index].waiting, 1);
+    while (!ring_put(routing->published, record, record->size)) drop_oldest(routing, received->now);
 }
 
 /* ---- routing ---- */
@@ -122,7 +123,7 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     received->route = chosen;
     stage_count(&routing->stage, entry->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
-    for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(routing, &chosen->parts[index], received);
+    if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
     counter_set(routing->stage.counters, chosen->last_message, received->received_at);
     return ROUTED;
 }
@@ -156,7 +157,7 @@ void route_by(struct routing *routing, const struct change *change) {
 }
 
 bool route_to_topics(struct stage *stage, const struct message_record *record) {
-    const struct targets *to = record->part->publishes;
+    const struct targets *to = record->to;
     struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};

@@ -1,5 +1,5 @@
-/* What a received datagram comes to: it is routed, sent to the destinations of its route, and handed over to the threads
- * that serve the route's topics; there it comes out of their ring again.
+/* What a received datagram comes to: it is routed, sent to the destinations of its route, and handed over to the thread
+ * that serves the route's topics; there it comes out of a ring again.
  *
  * Sockets, threads and clocks are the caller's: receive.c, publish.c, and rehearsal.c, which has none. */
 #ifndef ROUTE_H
@@ -19,6 +19,7 @@ struct routing {
     struct stage stage; /* first: what it calls is given this */
     const struct program *program;
     struct freshness freshness;
+    struct ring *published; /* gets messages for topics */
     /* A datagram, and the record that is made of it. Last, as they are large. */
     _Alignas(8) uint8_t datagram[MAX_DATAGRAM + 8];
     _Alignas(8) uint8_t record[MAX_DATAGRAM + 256];
@@ -47,7 +48,7 @@ int route_datagram(struct routing *routing, struct received *received);
 /* Adopt another program between two datagrams: deadmen pass from the earlier one to it, or end. */
 void route_by(struct routing *routing, const struct change *change);
 
-/* Deliver a message that `route_datagram` has put into the ring of a part with topics. Return false if the thread has been
+/* Deliver a message that `route_datagram` has put into the ring. Return false if the thread has been
  * given up (LEFT). */
 bool route_to_topics(struct stage *stage, const struct message_record *record);
 

@@ -85,9 +85,17 @@ struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t 
     struct ros_publisher *found = &routing->publishers[hash % MOST_PUBLISHERS];
     if (memcmp(found->gid, gid, GID_SIZE)) {
         memcpy(found->gid, gid, GID_SIZE);
+        found->number = 0;
         found->sent = found->stamped = INT64_MIN;
     }
     return found;
+}
+
+bool is_new(struct ros_publisher *publisher, uint64_t number) {
+    if (number == NO_NUMBER) return true;
+    if (number && number <= publisher->number) return false;
+    publisher->number = number;
+    return true;
 }
 
 void route_ros(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken) {

@@ -45,10 +45,12 @@ struct ros_topic {
 
 enum { MOST_PUBLISHERS = 64 };
 
-/* A publisher sends its messages in order. By the oldest readings of its last message's stamps: */
+/* A publisher numbers its messages, and sends them in order. Of its last one: the number, and the oldest readings of its
+ * stamps. */
 struct ros_publisher {
     uint8_t gid[GID_SIZE];
-    int64_t sent, stamped; /* INT64_MIN if it is not known */
+    uint64_t number;       /* 0 if it is not known, */
+    int64_t sent, stamped; /* INT64_MIN if these are not */
 };
 
 /* What a thread needs that routes messages from ROS. */
@@ -70,6 +72,10 @@ struct taken {
 
 /* Return what is known of a publisher. One with the same hash is forgotten. */
 struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid);
+
+/* Whether a message comes after the publisher's last one, as far as the middleware numbers them. Where one subscription
+ * takes over from another, both receive what comes meanwhile. */
+bool is_new(struct ros_publisher *publisher, uint64_t number);
 
 /* Deliver a message of a topic. */
 void route_ros_message(struct ros_routing *routing, const struct ros_topic *topic, const struct taken *taken);

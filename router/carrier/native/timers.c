@@ -96,7 +96,9 @@ void timers_note_due(struct timers *timers) {
     if (next < timers->timer_set_for) set_timer(timers, next);
 }
 
-void timers_await_next(struct timers *timers) { set_timer(timers, find_due(timers)); }
+void timers_await_next(struct timers *timers) {
+    if (!timers->is_left) set_timer(timers, find_due(timers));
+}
 
 void timers_add(struct timers *timers, struct timer *timer) {
     if (timer->is_listed) return;
@@ -128,7 +130,7 @@ void timers_serve(struct timers *timers, int64_t now) {
     pthread_mutex_lock(&timers->lock);
     for (struct timer *each = timers->first; each && !timers->is_left; each = each->next)
         if (each->due <= now) each->kind->serve(timers, each, now);
-    if (!timers->is_left) timers_await_next(timers);
+    timers_await_next(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 

@@ -16,8 +16,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
 static counter counters[COUNTERS];
 static struct limit limit = {1000, 500, -1000};
 static const uint8_t wanted = 1;
-static const uint8_t *const topics[] = {&wanted};
-static const struct waiting target = {1, WAITING, QUEUE_FULL, FILTERED};
+static const struct topic topic = {.wanted = &wanted};
+static const struct target published = {
+    .topic = &topic, .waiting = WAITING, .filtered = FILTERED, .dropped = {[LOSS_QUEUE_FULL] = QUEUE_FULL}};
 static struct sender nowhere = {.fd = -1};
 /* A condition on the first field that every payload may have. */
 static const struct node_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .node = NONE,
@@ -34,11 +35,10 @@ static const struct target destinations[] = {
                  [LOSS_SEND_ERROR] = FAILED}},
     {.sender = &nowhere, .condition = {condition, 3, 0}, .filtered = UNMET,
      .dropped = {[LOSS_MAPPING_ERROR] = REFUSED, [LOSS_STALE] = MET, [LOSS_SEND_ERROR] = MET}}};
-static struct part part = {.wanted = topics, .targets = &target, .wanted_count = 1, .target_count = 1};
 static const struct route only = {
     .sends = {.ttl = 1000000000, .layout = &layout, .sources = sources, .targets = destinations, .count = 2,
               .topic = NO_NAME},
-    .parts = &part, .part_count = 1,
+    .publishes = {.targets = &published, .count = 1},
     .last_message = LAST_MESSAGE, .duration = DURATION};
 static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
 static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
@@ -71,8 +71,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
         for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 3 + reason;
     }
     struct ring *events = ring_open(1 << 15);
-    part.ring = ring_open(1 << 15);
-    carrier = carrier_open(timers_open(counters, events), counters, events);
+    carrier = carrier_open(timers_open(counters, events), counters, events, ring_open(1 << 15));
     struct change first = {.program = &program};
     carrier_adopt_first(carrier, &first);
     carrier_mirror(carrier, ring_open(1 << 15), LOST);

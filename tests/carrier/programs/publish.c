@@ -1,6 +1,5 @@
 /* Programs replace each other without a pause while datagrams come as fast as they can and are published, by a middleware
- * that takes its time now and then, refuses, and is stuck at last. Generations are held and resumed, counters are read,
- * and all ends at some moment. Fails unless each topic gets its messages in order and from a program that is alive, and
+ * that takes its time now and then, refuses, and is stuck at last. Counters are read, and all ends at some moment. Fails unless each topic gets its messages in order and from a program that is alive, and
  * the counters balance; sanitizers see the rest. A program is freed as soon as nobody can use it. */
 #include "publish.h"
 
@@ -26,10 +25,6 @@ struct made {
     struct entry entry;
     struct payload_case only;
     struct route route;
-    struct part part;
-    struct waiting waiting[TOPICS];
-    const uint8_t *wanted[TOPICS];
-    struct targets publish;
     struct target targets[TOPICS];
     struct topic topics[TOPICS];
     struct node_field of_payload, of_envelope;
@@ -100,15 +95,13 @@ static uint32_t topic_counter(int topic, int which) { return (uint32_t)(TOPIC + 
 static void make_target(struct made *made, int index) {
     made->publishers[index] = (uint32_t)(ALIVE * TOPICS + index);
     made->topics[index] = (struct topic){&made->publishers[index], &wanted[index]};
-    made->wanted[index] = &wanted[index];
-    made->waiting[index] = (struct waiting){(uint32_t)index + 1, topic_counter(index, WAITING),
-                                            topic_counter(index, QUEUE_FULL), topic_counter(index, FILTERED)};
     made->targets[index] = (struct target){
         .topic = &made->topics[index], .message = {made->operations, 3, 0}, .id = (uint32_t)index + 1,
         .condition = {made->operations + 1, (uint32_t)index, 0}, .limit = index ? &limit : NULL,
         .delivered = topic_counter(index, PUBLICATIONS), .waiting = topic_counter(index, WAITING),
         .filtered = topic_counter(index, FILTERED)};
     for (int reason = 0; reason < LOSSES; reason++) made->targets[index].dropped[reason] = topic_counter(index, MAPPING);
+    made->targets[index].dropped[LOSS_QUEUE_FULL] = topic_counter(index, QUEUE_FULL);
     made->targets[index].dropped[LOSS_STALE] = topic_counter(index, STALE);
     made->targets[index].dropped[LOSS_RATE_LIMITED] = topic_counter(index, LIMITED);
     made->targets[index].dropped[LOSS_NON_FINITE] = topic_counter(index, NON_FINITE);
@@ -130,11 +123,9 @@ static struct made *make(const struct round *stage, uint32_t generation) {
     made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .literals = header,
                                    .slot_count = SLOTS};
     for (int index = 0; index < TOPICS; index++) make_target(made, index);
-    made->publish = (struct targets){.ttl = generation % 2 ? 0 : 5000000, .layout = &made->layout,
-                                     .sources = &made->source, .targets = made->targets, .count = TOPICS};
-    made->part = (struct part){.ring = stage->messages, .publishes = &made->publish, .wanted = made->wanted,
-                               .targets = made->waiting, .wanted_count = TOPICS, .target_count = TOPICS};
-    made->route = (struct route){.parts = &made->part, .part_count = 1, .last_message = LAST, .duration = DURATION};
+    struct targets publishes = {.ttl = generation % 2 ? 0 : 5000000, .layout = &made->layout, .sources = &made->source,
+                                .targets = made->targets, .count = TOPICS};
+    made->route = (struct route){.publishes = publishes, .last_message = LAST, .duration = DURATION};
     made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
     made->entry = (struct entry){0, ACCEPTED};
     made->listener = (struct listener){.fd = stage->socket, .entries = &made->entry, .columns = 1, .received = RECEIVED,
@@ -159,7 +150,6 @@ static struct made *replace_all(const struct round *stage, struct made *running)
     for (uint32_t generation = 2; generation <= PROGRAMS; generation++) {
         struct made *next = make(stage, generation);
         struct change change = {.program = &next->program};
-        if (generation % 3 == 0) publish_hold(stage->publishing, generation);
         carrier_change(stage->carrier, &change);
         publish_advance(stage->publishing, generation);
         __atomic_store_n(&wanted[0], generation % 5 != 0, __ATOMIC_RELAXED);
@@ -167,7 +157,6 @@ static struct made *replace_all(const struct round *stage, struct made *running)
         while (!publish_has_reached(stage->publishing, generation)) usleep(100);
         free_made(stage, running);
         running = next;
-        if (generation < PROGRAMS) publish_hold(stage->publishing, 0); /* the last one is held to the end */
     }
     return running;
 }
@@ -229,7 +218,7 @@ static void open_stage(struct round *stage) {
     stage->rejections = ring_open(1 << 12);
     stage->messages = ring_open(QUEUE);
     stage->timers = timers_open(stage->received, stage->rejections);
-    stage->carrier = carrier_open(stage->timers, stage->received, stage->rejections);
+    stage->carrier = carrier_open(stage->timers, stage->received, stage->rejections, stage->messages);
     stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
     check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
     stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget);
@@ -275,7 +264,6 @@ static void play(int round) {
     pthread_create(&watching, NULL, watch, &stage);
     struct made *last = replace_all(&stage, first);
     if (gets_stuck) {
-        publish_hold(stage.publishing, 0);
         __atomic_store_n(&wanted[0], 1, __ATOMIC_RELAXED);
         atomic_store(&is_stuck, true);
         while (!atomic_load(&inside)) usleep(100);

@@ -41,9 +41,8 @@ struct made {
     struct value defaults[SLOT_SOURCE + 1], sources[2];
     struct layout layout;
     struct operation condition;
-    struct part parts[ROUTES];
-    struct waiting waiting[ROUTES];
-    const uint8_t *wanted[1];
+    struct topic topic;
+    struct target topics[ROUTES];
     struct feed feed;
     bool has_been_left;  /* by the threads that take and command, */
     uint64_t turns;      /* when the receive thread had done so many turns */
@@ -140,15 +139,15 @@ static struct target make_destination(const struct made *made, int route, int to
 
 static void make_route(struct made *made, int index) {
     for (int to = 0; to < DESTINATIONS; to++) made->destinations[index][to] = make_destination(made, index, to);
-    made->waiting[index] = (struct waiting){7, route_counter(index, WAITING), route_counter(index, QUEUE_FULL),
-                                            route_counter(index, FILTERED)};
-    made->parts[index] = (struct part){.ring = messages, .wanted = made->wanted, .targets = &made->waiting[index],
-                                       .wanted_count = 1, .target_count = 1, .is_always_wanted = index == 0,
-                                       .handler = (uint32_t)index, .route = (uint32_t)index};
+    made->topics[index] = (struct target){.topic = &made->topic, .id = 7, .waiting = route_counter(index, WAITING),
+                                          .filtered = route_counter(index, FILTERED)};
+    made->topics[index].dropped[LOSS_QUEUE_FULL] = route_counter(index, QUEUE_FULL);
     struct targets sends = {.ttl = index ? 20000000 : 0, .layout = &made->layout, .sources = made->sources,
                             .targets = made->destinations[index], .count = DESTINATIONS, .route = (uint32_t)index,
                             .topic = NO_NAME};
-    made->routes[index] = (struct route){.sends = sends, .parts = &made->parts[index], .part_count = 1,
+    made->routes[index] = (struct route){.sends = sends,
+                                         .publishes = {.targets = &made->topics[index], .count = 1,
+                                                       .route = (uint32_t)index},
                                          .last_message = route_counter(index, LAST),
                                          .duration = route_counter(index, LAST + 1)};
     made->cases[index] = (struct payload_case){.number = (uint32_t)index + 1, .row = index, .unhandled = UNHANDLED_CASE};
@@ -165,7 +164,7 @@ static struct deadman *open_deadman(void) {
 static struct made *make(uint32_t generation) {
     struct made *made = calloc(1, sizeof *made);
     check(made, "memory");
-    made->wanted[0] = &wanted;
+    made->topic.wanted = &wanted;
     made->feed.deadman = open_deadman();
     made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
     made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
@@ -189,13 +188,10 @@ static void change(const struct made *next, const struct made *earlier) {
     struct deadman *replaced[] = {next->feed.deadman, earlier->feed.deadman};
     struct timer *ended[] = {(struct timer *)earlier->feed.deadman};
     struct change change = {.program = &next->program, .replaced = replaced, .replaced_count = 1,
-                            .timers = {.ended = ended, .ended_count = 1}, .holds = next->program.generation % 5 == 0};
+                            .timers = {.ended = ended, .ended_count = 1}};
     carrier_change(carrier, &change);
     atomic_store(&acting, next->feed.deadman);
     atomic_store(&latest, next->program.generation);
-    if (!change.holds) return;
-    usleep(300);
-    carrier_resume(carrier);
 }
 
 /* Whether nobody uses a program any more that another one has replaced. Until its next turn the receive thread may be
@@ -285,7 +281,7 @@ static void *send_commands(void *unused) {
     return unused;
 }
 
-/* Takes messages as a thread of Python does, and looks at the part of each, at times slowly. */
+/* Takes messages as the publish thread does, and looks at the targets of each, at times slowly. */
 static void *read_messages(void *unused) {
     static uint64_t records[2048];
     for (uint32_t turn = 0; !atomic_load(&has_ended) || ring_written(messages) != ring_taken(messages); turn++) {
@@ -293,7 +289,7 @@ static void *read_messages(void *unused) {
         size_t size = ring_take(messages, records, sizeof records, 1);
         for (size_t at = 0; at < size;) {
             const struct message_record *record = (const struct message_record *)(const void *)((char *)records + at);
-            check(record->part->handler == record->handler, "the part is alive");
+            check(record->to->targets->id == 7, "the targets are alive");
             check(record->generation >= atomic_load(&reader_at), "generations come in order");
             atomic_store(&reader_at, record->generation);
             atomic_fetch_add(&taken, 1);
@@ -339,9 +335,9 @@ static void check_balance(const int64_t *counts) {
                 if (which != SENT_BYTES) fates += counts[destination_counter(route, to, which)];
             check(fates == of_route, "each message to a destination is counted once");
         }
-        int64_t of_part = counts[route_counter(route, WAITING)] + counts[route_counter(route, QUEUE_FULL)] +
+        int64_t of_topic = counts[route_counter(route, WAITING)] + counts[route_counter(route, QUEUE_FULL)] +
                           counts[route_counter(route, FILTERED)];
-        check(of_part == of_route, "each message to Python is counted once");
+        check(of_topic == of_route, "each message for a topic is counted once");
         for (int cell = 0; cell < HISTOGRAM - 1; cell++) timed += counts[route_counter(route, LAST + 1 + cell)];
         check(timed == of_route, "each message is timed once");
     }
@@ -373,7 +369,7 @@ static void check_accounts(void) {
     check(waiting == atomic_load(&taken), "all that waited was taken");
     check(dropped > 0, "the queue was full at times");
     check(braked[TRIPS] > 0 && braked[BRAKES] > 0 && !braked[BRAKE_ERRORS], "brakes are sent");
-    printf("%lld datagrams for Python, %lld commands, %lld brakes\n", (long long)atomic_load(&taken),
+    printf("%lld datagrams for topics, %lld commands, %lld brakes\n", (long long)atomic_load(&taken),
            (long long)atomic_load(&commands), (long long)braked[BRAKES]);
 }
 
@@ -389,7 +385,7 @@ int main(int count, char **arguments) {
     int gone = bound(1);
     open_sender(BOARDS, address_of(gone));
     close(gone);
-    carrier = carrier_open(timers, counters, receive_events);
+    carrier = carrier_open(timers, counters, receive_events, messages);
     struct made *first = make(1);
     struct change start = {.program = &first->program};
     atomic_store(&acting, first->feed.deadman);

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from router.engine.binding import State
+from router.carrier.state import State
 
 
 def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from router.engine.wire import Wire, framed, wire_of_protos
+from router.datagrams import Wire, framed, wire_of_protos
 from router.errors import DecodeError, UsageError
 from router.values import payload
 
 
 @pytest.fixture(scope="module")
 def wire() -> Wire:
-    return wire_of_protos(Path(__file__).parents[1] / "protos")
+    return wire_of_protos(Path(__file__).parent / "protos")
 
 
 def test_an_envelope_comes_back_as_it_was_built(wire: Wire) -> None:

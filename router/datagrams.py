@@ -1,19 +1,23 @@
-"""Datagrams built from payloads and taken apart, one by one: for tools and rehearsals, not for the running router."""
+"""Datagrams built from payloads and taken apart, one by one: for tools and messages, not for the running routes."""
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
+from google.protobuf.unknown_fields import UnknownFieldSet
 
-from router.engine.slow_path import why_no_payload
 from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
 from router.table.model import RouteTable
 from router.types.framing import MAX_DATAGRAM, restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
+
+Peer = tuple[str, int]
+"""The IP address and port of a sender."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,3 +95,36 @@ def framed(exact: bytes, trim: bool, pad: int) -> bytes:
     if pad and len(sent) > pad:
         raise UsageError(f"the datagram has {len(sent)} bytes and cannot be padded to {pad}")
     return sent.ljust(pad, b"\0")
+
+
+def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool) -> str:
+    """Say in words what is wrong with a datagram of `length` bytes, of which `data` may be the beginning.
+
+    `repairs`: the listener puts back zeros. Of a datagram with a payload, return its case: no route takes that.
+    """
+    if length > MAX_DATAGRAM:
+        return f"{length} bytes"
+    if not data:
+        return ""
+    try:
+        outer = envelope.message_class.FromString(restored(data) if repairs else data)
+    except ProtobufError as error:
+        return str(error)
+    name = outer.WhichOneof(envelope.oneof)
+    if name is not None:
+        return str(name)
+    return why_no_payload(outer, {case.number for case in envelope.cases.values()})[1]
+
+
+def why_no_payload(envelope: Message, cases: Container[int]) -> tuple[str, str]:
+    """Return the reason why a parsed envelope has no payload, and the field that causes it, or "".
+
+    `cases` are the field numbers of the payload cases: one of them among the unknown fields has the wrong wire type.
+    """
+    fields = UnknownFieldSet(envelope)
+    numbers = [fields[index].field_number for index in range(len(fields))]
+    if not numbers:
+        return "no_payload", ""
+    if known := [number for number in numbers if number in cases]:
+        return "malformed", f"field {known[0]} is no message here"
+    return "unknown_case", f"field {numbers[0]}"

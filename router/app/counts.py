@@ -1,0 +1,75 @@
+"""What all threads have counted, whatever tables the router has had."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import cast
+
+from router.compiler.metrics import Counters
+from router.errors import StartError
+
+MOST_COUNTERS = 1 << 18
+"""Counters of each native thread: their addresses stay the same, so they cannot grow."""
+
+
+class ThreadCounts:
+    """What was counted since the start, whatever tables the router has had: a list of counts for each thread or lock.
+
+    `counters` are those of the running program and say what is counted at which index.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self.counters = counters
+        self.lists: list[list[int]] = []
+        self._copies: list[Callable[[int], list[int]]] = []
+        for _ in range(3):
+            self._add(counters.fresh_counts(), None)
+        self.gateways, self.events, self.own = self.lists
+
+    @staticmethod
+    def fixed() -> ctypes.Array[ctypes.c_int64]:
+        """Counts of a native thread: they never move."""
+        return (ctypes.c_int64 * MOST_COUNTERS)()
+
+    def add_fixed(
+        self, fixed: ctypes.Array[ctypes.c_int64], copy: Callable[[int], list[int]] | None = None
+    ) -> list[int]:
+        """Count in `fixed` too, and return it. `copy(size)` returns its beginning at a time at which it balances."""
+        counts = cast("list[int]", fixed)  # it is only indexed and sliced
+        self._add(counts, copy)
+        return counts
+
+    def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
+        self.counters.grow(counts)
+        self.lists.append(counts)
+        self._copies.append(copy or (lambda size: counts[:size]))
+
+    def copies(self, size: int) -> list[list[int]]:
+        """Return the first `size` counts, each list at one instant: between two messages, as far as that is known."""
+        return [copy(size) for copy in self._copies]
+
+    def total(self, metric: str) -> int:
+        """The sum of a counter over all its labels."""
+        indexes = [index for series, index in self.counters.series() if series.metric == metric]
+        return sum(counts[index] for counts in self.lists for index in indexes)
+
+    def make_room(self, counters: Counters) -> None:
+        """Add the counts of `counters`, which continue the present ones. Raises StartError."""
+        if counters.size > MOST_COUNTERS:
+            raise StartError(f"the table has {counters.size} counters, and there is room for {MOST_COUNTERS}")
+        present = dict(self.counters.series())
+        new = [index for series, index in counters.series() if series not in present]
+        for counts in self.lists:
+            counters.grow(counts)
+            for index in new:  # a program that was abandoned may have counted there
+                counts[index] = 0
+
+    def replace(self, counters: Counters) -> None:
+        """Adopt `counters`, once no thread counts by the earlier ones."""
+        counters.settle(self.lists)
+        self.adopt(counters)
+
+    def adopt(self, counters: Counters) -> None:
+        """As `replace`, while a thread may still count by the earlier ones, whose indexes stay taken."""
+        self.counters = counters  # from here on read by other threads, and no longer changed

@@ -1,0 +1,69 @@
+"""What of an envelope the router's parser in C cannot decide as protobuf does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterator
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+from router.errors import Code, Diagnostic, SourceSpan
+from router.types.descriptors import container
+from router.types.wire import delimited, parses
+
+MOST_TYPES = 65536
+
+Place = Callable[[str], SourceSpan]
+"""Of a message by its full name, or of a field."""
+
+_Found = tuple[str, str, str]
+"""The full name of a declaration, what is wrong with it, and what to do."""
+
+
+def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> list[Diagnostic]:
+    """Findings about an envelope and all types that it leads to. `cases` are the numbers of the payload cases."""
+    types = all_types(envelope)
+    found = [*_of_envelope(envelope, cases), *(each for descriptor in types for each in _of_type(descriptor))]
+    if len(types) > MOST_TYPES:
+        what = f"{envelope.full_name} leads to {len(types)} types of messages, and the router takes {MOST_TYPES}"
+        found.append((envelope.full_name, what, ""))
+    return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in found]
+
+
+def _of_envelope(envelope: Descriptor, cases: Container[int]) -> Iterator[_Found]:
+    """A field beside the payload may be unknown for its wire type only: that decides the reason of a rejection."""
+    for field in all_fields(envelope):
+        name = field.full_name
+        if field.number in cases and field.type == FieldDescriptor.TYPE_GROUP:
+            yield name, f"the payload case {field.name} is a group", "make it a message"
+        elif field.enum_type is not None and field.enum_type.is_closed:
+            yield name, f"{name} beside the payload is a closed enum", "make it an open one, or an integer"
+        elif field.message_type is not None and field.message_type.GetOptions().map_entry:
+            yield name, f"{name} beside the payload is a map", "move it into a payload"
+
+
+def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
+    if descriptor.GetOptions().message_set_wire_format:
+        yield descriptor.full_name, f"{descriptor.full_name} is a message set", "declare an ordinary message"
+    for field in all_fields(descriptor):
+        is_group = field.type == FieldDescriptor.TYPE_GROUP
+        if is_group and not parses(container(field), delimited(field.number, b"\xff")):
+            what = f"protobuf before 7.36 takes {field.full_name}, a group, for a message"
+            yield field.full_name, what, "make it a message"
+
+
+def all_types(envelope: Descriptor) -> dict[Descriptor, int]:
+    """The envelope and all types that its fields lead to, each with a number; the envelope's is 0."""
+    indexes, pending = {envelope: 0}, [envelope]
+    while pending:
+        for field in all_fields(pending.pop()):
+            if field.message_type is not None and field.message_type not in indexes:
+                indexes[field.message_type] = len(indexes)
+                pending.append(field.message_type)
+    return indexes
+
+
+def all_fields(descriptor: Descriptor) -> Iterator[FieldDescriptor]:
+    """The fields of a message and the extensions that its pool knows: protobuf parses both alike."""
+    yield from descriptor.fields
+    if descriptor.is_extendable:
+        yield from descriptor.file.pool.FindAllExtensions(descriptor)
