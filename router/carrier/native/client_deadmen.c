@@ -16,7 +16,7 @@ struct client_deadmen {
     pthread_t thread;
     pthread_cond_t changed;
     bool has_started, has_stopped; /* of whoever starts and stops the thread */
-    bool has_ended, is_left;       /* under the lock of the group */
+    bool has_ended;                /* under the lock of the group */
     int wake;                      /* eventfd */
     _Atomic bool is_stopping;
     _Atomic uint32_t latest; /* generation */
@@ -67,7 +67,7 @@ static void publish_message(struct client_deadmen *of, struct timer *from) {
     }
     pthread_mutex_lock(&of->group->lock);
     atomic_store_explicit(&of->since, 0, memory_order_relaxed);
-    if (!of->is_left) deadman_settle(of->group, from, &of->to, error ? why.text : NULL, boottime_ns());
+    if (!of->group->is_left) deadman_settle(of->group, from, &of->to, error ? why.text : NULL, boottime_ns());
 }
 
 static struct timer *find_due(const struct timers *group, int64_t now) {
@@ -80,7 +80,7 @@ static struct timer *find_due(const struct timers *group, int64_t now) {
 static void serve_all(struct client_deadmen *of) {
     int64_t now = boottime_ns();
     struct timer *due;
-    while (!of->is_left && (due = find_due(of->group, now))) {
+    while (!of->group->is_left && (due = find_due(of->group, now))) {
         due->kind->serve(of->group, due, boottime_ns());
         if (of->has_message) publish_message(of, due);
     }
@@ -111,7 +111,7 @@ static void *run(void *argument) {
         bool is_stopping = atomic_load(&of->is_stopping);
         if (is_stopping) end_all(of);
         serve_all(of);
-        if (of->is_left || is_stopping) break;
+        if (of->group->is_left || is_stopping) break;
         atomic_store(&of->generation, latest);
         wait_for_more(of);
     }
@@ -170,14 +170,14 @@ int64_t client_deadmen_since(struct client_deadmen *of, uint32_t *topic) {
 
 bool client_deadmen_stop(struct client_deadmen *of) {
     struct timespec until = patience();
-    if (!of->has_started || of->has_stopped) return !of->is_left;
+    if (!of->has_started || of->has_stopped) return !of->group->is_left;
     of->has_stopped = true;
     atomic_store(&of->is_stopping, true);
     wake_up(of);
     pthread_mutex_lock(&of->group->lock);
     while (!of->has_ended && !pthread_cond_timedwait(&of->changed, &of->group->lock, &until)) {}
     bool has_ended = of->has_ended;
-    of->is_left = !has_ended;
+    of->group->is_left = !has_ended;
     pthread_mutex_unlock(&of->group->lock);
     if (has_ended) pthread_join(of->thread, NULL);
     else pthread_detach(of->thread);
