@@ -29,7 +29,7 @@ class Watch:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._snapshots: deque[Snapshot] = deque(maxlen=int(WINDOW / PERIOD))
+        self._snapshots: deque[Snapshot] = deque()
         self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
@@ -40,6 +40,8 @@ class Watch:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
             earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
             seen = {name: self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
+            while self._snapshots and latest.at - self._snapshots[0].at > WINDOW + PERIOD / 2:
+                self._snapshots.popleft()
             snapshots = (*self._snapshots, latest)
             if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
                 self._snapshots.append(latest)
