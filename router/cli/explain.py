@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import is_coloured, print_findings
+from router.cli.findings import print_findings
 from router.cli.tool_options import add_table, seconds, table_path
 from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
@@ -15,7 +15,7 @@ from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
-from router.tools.listing import listed_route, python_of
+from router.tools.listing import listed_route
 
 _DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
 mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
@@ -95,19 +95,5 @@ def _diff(old: Path, new: Path) -> int:
 
 def _print_route(route: CheckedRoute, checked: Checked, program: Program, *, with_code: bool) -> None:
     code = listed_route(route, program) if with_code else ()
-    print(*explained_route(route, checked, program.executors), *code, sep="\n")
-    if with_code:
-        for source in python_of(route, program):
-            _print_python(source)
+    print(*explained_route(route, checked), *code, sep="\n")
     print()
-
-
-def _print_python(source: str) -> None:
-    print()
-    if is_coloured(sys.stdout):
-        from rich.console import Console
-        from rich.syntax import Syntax
-
-        Console().print(Syntax(source, "python", background_color="default"))
-    else:
-        print(source, end="")

@@ -12,7 +12,6 @@ from functools import cached_property
 from itertools import chain
 from types import CodeType
 
-from router.compiler.executors import Executors
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
 from router.compiler.namespace import NAMESPACE
@@ -186,11 +185,6 @@ class Program:
     lowered: Lowered
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
-
-    @property
-    def executors(self) -> Executors:
-        """Who serves which target."""
-        return self.lowered.executors
 
     @property
     def listeners(self) -> tuple[Listener, ...]:

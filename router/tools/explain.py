@@ -12,7 +12,6 @@ from time import sleep
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.executors import Executor, Executors
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.program import GatewayPlan, InboundPlan
@@ -47,8 +46,7 @@ _WIDEST_CELL = 48
 # Routes
 
 
-def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Executors) -> Iterator[str]:
-    """Targets that are not in `executed_by` are explained without their executor."""
+def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
     route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
     assert table is not None  # noqa: S101 - a table without errors is one
     assert envelope is not None  # noqa: S101 - and has one
@@ -65,10 +63,8 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
         yield ""
         if served.topic:
             yield from _topic(served, served.topic, route)
-            yield from _executor(executed_by.get((route.name, served.label, None)))
         else:
             yield from _destination(served, checked, everything, "unchanged")
-            yield from _executor(executed_by.get((route.name, None, served.label)))
     for feed in checked.subscriptions:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
@@ -78,7 +74,6 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
         for served in feed.targets:
             yield ""
             yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
-            yield from _executor(executed_by.get((route.name, feed.topic.topic.value, served.label)))
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
@@ -130,13 +125,6 @@ def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Check
         yield f"    disarms the deadman of {', '.join(others)}"
     if checked.route.name in served.deadmen:
         yield "    feeds its own deadman" if others else "    feeds the deadman"
-
-
-def _executor(executor: Executor | None) -> Iterator[str]:
-    """What the carrier serves is not worth a word."""
-    if executor is not None and not executor.is_carrier:
-        place = f"  ({executor.span})" if executor.span else ""
-        yield f"    by Python: {executor.reason}{place}"
 
 
 def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
@@ -421,7 +409,7 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
     parts |= {f"listener {name}": _settings_lines(each) for name, each in table.listeners.items()}
     parts |= {f"endpoint {name}": _settings_lines(each) for name, each in table.endpoints.items()}
     for route in checked.routes:
-        parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked, {}))
+        parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
     for gateway in checked.gateways:
         parts[f"gateway {gateway.settings.name}"] = [
             *_comparable(explained_gateway(gateway, {})),

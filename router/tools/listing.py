@@ -15,7 +15,7 @@ from router.compiler.expressions import tree
 from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredTarget
 from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
 from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
-from router.compiler.program import Handler, Program, TargetPlan
+from router.compiler.program import Program
 from router.errors import plural
 
 _INDENT = "  "
@@ -24,7 +24,7 @@ _MOST_SHOWN = 16
 
 
 def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
-    """All code of a route: the programs of the carrier, and handlers of targets that need Python."""
+    """All code of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name
     for kind, routes in (("destination", lowered.conditions), ("topic", lowered.topics)):
@@ -45,20 +45,6 @@ def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
                     yield from _for_each(feed.for_each, feed.layout, next(iter(feed.targets.values())))
                 for target in feed.targets.values():
                     yield from _target("destination", target, feed.layout)
-
-
-def python_of(checked: CheckedRoute, program: Program) -> Iterator[str]:
-    """The functions of the targets that need Python."""
-    for handler in program.handlers:
-        if handler.route == checked.route.name and (by_python := _by_python(handler, program)):
-            yield handler.part(by_python).source.text()
-
-
-def _by_python(handler: Handler, program: Program) -> list[TargetPlan]:
-    def place(target: TargetPlan) -> tuple[str, str | None, str | None]:
-        return (handler.route, target.label, None) if target.is_topic else (handler.route, handler.topic, target.label)
-
-    return [target for target in handler.targets if not program.executors[place(target)].is_carrier]
 
 
 # ---- what is read

@@ -114,21 +114,6 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_what_python_serves_is_told(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = explained(capsys, own)
-    lines = re.findall(r"^  (?:topic|destination) (\w+)|^    by (.*)$", told, re.MULTILINE)
-    assert [name or by for name, by in lines] == [
-        "e",
-        "radio",
-        "d",
-        "Python: `on_limit: latest` needs it  (table.yaml:15:15)",
-        "d",
-        "Python: it shares 'd' with newest, which needs Python  (table.yaml:15:15)",
-        "board",
-        "p",
-    ]
-
-
 def test_what_a_message_waits_for_is_told_behind_its_fields(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = explained(capsys, own, "newest")
     assert (
@@ -151,15 +136,6 @@ def test_what_is_checked_for_a_board_is_told(own: Path, capsys: pytest.CaptureFi
     assert f"\n    checked for the board: at most 62 bytes, no NaN or infinity, {bounds}\n" in told
     own.write_text(OWN.replace("kind: board}", "kind: board, allow_non_finite: true}"))
     assert f"bytes, NaN and infinity allowed, {bounds}\n" in explained(capsys, own, "order")
-
-
-def test_the_difference_of_two_tables_leaves_out_who_serves(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("old.yaml").write_text(OWN.replace("max_rate: 5 Hz, on_limit: latest, ", ""))
-    assert main(["explain", "--diff", "old.yaml", str(own)]) == OK
-    told = capsys.readouterr().out
-    assert "at most 5 Hz" in told
-    assert "Python" not in told
-    assert "route sharing" not in told
 
 
 def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_element(
@@ -196,13 +172,6 @@ def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
     assert "\n  topic x\n    # when  (" in out
     assert "\ndef " not in out
     assert "  ignored: not part of this test\n" in out
-
-
-def test_the_code_of_what_needs_python_is_python(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = explained(capsys, own, "--code")
-    assert "\ndef route_newest(" in out
-    assert "\n  topic p\n    # " in out
-    assert "def route_plain(" not in out
 
 
 def test_an_unknown_name_and_a_bad_table_are_told_instead(

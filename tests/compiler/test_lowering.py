@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from router.compiler import check_table
+from router.compiler import lowering as compiler_lowering
 from router.compiler.expressions import check
+from router.compiler.lookup import Definitions
 from router.compiler.lowering import layout, operations
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.layout import MOST_NODES_DEEP, ReadKind, ReadOperation
@@ -21,9 +24,13 @@ from router.errors import Code as FindingCode
 from router.types.model import Field, Float, Int, List, MessageType, String, Type
 from tests.carrier.evaluating import C
 from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
+from tests.compiler.conftest import CheckText
 from tests.compiler.payloads import made_wire, wire_of
 from tests.compiler.test_expressions import MODE
+from tests.tables import ROUTES
 
+ENDPOINTS = """{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation}, \
+tool: {address: 127.0.0.4:9000, kind: tool, trim_trailing_zeros: true}}"""
 HARD = Path(__file__).parents[1] / "carrier" / "protos"
 F32, F64, U8, I32, U32, I64, U64 = (
     Float(32), Float(64), Int(8, False), Int(32, True), Int(32, False), Int(64, True), Int(64, False)
@@ -375,3 +382,45 @@ def findings(name: str, target: MessageType) -> list[str]:
     except TooLargeError as error:
         return [error.diagnostic.message]
     return []
+
+
+# ---- what is lowered
+
+
+def test_targets_are_lowered_by_what_feeds_them(check_text: CheckText) -> None:
+    routes = """\
+        routes:
+          imu_info:
+            source: board
+            destinations: [base, {endpoint: tool, when: accel_x > 1}]
+            topics:
+              - {topic: a, type: std_msgs/msg/Float32, fields: {data: accel_x}}
+              - {topic: b, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 1 Hz, on_limit: latest}
+          ph_info: {source: board, destinations: [base]}
+          gps_info:
+            source: {topic: gps, type: std_msgs/msg/Float32}
+            destinations: [base, {endpoint: tool, fields: {altitude: data * 2}}]
+            fields: {altitude: data}
+    """
+    program = check_text(routes, endpoints=ENDPOINTS).program
+    assert program is not None
+    lowered = program.lowered
+    assert {route: list(each.targets) for route, each in lowered.conditions.items()} == {"imu_info": ["tool"]}
+    assert {route: list(each.targets) for route, each in lowered.topics.items()} == {"imu_info": ["a", "b"]}
+    (feed,) = lowered.from_ros["gps"]
+    assert (feed.route, list(feed.targets)) == ("gps_info", ["base", "tool"])
+
+
+def test_each_target_is_lowered_once(definitions: Definitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+    kind = compiler_lowering.LoweredTarget
+
+    def counted(label: str, condition: Code, message: Code, places: tuple[str, ...]) -> compiler_lowering.LoweredTarget:
+        made.append(places[-1])
+        return kind(label, condition, message, places)
+
+    monkeypatch.setattr(compiler_lowering, "LoweredTarget", counted)
+    program = check_table(ROUTES / "rover.yaml", {}, definitions).program
+    assert program is not None
+    assert made
+    assert len(made) == len(set(made))

@@ -1,7 +1,6 @@
 """From the routes of a table without errors to the programs that the carrier runs (`native/operations.h`).
 
-Each target is lowered once. A program that would be too large is a finding, also for a target that Python serves, so
-both planes refuse the same tables.
+Each target is lowered once. A program that would be too large is a finding.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.executors import Executors, executors, is_urgent
 from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.names import TooLargeError
@@ -19,6 +17,7 @@ from router.compiler.lowering.numbers import signs
 from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
 from router.compiler.lowering.sources import Collected, Datagram, Elements, RosMessage
 from router.errors import Diagnostic
+from router.table.model import Route
 from router.types.protobuf import Envelope
 
 
@@ -96,13 +95,12 @@ class LoweredFeed:
 
 @dataclass(frozen=True, slots=True)
 class Lowered:
-    """All that the carrier runs for a table; `executors` say who serves what.
+    """All that the carrier runs for a table.
 
     By route: `conditions` of its destinations from UDP that have one, and its `topics`. `from_ros` by topic, in the
     order of the table.
     """
 
-    executors: Executors
     conditions: Mapping[str, LoweredRoute]
     topics: Mapping[str, LoweredRoute]
     from_ros: Mapping[str, tuple[LoweredFeed, ...]]
@@ -111,17 +109,16 @@ class Lowered:
 def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Lowered, list[Diagnostic]]:
     """Lower all targets of a table without errors."""
     served = [checked for checked in routes if not checked.route.ignore]
-    table = _Table(envelope, executors(served))
+    table = _Table(envelope)
     for checked in served:
         table.add(checked)
     carried = {topic: tuple(feeds) for topic, feeds in table.from_ros.items()}
-    return Lowered(table.executors, table.conditions, table.topics, carried), table.findings
+    return Lowered(table.conditions, table.topics, carried), table.findings
 
 
 class _Table:
-    def __init__(self, envelope: Envelope, executors: Executors) -> None:
+    def __init__(self, envelope: Envelope) -> None:
         self.envelope = envelope
-        self.executors = executors
         self.conditions: dict[str, LoweredRoute] = {}
         self.topics: dict[str, LoweredRoute] = {}
         self.from_ros: dict[str, list[LoweredFeed]] = {}
@@ -131,28 +128,13 @@ class _Table:
         conditions = [target for target in checked.targets if not target.topic and target.when is not None]
         topics = [target for target in checked.targets if target.topic]
         for targets, lowered in ((conditions, self.conditions), (topics, self.topics)):
-            self._lower(checked, targets, lowered)
+            if targets and (made := self._route(checked, targets)) is not None:
+                lowered[checked.route.name] = made
         for feed in checked.subscriptions:
-            made = self._feed(checked, feed)
-            if made is not None and all(self._is_carried(checked, target, feed) for target in feed.targets):
-                self.from_ros.setdefault(feed.topic.topic.value, []).append(made)
-
-    def _is_carried(
-        self, checked: CheckedRoute, target: CheckedTarget, feed: CheckedSubscription | None = None
-    ) -> bool:
-        topic = feed.topic.topic.value if feed else target.label if target.topic else None
-        endpoint = None if target.topic else target.label
-        return self.executors[checked.route.name, topic, endpoint].is_carrier
+            if (fed := self._feed(checked, feed)) is not None:
+                self.from_ros.setdefault(feed.topic.topic.value, []).append(fed)
 
     # from UDP
-
-    def _lower(self, checked: CheckedRoute, targets: list[CheckedTarget], to: dict[str, LoweredRoute]) -> None:
-        carried = [target for target in targets if self._is_carried(checked, target)]
-        others = [target for target in targets if target not in carried]
-        if carried and (made := self._route(checked, carried)) is not None:
-            to[checked.route.name] = made
-        if others:
-            self._route(checked, others)
 
     def _route(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute | None:
         """Targets that share a layout; None with a finding."""
@@ -178,6 +160,11 @@ class _Table:
         except TooLargeError as error:
             self.findings.append(error.diagnostic)
             return None
+
+
+def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
+    """Whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
+    return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
 def _published_or_forwarded(source: Datagram, target: CheckedTarget, place: str) -> LoweredTarget:
