@@ -17,7 +17,7 @@ from router.carrier import structures as c
 from router.carrier.carrier import Carrier
 from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen
-from router.carrier.deferrals import timer_change
+from router.carrier.deferrals import Deferrals, NativeDeferral, timer_change
 from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
@@ -60,7 +60,7 @@ class Publisher:
 
 
 class Publishing:
-    """The receive thread and the one that publishes. All targets of `program` are topics without Python.
+    """The receive thread and the one that publishes. All targets of `program` are topics.
 
     `queue` is how many bytes may wait.
     """
@@ -104,7 +104,8 @@ class Publishing:
         self.thread.advance(generation)
 
     def _change_topics(self) -> None:
-        made, left = self._programs[-1], [each for each in self._state.left() if isinstance(each, NativeCollector)]
+        kinds = NativeCollector, NativeDeferral
+        made, left = self._programs[-1], [each for each in self._state.left() if isinstance(each, kinds)]
         timers = timer_change(made.adopted, [each.address for each in left])
         made.arrays.append(left)
         self._changes.append(c.PublishChange(timers=timers, generation=made.generation))
@@ -154,7 +155,7 @@ class Publishing:
             publications=self.publishers,
             feeds=lambda _route, _names: (),
             limit=self._limit,
-            deferral=lambda *_: None,
+            deferral=Deferrals(self._library, self._state, {}, self.publishers, {}).deferral,
             collector=partial(kept_collector, self._library, self._state),
             names=self._names,
         )

@@ -277,6 +277,92 @@ def test_books_are_read_while_a_publisher_is_stuck(opened: Open) -> None:
     whole.impede()
 
 
+# ---- what is held back
+
+HELD = f"""\
+  imu_info:
+    source: any
+    topics:
+      - {{topic: held, {_FLOAT}accel_x}}, max_rate: RATE, on_limit: latest}}
+      - {{topic: whole, type: std_msgs/msg/Int32, fields: {{data: round(accel_z)}}}}
+"""
+NEVER, SOON = HELD.replace("RATE", "0.001 Hz"), HELD.replace("RATE", "50 Hz")
+
+
+def held_of(publishing: Publishing) -> list[float]:
+    return [number(cdr) for cdr in publishing.publishers["held"].published()]
+
+
+def test_the_newest_that_is_held_is_published_when_it_may(opened: Open) -> None:
+    publishing = opened(SOON)
+    publishing.send(*(imu(float(turn)) for turn in range(20)))
+    wait_until(lambda: held_of(publishing)[-1:] == [19.0])
+    assert held_of(publishing) == sorted(held_of(publishing))
+    assert publishing.publishers["whole"].count == 20
+    check_books(publishing)
+
+
+def test_a_stop_publishes_what_is_held(opened: Open) -> None:
+    publishing = opened(NEVER)
+    publishing.send(imu(1.0), imu(2.0), imu(3.0))
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert held_of(publishing) == [1.0]
+    publishing.stop_receiving()
+    assert publishing.thread.stop()
+    assert held_of(publishing) == [1.0, 3.0]
+    check_books(publishing)
+
+
+def test_a_thread_that_is_stuck_with_what_was_held_is_left(opened: Open) -> None:
+    publishing = opened(SOON)
+    held, whole = publishing.publishers["held"], publishing.publishers["whole"]
+    publishing.send(imu(1.0))
+    wait_until(lambda: held.count == 1)
+    held.impede(is_stuck=True)
+    publishing.send(imu(2.0), imu(3.0))
+    wait_until(lambda: held.is_called)
+    publishing.stop_receiving()
+    assert not publishing.thread.stop()
+    before, many = publishing.ledger().counted(""), whole.count
+    held.impede()
+    wait_until(lambda: not held.is_called)
+    sleep(0.05)
+    assert publishing.ledger().counted("") == before
+    assert (held.count, whole.count) == (2, many)
+
+
+def test_what_is_held_goes_along_to_the_next_program(opened: Open) -> None:
+    publishing = opened(NEVER)
+    publishing.send(imu(1.0), imu(2.0))
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    for generation in (2, 3):
+        publishing.change(generation)
+        assert publishing.thread.wait_for(generation, 10)
+    assert held_of(publishing) == [1.0]
+    publishing.send(imu(3.0))
+    wait_until(lambda: publishing.count("messages_dropped", "imu_info", "held", "rate_limited") == 1)
+    publishing.stop_receiving()
+    publishing.thread.stop()
+    assert held_of(publishing) == [1.0, 3.0]
+    check_books(publishing)
+
+
+@pytest.mark.parametrize("later", [HELD.replace(", max_rate: RATE, on_limit: latest", ""), SOON])
+def test_what_the_next_program_does_not_hold_comes_before_its_own(opened: Open, tmp_path: Path, later: str) -> None:
+    publishing = opened(NEVER)
+    publishing.send(imu(1.0), imu(2.0))
+    whole = publishing.publishers["whole"]
+    whole.impede(is_stuck=True)
+    publishing.send(imu(3.0))
+    wait_until(lambda: whole.is_called)
+    publishing.change(2, program(tmp_path, later))
+    publishing.send(imu(4.0))  # behind messages of the earlier program, which the thread has not served
+    whole.impede()
+    wait_until(lambda: held_of(publishing)[-1:] == [4.0])
+    assert held_of(publishing) == [1.0, 3.0, 4.0]
+    check_books(publishing)
+
+
 # ---- generations
 
 
