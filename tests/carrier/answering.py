@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Sequence
+from itertools import count
+from typing import Any
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.expressions import Scope, check
 from router.compiler.lowering import LoweredFeed, LoweredRoute, lower_table
 from router.errors import Located
 from router.table.model import Destination, Route, Topic
-from tests.carrier.delivering import Delivering
-from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN
+from tests.carrier.delivering import Delivering, Outcome
+from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, written
 from tests.compiler.judging import Answer, Misfit, Plane, Question
 from tests.compiler.language import language_wire
 
 _ROUTE = "route"
+_TIMEOUT = 10
+"""Of frames, in ns."""
 
 
 def carrier_plane(functions: ctypes.CDLL) -> Plane:
     """Answers by what delivers to targets (delivering.c)."""
 
     def plane(asked: Question) -> Callable[[bytes], list[Answer]]:
-        carrier = Delivering(functions, _lowered(asked), RECEIVED_AT, SOURCE)
+        carrier = Delivering(functions, _lowered(asked), RECEIVED_AT, SOURCE, timeout=_TIMEOUT)
 
-        def answers(message: bytes) -> list[Answer]:
+        now = count(1, _TIMEOUT)
+
+        def answers(message: Any) -> list[Answer]:
+            if asked.language.is_frame:
+                return [outcome.got for outcome in _framed(carrier, message, next(now))]
             is_ros = asked.language.is_ros
             outcomes = carrier.from_ros(message) if is_ros else carrier.datagram(message, is_single=True)
             return [outcome.got for outcome in outcomes]
@@ -31,6 +41,21 @@ def carrier_plane(functions: ctypes.CDLL) -> Plane:
         return answers
 
     return plane
+
+
+def _collect(asked: Question) -> CheckedCollect:
+    scope = Scope(asked.source, asked.enums, ())
+    by, size, place = (check(written(text), scope) for text in ("0", "message.from", "message.in"))
+    return CheckedCollect(SPAN, by, size, place)
+
+
+def _framed(carrier: Delivering, payloads: Sequence[bytes], now: int) -> list[Outcome]:
+    """The outcomes of the frame of these payloads, which come in any order. The one before has been forgotten."""
+    shuffled = random.Random(payloads[0]).sample(payloads, len(payloads))
+    *earlier, last = (carrier.part(b"\0" + each, now, payload=(1, len(each))) for each in shuffled)
+    assert not any(earlier)
+    assert last is not None
+    return last
 
 
 def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
@@ -45,7 +70,8 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
     else:
         declared = topic if plan is not None else Destination(Located("endpoint", span), span)
         target = CheckedTarget(declared, type=asked.target, when=condition, plan=plan)
-        lowered, findings = lower_table([CheckedRoute(route, envelope.cases["source"], (target,))], envelope)
+        case, collect = envelope.cases["source"], _collect(asked) if asked.language.is_frame else None
+        lowered, findings = lower_table([CheckedRoute(route, case, (target,), collect=collect)], envelope)
     if findings:
         raise Misfit(findings)
     if asked.language.is_ros:

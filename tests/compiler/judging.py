@@ -1,8 +1,8 @@
 """The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
 
 A question is a mapping with a condition, from a payload to a ROS message or the other way, or a condition for a payload
-that is forwarded. A plane answers with bytes,
-FILTERED, or the reason of a refusal; with `for_each`, so for each element. The oracle gives what it may answer.
+that is forwarded. A plane answers with bytes, FILTERED, or the reason of a refusal; with `for_each`, so for each
+element. The oracle gives what it may answer. A message is bytes, or the payloads of a frame.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, NamedTuple, Union
 
 from google.protobuf.message import DecodeError
 
 from router.compiler.cdr import CdrReads, write_message
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.kinds import UINT32, BoolKind, element_of
+from router.compiler.expressions.kinds import UINT32, BoolKind, Kind, ListKind, MessageKind, element_of
 from router.compiler.expressions.lists import as_value
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
@@ -38,12 +39,13 @@ from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, writ
 from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
 from tests.oracles.reference import fill, fill_given
 from tests.oracles.reference_expressions import Context, meaning_of
-from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Refused, View, Whole
+from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Message, Refused, View, Whole
 from tests.oracles.reference_protobuf import envelope_of
 
 FILTERED = "filtered"
 Answer = Union[bytes, str]
-Plane = Callable[["Question"], Callable[[bytes], "list[Answer]"]]
+Sent = Union[bytes, tuple[bytes, ...]]
+Plane = Callable[["Question"], Callable[[Any], "list[Answer]"]]
 """Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
 
 _ABOUT_VALUES = {
@@ -87,6 +89,11 @@ def _element_names(for_each: Node) -> dict[str, Node]:
     return {name: Variable(kind, SPAN, name) for name, kind in ((ITEM, element), (INDEX, UINT32), (COUNT, UINT32))}
 
 
+def _frame_names(source: MessageType) -> dict[str, Node]:
+    kinds: dict[str, Kind] = {ITEMS: ListKind(MessageKind(source)), COUNT: UINT32}
+    return {name: Variable(kind, SPAN, name) for name, kind in kinds.items()}
+
+
 @dataclass(frozen=True, slots=True)
 class Question:
     language: Language
@@ -119,6 +126,8 @@ class Question:
             for_each = as_value(check(self.for_each, scope), scope) if self.for_each else None
             if for_each is not None:
                 scope = Scope(self.source, self.enums, (), _element_names(for_each))
+            elif self.language.is_frame:
+                scope = Scope(self.source, self.enums, (), _frame_names(self.source))
             condition = check(self.when, scope) if self.when else None
         except ExpressionError as error:
             raise Misfit([error.diagnostic]) from None
@@ -136,7 +145,8 @@ class Question:
         fields = ", ".join(f"{entry.path[-1]}: {entry.value}" for entry in self.fields.entries)
         types = ", ".join(str(self._type_of(entry.path[-1])) for entry in self.fields.entries)
         of = f"ros, for_each {self.language.for_each}" if self.language.for_each else "ros"
-        return f"{of if self.language.is_ros else 'udp'}: {{{fields}}} into {types}, when {self.when}"
+        from_udp = "frames" if self.language.is_frame else "udp"
+        return f"{of if self.language.is_ros else from_udp}: {{{fields}}} into {types}, when {self.when}"
 
     def _type_of(self, name: str) -> Type | None:
         field = self.target.field(name) if self.target else None
@@ -144,7 +154,7 @@ class Question:
 
 
 def question(noise: random.Random, language: Language) -> Question:
-    is_forwarded = not language.is_ros and noise.randrange(8) == 0
+    is_forwarded = not language.is_ros and not language.is_frame and noise.randrange(8) == 0
     when = None
     if is_forwarded or noise.randrange(4) == 0:
         when = written(language.text(noise, "b", noise.choice((1, 2, 3))))
@@ -153,7 +163,7 @@ def question(noise: random.Random, language: Language) -> Question:
     if language.is_ros:
         target, fields = language_wire()[1].cases["target"].type, protobuf_fields(noise)
     else:
-        target = ros_target(noise)
+        target = ros_target(noise, is_frame=language.is_frame)
         fields = [*target.fields[1:]]
     entries = [FieldEntry((each.name,), (SPAN,), language.filled(noise, each.type)) for each in fields]
     return Question(language, FieldMap(SPAN, False, tuple(entries)), when, target)
@@ -162,15 +172,35 @@ def question(noise: random.Random, language: Language) -> Question:
 # ---- messages, each with what the oracle sees of it
 
 
-def messages(noise: random.Random, language: Language) -> Iterator[tuple[bytes, View]]:
+def messages(noise: random.Random, language: Language) -> Iterator[tuple[Sent, View]]:
+    """Of a frame, what the oracle sees of its first payload."""
     if language.is_ros:
         for _ in range(10):
             value = ros_message(noise, language.source)
             yield cdr(language.source, as_written(value)), View(value, language.source)
         return
+    payloads = iter(some_payloads(language_wire()[1].cases["source"], noise.getrandbits(64)))
+    if not language.is_frame:
+        for payload in payloads:
+            yield payload, _view(payload)
+        return
+    while frame := [*islice(payloads, noise.choice((1, 2, 2, 3, 4)))]:
+        numbered = tuple(_numbered(payload, len(frame), place) for place, payload in enumerate(frame))
+        yield numbered, _view(numbered[0])
+
+
+def _view(payload: bytes) -> View:
     case = language_wire()[1].cases["source"]
-    for payload in some_payloads(case, noise.getrandbits(64)):
-        yield payload, View(case.message_class.FromString(payload), case.type)
+    return View(case.message_class.FromString(payload), case.type)
+
+
+def _numbered(payload: bytes, count: int, place: int) -> bytes:
+    """With the fields `from` and `in`, by which a plane may make frames."""
+    made: Any = language_wire()[1].cases["source"].message_class()
+    setattr(made, "from", count)
+    setattr(made, "in", place)
+    zero = b"\xe8\x01\x00" if place == 0 else b""  # it may stand in the payload
+    return payload + bytes(made.SerializeToString()) + zero
 
 
 # ---- the oracle
@@ -204,11 +234,15 @@ class Verdict:
             return False
 
 
-def oracle(asked: Question) -> Callable[[bytes, View], list[Verdict]]:
+def oracle(asked: Question) -> Callable[[Sent, View], list[Verdict]]:
     """What may be answered for a message, which the question is about. The compiler has accepted it."""
 
-    def judge(message: bytes, view: View) -> list[Verdict]:
+    def judge(message: Sent, view: View) -> list[Verdict]:
         context = context_of(view.message, view.type, asked.enums)
+        if isinstance(message, tuple):
+            items, of = [*map(_view, message)], Message(view.type)
+            count = (len(items), Whole(0, (1 << 32) - 1))
+            context = replace(context, names={ITEMS: (items, Listing(of)), COUNT: count})
         if asked.for_each is None:
             return [_verdict(asked, message, context)]
         meaning = meaning_of(asked.for_each, context)
@@ -228,12 +262,13 @@ def oracle(asked: Question) -> Callable[[bytes, View], list[Verdict]]:
     return judge
 
 
-def _verdict(asked: Question, message: bytes, context: Context) -> Verdict:
+def _verdict(asked: Question, message: Sent, context: Context) -> Verdict:
     schema, envelope = language_wire()
     try:
         if asked.when and not meaning_of(asked.when, context).give(context):
             return Verdict(None, frozenset([FILTERED]), asked.target)
         if asked.target is None:
+            assert isinstance(message, bytes)
             return Verdict(message, frozenset(), None)
         if asked.language.is_ros:
             payload = fill_given(asked.fields, asked.target, context)
@@ -284,7 +319,10 @@ def python_plane(asked: Question) -> Callable[[bytes], list[Answer]]:
             return _reason(error)
         return FILTERED if made is None else bytes(made)
 
-    def answers(data: bytes) -> list[Answer]:
+    def answers(data: Any) -> list[Answer]:
+        if isinstance(data, tuple):
+            items = [parse(payload) for payload in data]
+            return [answer(items[0], SOURCE, RECEIVED_AT, None, 0, len(items), items)]
         message = data if is_ros else parse(data), SOURCE, RECEIVED_AT
         if asked.target is None:
             return [data if answer(*message) == b"" else answer(*message)]
@@ -309,7 +347,7 @@ def _functions(asked: Question, checked: Checked) -> dict[str, Any]:
         if reads is not None:
             reads.write(out, SPAN)
         out.line(f"return {out.expression(render(checked.for_each, values)) if checked.for_each else '[]'}", SPAN)
-    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0):", SPAN):
+    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0, {ITEMS}=()):", SPAN):
         if reads is not None:
             reads.write(out, SPAN)
         if checked.condition is not None:
@@ -350,7 +388,9 @@ def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | N
         if not is_right:
             shown = " ".join(str(view.message).split())
             found = [answer.hex() if isinstance(answer, bytes) else answer for answer in answers]
-            return f"{asked}\n  is {found}\n  not {[*map(str, verdicts)]}\n  of {shown}\n  {message.hex()}"
+            sent = message if isinstance(message, tuple) else (message,)
+            as_hex = " ".join(each.hex() for each in sent)
+            return f"{asked}\n  is {found}\n  not {[*map(str, verdicts)]}\n  of {shown}\n  {as_hex}"
     return None
 
 

@@ -168,6 +168,20 @@ ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
 }  # fmt: skip
 """Lists for `for_each`, and what expressions see of their elements."""
 
+FRAME: Mapping[str, Sequence[str]] = {
+    "i": ("items[0].i32", "items[1].u64", "items[2].inner.value", "items[0].inners[1].value", "items[1].grade", "count",
+          "len(items)", "items[0].modes[0]", "items[2].left", "len(items[1].names)", "items[1].inner.many[0]"),
+    "f": ("items[0].f32", "items[1].f64", "items[2].third.ratio", "items[1].class"),
+    "b": ("items[1].flag", "has(items[0].inner)", "has(items[1].grade)", "has(items[2].opt)", "items[0].is"),
+    "s": ("items[0].name", "items[1].inner.in", "items[2].names[0]", "items[0].loose", "items[1].right"),
+    "t": (),
+    "I": ("items[0].i32s", "items[1].modes", "items[2].inner.many", "items[0].raw", "items[1].u64s"),
+    "F": ("items[1].f64s", "items[0].f32s"),
+    "B": ("items[1].flags",),
+    "S": ("items[1].names", "str(items[0].grades)"),
+}  # fmt: skip
+"""What expressions see of the payloads of a frame, beside the fields of the first one."""
+
 _INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
              1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
 _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18", "-2.5", "nan", "inf", "0.1")
@@ -177,13 +191,15 @@ _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18
 class Language:
     """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted.
 
-    `for_each` is one of ITEMS, or empty. `order` is that of the fields of a ROS message.
+    `for_each` is one of ITEMS, or empty. `order` is that of the fields of a ROS message. `is_frame`: several payloads
+    are one message.
     """
 
     is_ros: bool
     is_wild: bool = False
     for_each: str = ""
     order: int = 0
+    is_frame: bool = False
 
     @property
     def source(self) -> MessageType:
@@ -210,6 +226,8 @@ class Language:
             of_item: list[str] = [*ITEMS[self.for_each].get(kind, ()), *(("index", "count") if kind == "i" else ())]
             if of_item:
                 return noise.choice(of_item)
+        if self.is_frame and FRAME[kind] and noise.randrange(2):
+            return noise.choice(FRAME[kind])
         known: list[str] = [*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]]
         return noise.choice(known)
 
@@ -220,7 +238,7 @@ class Language:
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
 
     def _value(self, noise: random.Random, target: Type, depth: int) -> str:
-        return self._completed(noise, noise.choice(_filling(target)), depth)
+        return self._completed(noise, noise.choice(_of_frames(target) if self.is_frame else _filling(target)), depth)
 
     def _completed(self, noise: random.Random, template: str, depth: int) -> str:
         parts = template.split("{")
@@ -242,10 +260,10 @@ class Language:
 
 
 def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
-    """From UDP, from ROS, or from ROS for each element of a list."""
-    is_ros = noise.randrange(2) == 1
-    for_each = noise.choice([*ITEMS]) if is_ros and noise.randrange(3) == 0 else ""
-    return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS))
+    """From UDP, one by one or as a frame, from ROS, or from ROS for each element of a list."""
+    is_ros, has_more = noise.randrange(2) == 1, noise.randrange(3) == 0
+    for_each = noise.choice([*ITEMS]) if is_ros and has_more else ""
+    return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS), is_frame=has_more and not is_ros)
 
 
 def _bracketed(number: int) -> str:
@@ -278,6 +296,21 @@ def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
             return [_raised(template) for template in _filling(target.element)]
 
 
+def _of_frames(target: Type) -> Sequence[str]:
+    """Templates of what fills a type, in the topics of a frame."""
+    match target:
+        case MessageType() if target == PART:
+            return ("items[1]", "message", "items[0]")
+        case MessageType() if target == INNER:
+            return (*_filling(target), "items[1].inner", "items[0].inners[0]")
+        case List(MessageType() as of) if of == PART:
+            return ("items", "items", "[message, items[1]]")
+        case List(MessageType() as of) if of == INNER:
+            return (*_filling(target), "items[1].inners", "[items[1].inner, inner]")
+        case _:
+            return _filling(target)
+
+
 def _innermost(declared: Type) -> Type:
     return declared.element if isinstance(declared, List) else declared
 
@@ -298,9 +331,20 @@ _LISTS: Sequence[Type] = (
 )  # fmt: skip
 
 
-def ros_target(noise: random.Random) -> MessageType:
+PART = MessageType(
+    "made/msg/Part",
+    (Field("flag", Bool()), Field("i32", I32), Field("name", String()), Field("f64", F64), Field("inner", INNER),
+     Field("i64s", List(I64)), Field("inners", List(INNER)), Field("names", List(String())), Field("is", Bool())),
+)  # fmt: skip
+"""What a payload of a frame can fill as a whole."""
+
+_PARTS: Sequence[Type] = (PART, List(PART), List(PART), List(PART, 2), List(PART, None, 2))
+
+
+def ros_target(noise: random.Random, *, is_frame: bool = False) -> MessageType:
     """One to three fields, and one in front of them that shifts what is aligned."""
-    types = [noise.choice(_SCALARS if noise.randrange(2) else _LISTS) for _ in range(noise.choice((1, 1, 2, 3)))]
+    kinds = (_SCALARS, _LISTS, *([_PARTS] if is_frame else ()))
+    types = [noise.choice(noise.choice(kinds)) for _ in range(noise.choice((1, 1, 2, 3)))]
     return MessageType(
         "made/msg/Target", (Field("before", U8), *(Field(f"it_{place}", each) for place, each in enumerate(types)))
     )
