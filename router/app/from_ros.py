@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription
+from router.carrier.from_ros import FromRosThread, NativeFromRos, Subscription, forget_what_is_served
 from router.carrier.ring import Ring
 from router.errors import StartError
 from router.log import logger
@@ -77,12 +77,16 @@ class FromRos:
         if self._thread is None:
             return
         now, then = self._served, next_one.only(urgent=not self.is_urgent).messages.topics
-        kept = {topic: routes for topic, routes in now.messages.topics.items() if topic not in then}
+        moved = {topic: next_one.subscriptions[topic] for topic in now.messages.topics if topic in then}
+        forget_what_is_served(now.subscriptions, moved)
+        kept = {topic: routes for topic, routes in now.messages.topics.items() if topic not in moved}
         messages = NativeFromRos(kept, now.messages.urgent, now.messages.arrays)
         self._thread.serve(messages, {topic: now.subscriptions[topic] for topic in kept})
-        for topic in now.messages.topics.keys() & then.keys():
-            if (subscription := next_one.subscriptions[topic]) is not now.subscriptions[topic]:
-                subscription.take_all()  # which the earlier subscription has received as well
+
+    def follow(self, other: FromRos) -> None:
+        """Go on where the other thread has left topics."""
+        if self._thread is not None and other._thread is not None:
+            self._thread.follow(other._thread)
 
     def stay(self) -> None:
         """Undo `leave`."""

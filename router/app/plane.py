@@ -230,7 +230,9 @@ class Plane:
         clients = self.now.client_deadmen if self.now else {}
         self._client_deadmen.adopt(clients, built.client_deadmen, built.native.generation)
         self._publishing.advance(built.native.generation)
-        for thread in self._from_ros:  # after deadmen were replaced: a feed of the earlier ones acts on the next ones
+        # After deadmen were replaced: a feed of the earlier ones acts on the next ones.
+        for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
+            thread.follow(other)
             thread.serve(built.topics)
         self.now = built
 

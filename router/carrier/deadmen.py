@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 from router.carrier import structures as c
 from router.carrier.outlets import Names
@@ -12,14 +11,10 @@ from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Stale
-
-_NEVER = (1 << 63) - 1
-_STALE = -1
 
 
 class NativeDeadman:
-    """The deadman of one route, as `engine.deadman.Deadman`. `address` is that of its `struct deadman`."""
+    """The deadman of one route. `address` is that of its `struct deadman`."""
 
     def __init__(self, library: ctypes.CDLL, deadmen: int, address: int, plan: DeadmanPlan, keep: object) -> None:
         self.address = address
@@ -67,26 +62,6 @@ class Deadmen:
         outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}
         address = open_deadman(self._library, self.address, self._names, counters, plan, outlets)
         return NativeDeadman(self._library, self.address, address, plan, senders)
-
-    def command(
-        self, sender: NativeSender, feeds: Sequence[tuple[NativeDeadman, bool]]
-    ) -> Callable[[bytes, int | None], int]:
-        """Return what sends a command: it checks `expires`, sends, and feeds or disarms (True) deadmen, under the lock.
-
-        Returns the number of bytes sent; raises Stale, or OSError.
-        """
-        array = (c.Feed * len(feeds))(*(c.Feed(deadman.address, disarms) for deadman, disarms in feeds))
-        send, deadmen, to, count = self._library.command_send, self.address, sender.address, len(feeds)
-
-        def command(data: bytes, expires: int | None, _keep: object = (feeds, sender)) -> int:
-            error = send(deadmen, to, data, len(data), _NEVER if expires is None else expires, array, count)
-            if not error:
-                return len(data)
-            if error == _STALE:
-                raise Stale
-            raise OSError(error, os.strerror(error))
-
-        return command
 
 
 def open_deadman(

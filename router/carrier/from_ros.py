@@ -181,6 +181,12 @@ class FromRosThread:
         for subscription in eventfds.keys() - served.eventfds.keys():
             self._leave(subscription, eventfds[subscription])
 
+    def follow(self, other: FromRosThread) -> None:
+        """Go on where another thread has left subscriptions: what it has served is not served again."""
+        with self._in_use:
+            if self._address and other._address:
+                self._library.from_ros_follow(self._address, other._address)
+
     def stop(self) -> bool:
         """Serve what has arrived, and end.
 

@@ -57,6 +57,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "freshness_look": (None, (c_void_p, c_int64, c_int64)),
     "from_ros_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "from_ros_failures": (c_uint64, (c_void_p,)),
+    "from_ros_follow": (None, (c_void_p, c_void_p)),
     "from_ros_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_bool)),
     "from_ros_serve": (c_bool, (c_void_p, c_void_p)),
     "from_ros_stop": (c_bool, (c_void_p,)),

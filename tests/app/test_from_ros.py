@@ -44,6 +44,15 @@ CALCULATED = drive(
     fields='{distance_to_go: "float32(round(clamp(100 * distance_to_go, -700, 700)) // 100)"}',
     more=", when: turning_radius > 0.5",
 )
+UNHURRIED = f"""\
+  drive_motor:
+    source: {{topic: drive_motor, type: {TYPE}, queue_depth: 1000}}
+    fields: auto
+    destinations: [basestation]
+    deadman: {{none: for this test}}
+"""
+"""Served by the other thread."""
+
 NOBODY = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 
 
@@ -154,8 +163,8 @@ def test_each_is_sent_once_and_in_order_while_subscriptions_take_over(site: Site
     with site.router(drive()) as router:
         assert publisher.line() == "matched"
         with commands_coming(publisher) as sent:
-            for depth in (900, 1000, 900, 1000):
-                site.write(drive(depth=depth))
+            for table in (drive(depth=900), UNHURRIED, drive(depth=900), UNHURRIED, drive()):
+                site.write(table)
                 assert router.reload().ok
         assert numbers(site, sent[-1]) == sent
 

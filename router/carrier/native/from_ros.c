@@ -204,6 +204,17 @@ bool from_ros_serve(struct from_ros *thread, const struct ros_set *set) {
     return is_adopted;
 }
 
+void from_ros_follow(struct from_ros *thread, struct from_ros *other) {
+    struct ros_publisher known[MOST_PUBLISHERS];
+    pthread_mutex_lock(&other->lock);
+    memcpy(known, other->routing.publishers, sizeof known);
+    pthread_mutex_unlock(&other->lock);
+    pthread_mutex_lock(&thread->lock);
+    for (int index = 0; index < MOST_PUBLISHERS; index++)
+        if (known[index].number) follow_publisher(&thread->routing, &known[index]);
+    pthread_mutex_unlock(&thread->lock);
+}
+
 bool from_ros_stop(struct from_ros *thread) {
     struct timespec until = patience();
     pthread_mutex_lock(&thread->lock);

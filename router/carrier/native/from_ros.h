@@ -35,6 +35,9 @@ void from_ros_unwatch(struct from_ros *thread, int eventfd);
  * thread is stuck in the middleware. */
 bool from_ros_serve(struct from_ros *thread, const struct ros_set *set);
 
+/* Go on where another thread has left subscriptions: what it has served is not served again. */
+void from_ros_follow(struct from_ros *thread, struct from_ros *other);
+
 /* Serve what has arrived, and end the thread. Returns false after 1 s: the thread is stuck in the middleware, and left
  * there with a subscription. Should it return, it ends; it uses nothing else of the caller's. */
 bool from_ros_stop(struct from_ros *thread);

@@ -98,6 +98,11 @@ bool is_new(struct ros_publisher *publisher, uint64_t number) {
     return true;
 }
 
+void follow_publisher(struct ros_routing *routing, const struct ros_publisher *known) {
+    struct ros_publisher *publisher = find_publisher(routing, known->gid);
+    if (publisher->number < known->number) *publisher = *known;
+}
+
 void route_ros(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken) {
     struct message message = {.now = taken->now, .is_read = true, .outcome = EVALUATED};
     struct machine *machine = &routing->stage.machine;

@@ -77,6 +77,9 @@ struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t 
  * takes over from another, both receive what comes meanwhile. */
 bool is_new(struct ros_publisher *publisher, uint64_t number);
 
+/* Go on from what is known of a publisher elsewhere. */
+void follow_publisher(struct ros_routing *routing, const struct ros_publisher *known);
+
 /* Deliver a message of a topic. */
 void route_ros_message(struct ros_routing *routing, const struct ros_topic *topic, const struct taken *taken);
 
