@@ -30,15 +30,9 @@ def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> li
 
 
 def _of_envelope(envelope: Descriptor, cases: Container[int]) -> Iterator[_Found]:
-    """A field beside the payload may be unknown for its wire type only: that decides the reason of a rejection."""
-    for field in all_fields(envelope):
-        name = field.full_name
+    for field in envelope.fields:
         if field.number in cases and field.type == FieldDescriptor.TYPE_GROUP:
-            yield name, f"the payload case {field.name} is a group", "make it a message"
-        elif field.enum_type is not None and field.enum_type.is_closed:
-            yield name, f"{name} beside the payload is a closed enum", "make it an open one, or an integer"
-        elif field.message_type is not None and field.message_type.GetOptions().map_entry:
-            yield name, f"{name} beside the payload is a map", "move it into a payload"
+            yield field.full_name, f"the payload case {field.name} is a group", "make it a message"
 
 
 def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
