@@ -34,7 +34,6 @@ PEERS = (
     ("192.168.0.60", 8003), ("192.168.0.81", 9000), ("192.168.0.99", 1), ("0.0.0.0", 0), ("255.255.255.255", 65535),
 )  # fmt: skip
 
-COLLECTS = False
 _SENDERS = ("sensor_board", "basestation", "left_tool", "right_tool", "picky", "recorder")
 _BOARDS = ("driving_board", "arm_board")
 _OTHERS = ("basestation", "recorder", "left_tool", "right_tool", "picky")
@@ -47,7 +46,8 @@ _FIELDS = {
     "manual_arm": (),
     "drive_diag": (),
 }
-_COMMANDS = ("manual_drive", "manual_arm")
+_INTEGERS = ("sensor_index", "turn", "forward_backward", "3")
+_COMMANDS = ("manual_drive", "manual_arm", "drive_motor", "arm_target", "arm_ctrl")
 _RATES = ("3 Hz", "12 Hz", "30 Hz", "47.5 Hz", "200 Hz")
 _TIMES = ("50ms", "120ms", "200ms", "1s")
 _BANDWIDTHS = ("300 B/s", "1kB/s", "2kB/s", "20kB/s", "1MB/s")
@@ -86,6 +86,8 @@ class Tables:
 
     def __init__(self, noise: random.Random) -> None:
         self._noise = noise
+        self._commanded: dict[str, list[str]] = {}  # which boards the routes with commands send to
+        self._sources: Sequence[str] = ()  # of the route that is made
 
     def table(self) -> RandomTable:
         return RandomTable(self._bandwidths(), dict(self._routes()))
@@ -110,64 +112,60 @@ class Tables:
         return self._noise.random() < probability
 
     def _routes(self) -> Iterator[tuple[str, str]]:
+        self._commanded = {
+            case: self._noise.sample(_BOARDS, self._noise.randrange(1, 3)) for case in _COMMANDS if self._chance(0.7)
+        }
         for case in _FIELDS:
-            if self._chance(0.75):
+            if case in self._commanded or (case not in _COMMANDS and self._chance(0.75)):
                 yield case, self._route(case)
         for case in _FROM_ROS:
-            if self._chance(0.5):
-                yield f"{case} from ROS", self._from_ros(case)
-        if COLLECTS and self._chance(0.4):
-            yield "collected", self._collected()
+            if case in self._commanded or (case not in _COMMANDS and self._chance(0.4)):
+                yield case, self._from_ros(case)
+        if self._chance(0.4):
+            yield "detected_object", self._collected()
         if self._chance(0.2):
             yield "ignored", "  arm_diag: {ignore: nobody wants it}\n"
 
     def _route(self, case: str) -> str:
-        if case in _COMMANDS:
-            return f"  {case}: {self._inbound(case, ['basestation', 'left_tool'], _BOARDS, ())}\n"
+        if case in self._commanded:
+            return f"  {case}: {self._inbound(case, ['basestation', 'left_tool'])}\n"
         if self._chance(0.3):
-            one, other = (
-                self._inbound(case, sources, _OTHERS, self._topics(case))
-                for sources in (["sensor_board"], ["left_tool", "picky"])
-            )
+            one, other = (self._inbound(case, sources) for sources in (["sensor_board"], ["left_tool", "picky"]))
             return f"  {case}:\n    - {one}\n    - {other}\n"
         sources = ["any"] if self._chance(0.4) else self._noise.sample(_SENDERS, self._noise.randrange(1, 4))
-        outlets = (*_OTHERS, "arm_board") if self._chance(0.2) else _OTHERS
-        return f"  {case}: {self._inbound(case, sources, outlets, self._topics(case))}\n"
+        return f"  {case}: {self._inbound(case, sources)}\n"
 
-    def _inbound(self, case: str, sources: Sequence[str], outlets: Sequence[str], topics: Sequence[str]) -> str:
-        parts = [f"source: {'any' if list(sources) == ['any'] else '[' + ', '.join(sources) + ']'}"]
-        destinations = self._destinations(case, [each for each in outlets if each not in sources], least=not topics)
+    def _inbound(self, case: str, sources: Sequence[str]) -> str:
+        self._sources = sources
+        parts = [f"source: [{', '.join(sources)}]" if "any" not in sources else "source: any"]
+        topics = self._topics(case) if case not in self._commanded else []
+        destinations = self._destinations(case, [each for each in _OTHERS if each not in sources], least=not topics)
         parts += [f"destinations: [{', '.join(destinations)}]"] if destinations else []
         parts += [f"topics: [{', '.join(topics)}]"] if topics else []
-        parts += self._age(case, destinations)
-        parts += self._kind()
-        return "{" + ", ".join(parts) + "}"
+        return "{" + ", ".join([*parts, *self._age(case), *self._kind()]) + "}"
 
     def _kind(self) -> list[str]:
         return [f"priority: {self._noise.choice(('command', 'telemetry', 'bulk'))}"] if self._chance(0.3) else []
 
-    def _age(self, case: str, destinations: Sequence[str]) -> list[str]:
-        """`ttl` and `deadman`: boards that get commands need one, or a reason for none."""
-        parts = [f"ttl: {self._noise.choice(_TIMES)}"] if self._chance(0.4) else []
-        boards = [name for name in _BOARDS if any(name in each for each in destinations)]
-        if not boards:
-            return parts
+    def _age(self, case: str) -> list[str]:
+        """`ttl` and `deadman`: of a command that may wait, a `ttl` that is shorter than the timeout."""
+        timeout, ttl = self._noise.choice(((300, 120), (300, 200), (1000, 400)))
+        boards = self._commanded.get(case)
+        if boards is None:
+            return [f"ttl: {self._noise.choice(_TIMES)}"] if self._chance(0.4) else []
         if self._chance(0.2):
-            return [*parts, "deadman: {none: for tests}"]
-        others = [
-            each for each in (*_COMMANDS, *_FROM_ROS) if each not in {case, "detected_object"} and self._chance(0.4)
-        ]
-        disarmed = f"[{', '.join(others)}]"
-        keys = (
-            f"timeout: {self._noise.choice(_TIMES)}, repeat: {self._noise.choice(('30ms', '70ms', '110ms', '500ms'))}"
-        )
+            return [f"ttl: {ttl}ms", "deadman: {none: for tests}"]
         to = self._noise.sample(boards, self._noise.randrange(1, len(boards) + 1))
-        keys += f", send: {{manual_brake: {{brake: true}}}}, to: [{', '.join(to)}], disarmed_by: {disarmed}"
-        return [*parts, f"deadman: {{{keys}}}"]
+        others = [each for each in self._commanded if each != case and {*to} & {*self._commanded[each]}]
+        disarmed = ", ".join(each for each in others if self._chance(0.5))
+        keys = f"timeout: {timeout}ms, repeat: {self._noise.choice(('30ms', '70ms', '110ms', '500ms'))}"
+        keys += f", send: {{manual_brake: {{brake: true}}}}, to: [{', '.join(to)}], disarmed_by: [{disarmed}]"
+        return [*([f"ttl: {ttl}ms"] if self._chance(0.8) else []), f"deadman: {{{keys}}}"]
 
     def _destinations(self, case: str, outlets: Sequence[str], *, least: bool) -> list[str]:
-        count = self._noise.randrange(1 if least else 0, min(4, len(outlets)) + 1)
-        return [self._destination(case, name) for name in self._noise.sample(outlets, count)]
+        boards = self._commanded.get(case, [])
+        count = self._noise.randrange(1 if least and not boards else 0, min(4, len(outlets)) + 1)
+        return [self._destination(case, name) for name in (*boards, *self._noise.sample(outlets, count))]
 
     def _destination(self, case: str, name: str) -> str:
         keys = self._limits() + self._condition(case)
@@ -182,46 +180,46 @@ class Tables:
     def _condition(self, case: str) -> str:
         if self._chance(0.6):
             return ""
-        numbers = _FIELDS.get(case, ())
-        if case not in _FIELDS:
-            numbers = (_FROM_ROS[case][2],)
-        conditions = ['source == "left_tool"'] if case in _FIELDS else []
+        numbers = _FIELDS.get(case, ()) if case not in _FROM_ROS else (_FROM_ROS[case][2],)
+        conditions = ['source == "left_tool"'] if {"any", "left_tool"} & {*self._sources} else []
         for each in numbers:
             conditions += [f"{each} > 1", f"1 / {each} > 0.5", f"{each} != 0 or {each} > -5"]
-        return f", when: {self._noise.choice(conditions)!s}" if conditions else ""
+        return f", when: {self._noise.choice(conditions)}" if conditions else ""
 
     def _topics(self, case: str) -> list[str]:
         named = [(kind, number) for kind in ("Float32", "Int32", "String") for number in (1, 2) if self._chance(0.15)]
-        return [f"{{topic: {kind.lower()}_{number}, type: std_msgs/msg/{kind}, fields: {{data: {self._value(case, kind)}}}"
-                f"{self._limits()}{self._condition(case)}}}" for kind, number in named]  # fmt: skip
+        return [self._topic(case, kind, number) for kind, number in named]
+
+    def _topic(self, case: str, kind: str, number: int) -> str:
+        keys = f"topic: {kind.lower()}_{number}, type: std_msgs/msg/{kind}, fields: {{data: {self._value(case, kind)}}}"
+        return f"{{{keys}{self._limits()}{self._condition(case)}}}"
 
     def _value(self, case: str, kind: str) -> str:
         number = self._noise.choice(_FIELDS[case] or ("3",))
         if kind == "String":
             return self._noise.choice(("source", f"'text(float64({number}), 1)'"))
         if kind == "Float32":
-            return self._noise.choice(
-                (f"{number}", f"1 / {number}", f"{number} * 2", f"{number} if {number} > 1 else 7")
-            )
-        return self._noise.choice((f"round({number} * 1000)", f"floor(1 / {number})", f"round({number})"))
+            values = [f"1 / {number}", f"float32({number} * 2)", f"float32({number} if {number} > 1 else 7)"]
+        elif number in _INTEGERS:
+            values = [f"floor(1 / {number})", f"int32({number})"]
+        else:
+            values = [f"round({number} * 1000)", f"floor(1 / {number})", f"round({number})"]
+        return self._noise.choice(values)
 
     def _from_ros(self, case: str) -> str:
         kind, fields, _, more = _FROM_ROS[case]
-        outlets = (*_BOARDS, "recorder") if case != "detected_object" else _OTHERS
-        destinations = self._destinations(case, outlets, least=True)
+        self._sources = ()
+        destinations = self._destinations(case, ("recorder",) if case in self._commanded else _OTHERS, least=True)
         topic = self._noise.choice((f"{case}_topic", f"{case}_topic", f"shared_{kind.rpartition('/')[2]}"))
         parts = [f"source: {{topic: {topic}, type: {kind}}}", f"{more}fields: {fields}"]
-        parts += [f"destinations: [{', '.join(destinations)}]", *self._age(case, destinations), *self._kind()]
+        parts += [f"destinations: [{', '.join(destinations)}]", *self._age(case), *self._kind()]
         return f"  {case}: {{{', '.join(parts)}}}\n"
 
     def _collected(self) -> str:
-        """Frames of detected objects; the route has another name in tables where one from ROS has its case."""
-        destinations = self._destinations("drive_diag", ("recorder", "left_tool"), least=False)
-        parts = (
-            ["source: basestation", f"destinations: [{', '.join(destinations)}]"]
-            if destinations
-            else ["source: basestation"]
-        )
+        """Frames of detected objects."""
+        self._sources = ()
+        destinations = self._destinations("detected", ("recorder", "left_tool"), least=False)
+        parts = ["source: basestation", *([f"destinations: [{', '.join(destinations)}]"] if destinations else [])]
         timeout = self._noise.choice(("40ms", "200ms", "1s"))
         parts.append(f"collect: {{by: frame_id, count: total_count, order: index, timeout: {timeout}}}")
         parts += ["ttl: 300ms"] if self._chance(0.3) else []
