@@ -2,6 +2,9 @@
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
 
+# Bytecode is kept, whatever the environment says: tests start hundreds of routers.
+unexport PYTHONDONTWRITEBYTECODE
+
 # To use an interpreter or an installed ROS other than those found: make setup PYTHON=python3.12 ROS=/opt/ros/jazzy
 # Without what only developers need: make setup DEV=no
 export PYTHON ROS DEV

@@ -11,6 +11,7 @@ import sys
 import urllib.request
 from collections import Counter
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ record: {{directory: recordings, continuous: true}}
 """
 
 
+@cache
 def gps(latitude: float) -> bytes:
     wire = wire_of_protos(PROTOS)
     case = wire.case("gps_info")
