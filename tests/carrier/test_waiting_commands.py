@@ -256,10 +256,11 @@ def test_what_waits_for_a_bandwidth_goes_along_to_the_next_program(rehearse: Reh
         (PH, SLOW.replace("1kB/s", "2kB/s")),
         (PH, SLOW.replace(", bandwidth: 1kB/s", "")),
         (PH, SLOW.replace("70:8", "71:8")),
+        (PH.replace("ph_info", "pump_info"), SLOW),
         (OTHER, SLOW),
         ("  ph_info: {source: basestation, destinations: [far_board]}\n", SLOW.replace("far_board", "other_board")),
     ],
-    ids=["bandwidth", "no bandwidth", "address", "no route", "no endpoint"],
+    ids=["bandwidth", "no bandwidth", "address", "another route", "no route", "no endpoint"],
 )
 def test_what_the_next_program_does_not_hold_leaves_before_its_own(
     rehearse: Rehearse, tmp_path: Path, routes: str, far: str
