@@ -363,6 +363,100 @@ def test_what_the_next_program_does_not_hold_comes_before_its_own(opened: Open, 
     check_books(publishing)
 
 
+# ---- frames
+
+FRAMES = f"""\
+  imu_info:
+    source: any
+    collect: {{by: round(accel_z), count: 3, order: round(accel_y), timeout: TIMEOUT}}
+    topics: [{{topic: accel, {_FLOAT}"accel_x + items[2].accel_x"}}}}, {{topic: unwanted, {_FLOAT}accel_x}}}}]
+"""
+LONG = FRAMES.replace("TIMEOUT", "1h")
+
+
+def of_frame(place: int, frame: int = 1) -> bytes:
+    return imu(10.0 + place, place, frame)
+
+
+def served(publishing: Publishing) -> None:
+    wait_until(lambda: not publishing.count("messages_waiting"))
+
+
+def fates_of(publishing: Publishing, topic: str = "accel") -> dict[str, int]:
+    published, collected, filtered = (
+        publishing.count(f"messages_{what}", "imu_info", topic) for what in ("published", "collected", "filtered")
+    )
+    incomplete = publishing.count("messages_dropped", "imu_info", topic, "incomplete")
+    return {"published": published, "collected": collected, "filtered": filtered, "incomplete": incomplete}
+
+
+def test_a_frame_is_published_when_it_is_complete(opened: Open) -> None:
+    publishing = opened(LONG)
+    publishing.publishers["unwanted"].wanted[0] = 0
+    publishing.send(of_frame(2), of_frame(0), of_frame(0), of_frame(1))
+    served(publishing)
+    assert [number(cdr) for cdr in publishing.publishers["accel"].published()] == [22.0]
+    assert fates_of(publishing) == {"published": 1, "collected": 2, "filtered": 1, "incomplete": 0}
+    assert fates_of(publishing, "unwanted") == {"published": 0, "collected": 2, "filtered": 2, "incomplete": 0}
+    check_books(publishing)
+
+
+def test_a_frame_is_collected_while_nobody_wants_its_topic(opened: Open) -> None:
+    """Somebody may, until it is complete."""
+    publishing = opened(LONG)
+    for publisher in publishing.publishers.values():
+        publisher.wanted[0] = 0
+    publishing.send(of_frame(2), of_frame(0))
+    served(publishing)
+    publishing.publishers["accel"].wanted[0] = 1
+    publishing.send(of_frame(1))
+    served(publishing)
+    assert publishing.publishers["accel"].count == 1
+
+
+def test_a_frame_ends_in_time_while_nothing_comes(opened: Open) -> None:
+    publishing = opened(FRAMES.replace("TIMEOUT", "30ms"))
+    publishing.send(of_frame(0), of_frame(1))
+    wait_until(lambda: fates_of(publishing)["incomplete"] == 1)
+    assert publishing.count("messages_published") == 0
+    assert [loss[3] for loss in publishing.losses()] == ["2 of 3 parts"] * 2
+    check_books(publishing)
+
+
+def test_a_frame_that_is_open_goes_along_to_the_next_program(opened: Open) -> None:
+    publishing = opened(LONG)
+    publishing.send(of_frame(0), of_frame(1))
+    served(publishing)
+    for generation in (2, 3):
+        publishing.change(generation)
+        assert publishing.thread.wait_for(generation, 10)
+    publishing.send(of_frame(2))
+    served(publishing)
+    assert [number(cdr) for cdr in publishing.publishers["accel"].published()] == [22.0]
+    assert fates_of(publishing) == {"published": 1, "collected": 2, "filtered": 0, "incomplete": 0}
+    check_books(publishing)
+
+
+def test_a_frame_ends_with_the_last_program_that_collects_it(opened: Open, tmp_path: Path) -> None:
+    publishing = opened(LONG)
+    accel = publishing.publishers["accel"]
+    publishing.send(of_frame(0, frame=2))
+    served(publishing)
+    accel.impede(is_stuck=True)
+    publishing.send(of_frame(0), of_frame(1), of_frame(2))
+    wait_until(lambda: accel.is_called)
+    publishing.change(2, program(tmp_path, FRAMES.replace("TIMEOUT", "2h")))
+    publishing.send(of_frame(1, frame=2))  # behind messages of the earlier program, which the thread has not served
+    accel.impede()
+    assert publishing.thread.wait_for(2, 10)
+    served(publishing)
+    assert fates_of(publishing) == {"published": 1, "collected": 2, "filtered": 0, "incomplete": 1}
+    publishing.stop_receiving()
+    assert publishing.thread.stop()
+    assert fates_of(publishing)["incomplete"] == 2
+    check_books(publishing)
+
+
 # ---- generations
 
 
