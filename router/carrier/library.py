@@ -80,7 +80,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "rehearsal_datagram": (None, (c_void_p, c_uint32, c_uint32, c_uint32, c_void_p, c_size_t, c_int64)),
     "rehearsal_end": (None, (c_void_p,)),
     "rehearsal_message": (None, (c_void_p, c_uint32, c_void_p, c_size_t, c_int64)),
-    "rehearsal_open": (c_void_p, (c_void_p, c_void_p, c_int64)),
+    "rehearsal_open": (c_void_p, (c_void_p, c_int64)),
     "rehearsal_records": (c_void_p, (c_void_p, c_void_p)),
     "rehearsal_set_clock": (None, (c_void_p, c_int64)),
     "rehearsal_timers": (c_void_p, (c_void_p,)),

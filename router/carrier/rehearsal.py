@@ -9,6 +9,7 @@ from functools import partial
 from struct import Struct
 from types import SimpleNamespace
 from typing import NamedTuple, Union
+from weakref import finalize
 
 from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
@@ -21,7 +22,6 @@ from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.reasons import where_refused, why_rejected
-from router.carrier.ring import Ring
 from router.carrier.state import State
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.table.model import Endpoint
@@ -29,9 +29,6 @@ from router.table.model import Endpoint
 Peer = tuple[str, int]
 
 _MOST_COUNTERS = 1 << 18
-_WAITING = 1 << 16
-"""Bytes in the ring for topics, from which each message is taken at once."""
-
 _TIME, _COUNTED, _SENT, _BRAKED, _PUBLISHED = range(32, 37)
 """`enum record_kind` in rehearsal.h."""
 
@@ -73,13 +70,12 @@ class Stage:
         self.now = now
         self._library = library
         self._names = Names()
-        self._ring = Ring(library, _WAITING)
-        self._opened = _Opened(library, self._ring, now)
+        self._opened = _Opened(library, now)
         self._address = self._opened.address
         self._reader = EventReader(self._names, self._why_rejected, self._where_refused)
-        self._state = State()
-        self._running: _Running | None = None
         self._generation = 0
+        # It keeps what is open out of the garbage, which would be freed in any order.
+        finalize(self, self._opened.close)
 
     def counters(self, count: int) -> list[int]:
         """The first counters."""
@@ -87,7 +83,7 @@ class Stage:
 
     def adopt(self, program: Program) -> None:
         """Go on with a program, which takes over what has the same key, as at a reload. Raises MemoryError."""
-        earlier, state = self._running, State(self._state)
+        earlier, state = self._opened.running, State(self._opened.state)
         self._generation += 1
         running = self._opened_for(program, state)
         before = earlier.deadmen if earlier else {}
@@ -105,7 +101,7 @@ class Stage:
         )
         of_topics = running.timer_change(earlier, (), of_topics=True)
         self._library.rehearsal_adopt(self._address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
-        self._state, self._running = state, running
+        self._opened.state, self._opened.running = state, running
         state.forget_previous()
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
@@ -158,8 +154,9 @@ class Stage:
 
     @property
     def _in_use(self) -> _Running:
-        assert self._running is not None  # noqa: S101 - a program was adopted
-        return self._running
+        running = self._opened.running
+        assert running is not None  # noqa: S101 - a program was adopted
+        return running
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
         return why_rejected(self._in_use.program, listener, data, length)
@@ -207,7 +204,7 @@ class Stage:
         return _Running(program, native, from_ros, deadmen, adopted)
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
-        return state.keep(("sender", endpoint.name, endpoint.address.value), lambda: _Sender(self._opened))
+        return state.keep(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
 
     def _deadman(
         self, plan: DeadmanPlan, program: Program, senders: Mapping[str, _Sender], state: State
@@ -223,34 +220,37 @@ class Stage:
 
 
 class _Opened:
-    """The stage in C. It stays open as long as anything of it is."""
+    """The stage in C, and what it executes."""
 
-    def __init__(self, library: ctypes.CDLL, ring: Ring, now: int) -> None:
+    def __init__(self, library: ctypes.CDLL, now: int) -> None:
         self.library = library
         self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
-        self._ring = ring
-        self.address: int = library.rehearsal_open(self.counters, ring.address, now)
+        self.running: _Running | None = None
+        self.state = State()
+        self.address: int = library.rehearsal_open(self.counters, now)
         if not self.address:
             raise MemoryError("the stage cannot be opened")
         self.timers: int = library.rehearsal_timers(self.address)
 
-    def __del__(self) -> None:
-        if self.address:
-            self.library.rehearsal_close(self.address)
+    def close(self) -> None:
+        """End all timers, and free them before the stage."""
+        self.library.rehearsal_end(self.address)
+        self.running, self.state = None, State()
+        self.library.rehearsal_close(self.address)
 
 
 class _Sender:
     """A sender without a socket."""
 
-    def __init__(self, opened: _Opened) -> None:
-        self._opened = opened
-        self.address = int(opened.library.sender_open(-1, -1, 0, 0) or 0)
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library = library
+        self.address = int(library.sender_open(-1, -1, 0, 0) or 0)
         if not self.address:
             raise MemoryError("a sender of the stage cannot be opened")
 
     def __del__(self) -> None:
         if self.address:
-            self._opened.library.sender_close(self.address)
+            self._library.sender_close(self.address)
 
 
 class _Listener:

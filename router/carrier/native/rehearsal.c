@@ -102,19 +102,19 @@ static bool open_stage(struct rehearsal *rehearsal, struct stage *stage, counter
     return is_open;
 }
 
-struct rehearsal *rehearsal_open(counter *counters, struct ring *ring, int64_t now) {
+struct rehearsal *rehearsal_open(counter *counters, int64_t now) {
     struct rehearsal *rehearsal = calloc(1, sizeof *rehearsal);
     if (!rehearsal) return NULL;
     rehearsal->now = rehearsal->noted_at = now;
     rehearsal->events = ring_open(1 << 16);
+    rehearsal->routing.published = ring_open(1 << 16); /* from which each message is taken at once */
     rehearsal->timers = timers_open_on(&rehearsal->timing);
     rehearsal->holding = timers_open_on(&rehearsal->publishing);
     struct stage *stages[] = {&rehearsal->routing.stage, &rehearsal->ros.stage, &rehearsal->timing, &rehearsal->publishing};
-    bool is_open = rehearsal->events && rehearsal->timers && rehearsal->holding;
+    bool is_open = rehearsal->events && rehearsal->routing.published && rehearsal->timers && rehearsal->holding;
     for (size_t index = 0; index < sizeof stages / sizeof *stages; index++)
         is_open &= open_stage(rehearsal, stages[index], counters);
     rehearsal->publishing.timers = rehearsal->holding;
-    rehearsal->routing.published = ring;
     if (is_open) return rehearsal;
     rehearsal_close(rehearsal);
     return NULL;
@@ -128,6 +128,7 @@ void rehearsal_close(struct rehearsal *rehearsal) {
     if (rehearsal->timers) timers_close(rehearsal->timers);
     if (rehearsal->holding) timers_close(rehearsal->holding);
     if (rehearsal->events) ring_close(rehearsal->events);
+    if (rehearsal->routing.published) ring_close(rehearsal->routing.published);
     free(rehearsal->records);
     free(rehearsal);
 }

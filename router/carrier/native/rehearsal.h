@@ -35,9 +35,8 @@ struct left_record {
 
 struct rehearsal;
 
-/* Open a stage that counts in `counters`, at this time of the boot clock. `ring` is for what goes to topics. Returns
- * NULL for lack of memory or descriptors. */
-struct rehearsal *rehearsal_open(counter *counters, struct ring *ring, int64_t now);
+/* Open a stage that counts in `counters`, at this time of the boot clock. NULL for lack of memory or descriptors. */
+struct rehearsal *rehearsal_open(counter *counters, int64_t now);
 void rehearsal_close(struct rehearsal *rehearsal); /* when it has no timer left */
 
 /* The timers of destinations: deadmen of its programs are opened there. */
