@@ -16,6 +16,8 @@ extends: {routes}/rover.yaml
 endpoints:
   sensor_board: {{stale_after: 3s}}
   arm_board: {{stale_after: never}}
+routes:
+  ph_info: {{source: [sensor_board, arm_board]}}
 gateways:
   dashboard:
     inbound:

@@ -95,8 +95,9 @@ def test_a_problem_is_told_where_it_belongs(
     router: Counting, series: str, name: str, level: Level, message: str
 ) -> None:
     router.count(*series.split(), to=9)
-    status = reported(router, 1)[name]
-    assert (status.level, message in status.message) == (level, True), status.message
+    told = reported(router, 1)
+    assert (told[name].level, message in told[name].message) == (level, True), told[name].message
+    assert (told["router"].level == Level.OK) == (name != "router")
 
 
 def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Counting) -> None:

@@ -102,6 +102,7 @@ def test_who_looks_often_does_not_shorten_the_time(router: Counting) -> None:
     router.count("kernel_drops", "rover", to=9)
     told = [router.told(0.1) for _ in range(100)]
     assert "the kernel drops datagrams of rover, 9 in 10 s" in told[-1]
+    assert len(router.look(0.1).snapshots) < 2 * WINDOW / PERIOD
     router.count(STALLED, "imu_data", to=0.6)
     assert not any("stuck" in text for _ in range(5) for text in router.told(0.1))
 
@@ -147,7 +148,7 @@ def test_an_endpoint_is_silent_after_its_own_time_and_with_it_the_routes_that_on
     [problem] = router.look(0.1).problems
     assert (problem.text, problem.kind.level) == ("sensor_board is silent for 3.1 s", Level.WARNING)
     assert "imu_info" in problem.routes
-    assert "manual_drive" not in problem.routes
+    assert not {"manual_drive", "ph_info"} & set(problem.routes)  # of the basestation, also of the arm board
     assert "ping 192.168.0.30" in problem.remedy
     router.hear("sensor_board")
     assert router.told(1) == []
