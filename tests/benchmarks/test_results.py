@@ -1,4 +1,4 @@
-"""The file of results, and how it is shown."""
+"""The file of results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from benchmarks.versus import report, results
+from benchmarks.versus import results
 from benchmarks.versus.building import ROOT
 from benchmarks.versus.figures import judge
 from benchmarks.versus.scenarios import SCENARIOS
@@ -15,10 +15,10 @@ from benchmarks.versus.scenarios import SCENARIOS
 FIRST, SECOND = SCENARIOS[:2]
 
 
-def entry(cpu_us: float, noise: float = 0) -> dict[str, Any]:
+def entry(cpu_us: float) -> dict[str, Any]:
     """Of the first scenario, as if the peer took 10 us for a datagram."""
     rounds = {
-        "router": [{"cpu_us@1000": cpu_us, "noise": noise}],
+        "router": [{"cpu_us@1000": cpu_us}],
         "peer": [{"cpu_us@1000": 10.0}],
     }
     return results.entry(FIRST, rounds, judge(FIRST.aims, rounds), 4)
@@ -41,14 +41,3 @@ def test_the_file_names_neither_this_machine_nor_its_folders() -> None:
     text = json.dumps(results.empty() | {"scenarios": entry(5)})
     assert socket.gethostname() not in text
     assert str(ROOT) not in text
-
-
-def test_a_figure_is_shown_with_ratio_aim_verdict_and_what_disturbed_it() -> None:
-    [row] = report.cells(entry(5, noise=0.2))
-    assert row == ("cpu_us@1000", "5", "peer 10", "0.50", "0.5 to 0.5", "<= 0.75", "met", "router noisy")
-
-
-def test_the_page_has_a_table_for_each_scenario() -> None:
-    page = report.page(results.empty() | {"scenarios": {FIRST.name: entry(5)}})
-    assert f"## `{FIRST.name}`" in page
-    assert "| cpu_us@1000 | 5 | peer 10 | 0.50 | 0.5 to 0.5 | <= 0.75 | met |" in page

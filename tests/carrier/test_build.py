@@ -16,14 +16,9 @@ COMPILERS = [compiler for compiler in ("gcc", "clang") if shutil.which(compiler)
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("source", build.sources(), ids=lambda path: path.name)
-def test_compilers_have_nothing_to_warn_of(source: Path, compiler: str, tmp_path: Path) -> None:
-    build.compile_c([str(source), *build.WARNINGS, "-O2", "-c", "-o", str(tmp_path / "made.o")], compiler)
-
-
-@pytest.mark.parametrize("compiler", COMPILERS)
-def test_a_library_of_any_compiler_can_be_loaded(compiler: str, tmp_path: Path) -> None:
-    load(build.build(tmp_path / "libcarrier.so", compiler=compiler))
+def test_compilers_have_nothing_to_warn_of_and_their_libraries_can_be_loaded(compiler: str, tmp_path: Path) -> None:
+    flags = [*build.WARNINGS, *build._OPTIMIZED, *build._LINKED]
+    load(build.build(tmp_path / "libcarrier.so", flags, compiler))
 
 
 @pytest.fixture

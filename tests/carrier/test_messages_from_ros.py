@@ -145,9 +145,8 @@ def _assert_equal(declared: MessageType, python: Plane, carrier: Plane, *, refus
     """`refuses` says that a message may be refused."""
 
     @settings(max_examples=settings().max_examples, suppress_health_check=list(HealthCheck))
-    @given(st.data())
-    def equal(data: st.DataObject) -> None:
-        message = data.draw(messages(declared))
+    @given(messages(declared), st.data())
+    def equal(message: bytes, data: st.DataObject) -> None:
         expected = python(message)
         assert carrier(message) == expected
         assert refuses or expected != [MAPPING_ERROR]

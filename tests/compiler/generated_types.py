@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -179,6 +180,7 @@ def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
             return st.just(target)
 
 
+@cache  # Hypothesis checks each new strategy, which takes longer than to draw from it
 def values(declared: Type) -> st.SearchStrategy[Any]:
     """Python values of a type; messages are namespaces, as the generated code reads attributes only."""
     match declared:

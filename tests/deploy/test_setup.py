@@ -219,6 +219,7 @@ def test_make_says_how_to_get_the_tools_that_tests_need(checkout: Checkout) -> N
     assert done.returncode
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not is_buildable(), reason="ROS's generators or cmake are not installed")
 @pytest.mark.parametrize("options", [(), (f"-DCMAKE_PROJECT_comms_INCLUDE={ROOT / ONLY_NEEDED}",)])
 def test_only_a_workspace_builds_the_interfaces_for_cpp(options: Sequence[str], tmp_path: Path) -> None:
