@@ -443,9 +443,9 @@ def test_what_is_missing_is_explained_by_its_drop(tmp_path: Path) -> None:
           given: {given("{}")}
           expect: {{sent: basestation, published: {QUIET}}}
         """
-    assert messages(tmp_path, IMU, tests) == [
-        "nothing for imu/data_raw: it was dropped as mapping_error (float division by zero)",
-    ]
+    (message,) = messages(tmp_path, IMU, tests)
+    assert message.startswith("nothing for imu/data_raw: it was dropped as mapping_error (")
+    assert message.endswith("table.yaml:24:53: angular_velocity.y)")
 
 
 def test_rejection_is_told_once_and_not_as_everything_that_is_missing(tmp_path: Path) -> None:
@@ -705,7 +705,7 @@ def test_a_budget_has_to_be_exceeded(tmp_path: Path) -> None:
     beyond = f"""
         b:
           given: {given("{accel_x: 1}", ", times: 10000")}
-          expect: {{sent: {{basestation: {{times: 2}}}}, dropped: {{basestation: {{queue_full: 636}}}}}}
+          expect: {{sent: {{basestation: {{times: 2}}}}, dropped: {{basestation: {{queue_full: 5902}}}}}}
         """
     assert gaps(tmp_path, routes, within + dedent(beyond), head) == []
 
