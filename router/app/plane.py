@@ -344,8 +344,8 @@ class Plane:
 def _change_of_destinations(built: Built) -> c.TimerChange:
     """What changes in the timers of endpoints. What only the earlier program had sends what it holds."""
     left = list(built.state.left())
-    ended = [each.address for each in left if isinstance(each, NativeDeferral) and not each.is_topic]
-    ended += [each.address for each in left if isinstance(each, NativePacer)]
+    ended = [each.address for each in left if isinstance(each, NativePacer)]
+    ended += [each.address for each in left if isinstance(each, NativeDeferral) and not each.is_topic]
     return timer_change([each for each in built.adopted if not each.is_topic], ended)
 
 

@@ -93,7 +93,7 @@ class Adoption:
 
 
 def timer_change(adopted: Sequence[Adoption], ended: Sequence[int]) -> c.TimerChange:
-    """What a reload does to timers. What ends goes first: a deferral before its pacer, and deadmen last."""
+    """What a reload does to timers. What ends goes first: a pacer before its deferrals, and deadmen last."""
     adoptions = [c.Adoption(each.timer, each.targets, each.target) for each in adopted]
     return c.TimerChange(
         adopted=(c.Adoption * len(adoptions))(*adoptions),

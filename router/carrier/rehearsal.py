@@ -291,8 +291,7 @@ class _Running:
         adopted = [each for each in self.adopted if each.is_topic is of_topics]
         kept = {each.timer for each in adopted}
         before = [each.timer for each in earlier.adopted if each.is_topic is of_topics] if earlier else []
-        # A deferral ends before its pacer, which was adopted before it.
-        return timer_change(adopted, [*(each for each in reversed(before) if each not in kept), *ended])
+        return timer_change(adopted, [*(each for each in before if each not in kept), *ended])
 
 
 def _number(host: str) -> int:

@@ -33,6 +33,7 @@ struct pacer {
     int64_t overdraft;
     int64_t bytes_left, datagrams_left; /* that may wait still; below 0 until the oldest was dropped */
     int64_t paid_at; /* when the budget has paid for all that was sent; what lies before now is saved up */
+    bool has_ended;  /* nothing waits any more */
 };
 
 /* ---- lanes ---- */
@@ -158,6 +159,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 /* Send all that waits, whatever the budget: at most what there is room for. */
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct pacer *pacer = (struct pacer *)timer;
+    pacer->has_ended = true;
     timer->due = NEVER;
     for (int index = 0; index < PRIORITIES; index++)
         while (pacer->lanes[index].count) send_first(timers, pacer, &pacer->lanes[index], now);
@@ -171,6 +173,10 @@ static const struct timer_kind PACER = {.serve = serve, .adopt = adopt, .end = e
 void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
                  int64_t expires, int64_t now) {
     struct waiting_datagram waiting = {of, expires, cost_of(pacer, size), size};
+    if (pacer->has_ended) {
+        deliver_now(timers->stage, of->to, of->target, data, size, expires, now);
+        return;
+    }
     limit_savings(pacer, now);
     put(&pacer->lanes[of->target->priority], &waiting, data);
     pacer->bytes_left -= (int64_t)size;

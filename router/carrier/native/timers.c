@@ -115,13 +115,19 @@ void timers_remove(struct timers *timers, struct timer *timer) {
     *link = timer->next;
 }
 
-/* End the timers that hold messages, or the deadmen. Those that are ended may leave the list. */
-static void end_all(struct timers *timers, bool holds, int64_t now) {
-    for (struct timer *each = timers->first, *next; each; each = next) {
-        next = each->next;
-        if (holds == (each->kind->adopt != NULL)) each->kind->end(timers, each, now);
-        if (timers->is_left) return;
+/* End the timers that hold messages, the oldest first: a pacer before what passes on to it. */
+static void end_holding(struct timers *timers, int64_t now) {
+    for (struct timer *oldest = timers->first; oldest && !timers->is_left;) {
+        oldest = NULL;
+        for (struct timer *each = timers->first; each; each = each->next)
+            if (each->kind->adopt) oldest = each;
+        if (oldest) oldest->kind->end(timers, oldest, now); /* which leaves the list */
     }
+}
+
+static void end_deadmen(struct timers *timers, int64_t now) {
+    for (struct timer *each = timers->first; each && !timers->is_left; each = each->next)
+        if (!each->kind->adopt) each->kind->end(timers, each, now);
 }
 
 /* ---- public ---- */
@@ -160,8 +166,8 @@ void timer_end(struct timers *timers, struct timer *timer) {
 void timers_end(struct timers *timers) {
     pthread_mutex_lock(&timers->lock);
     int64_t now = timers->stage->now(timers->stage);
-    end_all(timers, true, now);
-    if (!timers->is_left) end_all(timers, false, now);
+    end_holding(timers, now);
+    end_deadmen(timers, now);
     if (!timers->is_left) timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
 }
