@@ -1,6 +1,7 @@
 """Another table every second, while datagrams, commands and frames come: nothing is lost, doubled or braked in vain.
 
-`STORM_SECONDS=600` in the environment makes it as long.
+`STORM_SECONDS=600 .venv/bin/python -m pytest -o faulthandler_timeout=900 tests/acceptance/test_reload_storm.py` makes it
+as long.
 """
 
 from __future__ import annotations
