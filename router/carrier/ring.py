@@ -34,11 +34,6 @@ class Ring:
         """End the wait of a reader."""
         self._library.ring_wake(self.address)
 
-    @property
-    def written(self) -> int:
-        """How many bytes were written since it was opened."""
-        return int(self._library.ring_written(self.address))
-
     def watch(self) -> int:
         """Return an eventfd that each new record makes readable, from now on."""
         return int(self._library.ring_watch(self.address))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import socket
 from collections.abc import Collection
 
@@ -41,17 +40,6 @@ class NativeSender(Sender):
     def _listening(self) -> int:
         """The descriptor of the listener from whose port it sends; -1 for none."""
         return self.source.socket.fileno() if self.source is not None and self.is_bound else -1
-
-    def send(self, data: bytes) -> int:
-        return self._sent(self._library.sender_send(self.address, data, len(data)), data)
-
-    def send_checked(self, data: bytes) -> int:
-        return self._sent(self._library.sender_send_checked(self.address, data, len(data)), data)
-
-    def _sent(self, error: int, data: bytes) -> int:
-        if error:
-            raise OSError(error, os.strerror(error))
-        return len(data)
 
     def close(self) -> None:
         """Close the socket. Sending afterwards raises OSError."""

@@ -25,10 +25,6 @@ class State:
             self._kept[key] = self._previous[key] if key in self._previous else make()
         return cast("T", self._kept[key])
 
-    def added(self) -> Iterator[object]:
-        """The objects that the previous program does not have."""
-        return (value for key, value in self._kept.items() if key not in self._previous)
-
     def left(self) -> Iterator[object]:
         """The objects that only the previous program has; none after `forget_previous`."""
         return (value for key, value in self._previous.items() if key not in self._kept)

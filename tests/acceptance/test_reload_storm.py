@@ -1,7 +1,6 @@
 """Another table every second, while datagrams, commands and frames come: nothing is lost, doubled or braked in vain.
 
-`STORM_SECONDS=600 .venv/bin/python -m pytest -o faulthandler_timeout=900 tests/acceptance/test_reload_storm.py` makes it
-as long.
+For ten minutes: `STORM_SECONDS=600 .venv/bin/python -m pytest -o faulthandler_timeout=900 -m slow` with this file.
 """
 
 from __future__ import annotations

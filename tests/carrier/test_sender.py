@@ -25,13 +25,28 @@ from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
 
 PATIENCE = 10.0
-Make = Callable[..., NativeSender]
+Make = Callable[..., "Sending"]
 """Called with an endpoint, the listener that it sends from, and all listeners."""
+
+
+class Sending(NativeSender):
+    """What sends, as the carrier's threads do."""
+
+    def send(self, data: bytes) -> int:
+        return self._sent(self._library.sender_send(self.address, data, len(data)), data)
+
+    def send_checked(self, data: bytes) -> int:
+        return self._sent(self._library.sender_send_checked(self.address, data, len(data)), data)
+
+    def _sent(self, error: int, data: bytes) -> int:
+        if error:
+            raise OSError(error, os.strerror(error))
+        return len(data)
 
 
 @pytest.fixture(scope="session")
 def make(library: ctypes.CDLL) -> Make:
-    return partial(NativeSender, library)
+    return partial(Sending, library)
 
 
 @pytest.fixture
@@ -54,12 +69,12 @@ def listener(stack: ExitStack) -> Listener:
 
 
 @pytest.fixture
-def sender(stack: ExitStack, make: Make, board: socket.socket, listener: Listener) -> NativeSender:
+def sender(stack: ExitStack, make: Make, board: socket.socket, listener: Listener) -> Sending:
     """It sends to the board, from the listener's port."""
     return stack.enter_context(closing(make(endpoint("board", Address(*board.getsockname())), listener, [listener])))
 
 
-def send_to(stack: ExitStack, make: Make, address: Address) -> NativeSender:
+def send_to(stack: ExitStack, make: Make, address: Address) -> Sending:
     return stack.enter_context(closing(make(endpoint("board", address))))
 
 
@@ -112,7 +127,7 @@ def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, ma
 
 
 def test_it_sends_from_its_listeners_port_and_answers_reach_the_listener(
-    sender: NativeSender, board: socket.socket, listener: Listener
+    sender: Sending, board: socket.socket, listener: Listener
 ) -> None:
     sender.send(b"drive")
     data, where_from = board.recvfrom(100)
@@ -166,7 +181,7 @@ def test_it_shares_the_port_of_an_inherited_listener_also_while_the_address_is_n
 
 
 @pytest.mark.parametrize("shares", [0, 1])
-def test_nobody_else_can_have_the_port(listener: Listener, sender: NativeSender, shares: int) -> None:
+def test_nobody_else_can_have_the_port(listener: Listener, sender: Sending, shares: int) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, shares)
         with pytest.raises(OSError, match="Address already in use"):
@@ -208,7 +223,7 @@ def test_an_endpoint_without_a_listener_has_a_port_of_its_own_and_hears_no_answe
 
 
 def test_each_sender_hears_of_its_own_losses(
-    stack: ExitStack, library: ctypes.CDLL, make: Make, board: socket.socket, listener: Listener, sender: NativeSender
+    stack: ExitStack, library: ctypes.CDLL, make: Make, board: socket.socket, listener: Listener, sender: Sending
 ) -> None:
     """The kernel tells the listener, which passes it on, and receives on."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
@@ -263,7 +278,7 @@ def test_a_flood_of_errors_leaves_no_room_taken(
 
 
 def test_a_sender_moves_to_another_port_and_back(
-    stack: ExitStack, sender: NativeSender, board: socket.socket, listener: Listener
+    stack: ExitStack, sender: Sending, board: socket.socket, listener: Listener
 ) -> None:
     other = stack.enter_context(closing(Listener(plan("other"))))
     for source in (other, None, listener):
@@ -293,7 +308,7 @@ def test_without_ipv6_it_sends_from_another_port_and_says_so(
     assert [(each["log_level"], each["listener"]) for each in logged] == [("warning", "rover")]
 
 
-def fill(sender: NativeSender) -> int:
+def fill(sender: Sending) -> int:
     """Send until the buffer is full. Return how many datagrams it has taken."""
     for number in range(1000):
         try:
