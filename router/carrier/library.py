@@ -88,7 +88,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "ring_drop": (c_bool, (c_void_p, c_void_p, c_size_t)),
     "ring_open": (c_void_p, (c_size_t,)),
     "ring_put": (c_bool, (c_void_p, c_void_p, c_uint32)),
-    "ring_take": (c_size_t, (c_void_p, c_void_p, c_size_t, c_int)),
+    "ring_take": (c_size_t, (c_void_p, c_void_p, c_size_t, c_int64)),
     "ring_taken": (c_uint64, (c_void_p,)),
     "ring_wake": (None, (c_void_p,)),
     "ring_watch": (c_int, (c_void_p,)),

@@ -22,12 +22,9 @@ class Ring:
         self._records = ctypes.create_string_buffer(max(1 << 16, 2 * LONGEST_RECORD))
         self._view = memoryview(self._records).cast("B")
 
-    def take(self, timeout_ms: int = 0) -> memoryview:
-        """Return whole records, the oldest first; none after the timeout (-1: never) or `wake`.
-
-        They are valid until the next call. For one thread.
-        """
-        size = self._library.ring_take(self.address, self._records, len(self._records), timeout_ms)
+    def take(self) -> memoryview:
+        """Return whole records, the oldest first. They are valid until the next call. For one thread."""
+        size = self._library.ring_take(self.address, self._records, len(self._records), 0)
         return self._view[:size]
 
     def wake(self) -> None:

@@ -57,17 +57,17 @@ static enum publication publish_unlocked(struct stage *stage, const struct targe
 
 /* ---- the thread ---- */
 
-/* For how long to wait for messages, in ms: until the next timer is due, or for ever (-1). */
-static int patience_of(const struct publish_thread *thread) {
+/* For how long to wait for messages, in ns: until the next timer is due, or for ever (-1). */
+static int64_t patience_of(const struct publish_thread *thread) {
     int64_t due = atomic_load_explicit(&thread->stage.timers->next_due, memory_order_relaxed);
     if (due == NEVER) return -1;
     int64_t wait = due - boottime_ns();
-    return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
+    return wait > 0 ? wait : 0;
 }
 
 /* Take messages, without the lock. Return how many bytes they have. */
 static size_t take(struct publish_thread *thread, bool waits) {
-    int timeout = waits ? patience_of(thread) : 0;
+    int64_t timeout = waits ? patience_of(thread) : 0;
     pthread_mutex_unlock(&thread->lock);
     size_t size = ring_take(thread->ring, thread->records, sizeof thread->records, timeout);
     pthread_mutex_lock(&thread->lock);

@@ -112,20 +112,20 @@ static size_t take_ready(struct ring *ring, void *records, size_t limit) {
     }
 }
 
-/* Sleep while `is_waited_for`, for up to `timeout_ms` (-1: for ever). */
-static void sleep_until_woken(struct ring *ring, int timeout_ms) {
-    struct timespec timeout = {timeout_ms / 1000, timeout_ms % 1000 * 1000000L};
-    syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAIT_PRIVATE, 1, timeout_ms < 0 ? NULL : &timeout, NULL, 0);
+/* Sleep while `is_waited_for`, for up to `timeout` ns (-1: for ever). */
+static void sleep_until_woken(struct ring *ring, int64_t timeout) {
+    struct timespec until = {timeout / 1000000000, timeout % 1000000000};
+    syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAIT_PRIVATE, 1, timeout < 0 ? NULL : &until, NULL, 0);
 }
 
-size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms) {
+size_t ring_take(struct ring *ring, void *records, size_t limit, int64_t timeout) {
     size_t copied = take_ready(ring, records, limit);
-    if (copied || !timeout_ms) return copied;
+    if (copied || !timeout) return copied;
     atomic_store_explicit(&ring->is_waited_for, 1, memory_order_relaxed);
     atomic_thread_fence(memory_order_seq_cst);
     copied = take_ready(ring, records, limit);
     if (!copied && !atomic_exchange(&ring->is_woken, false)) {
-        sleep_until_woken(ring, timeout_ms);
+        sleep_until_woken(ring, timeout);
         copied = take_ready(ring, records, limit);
     }
     atomic_store(&ring->is_waited_for, 0);

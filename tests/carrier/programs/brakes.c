@@ -129,7 +129,7 @@ static void *replace(void *unused) {
 static void *read_events(void *unused) {
     _Alignas(8) char records[4096];
     while (!atomic_load(&is_done)) {
-        size_t size = ring_take(events, records, sizeof records, 20);
+        size_t size = ring_take(events, records, sizeof records, 20000000);
         for (size_t position = 0; position < size;) {
             struct deadman_event event;
             memcpy(&event, records + position, sizeof event);

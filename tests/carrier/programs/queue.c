@@ -61,10 +61,10 @@ static void *write_all(void *unused) {
     return unused;
 }
 
-static void take_some(int timeout_ms) {
+static void take_some(int64_t timeout) {
     static int64_t last = -1;
     uint64_t records[WORDS_TAKEN];
-    size_t words = ring_take(ring, records, sizeof records, timeout_ms) / 8;
+    size_t words = ring_take(ring, records, sizeof records, timeout) / 8;
     for (size_t at = 0; at < words;) {
         union head head = {.word = records[at]};
         uint64_t number = records[at + 1];
