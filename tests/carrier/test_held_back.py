@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from random import Random
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.deferring import Deferring
 from tests.carrier.test_pacing import RANKS
 from tests.oracles.held_back import Deferral, Message, Pacer
@@ -207,3 +209,10 @@ def test_what_leaves_and_what_is_counted_is_what_the_oracle_says(
         assert carried(group, targets, history) == expected(targets, bandwidth, history)
     finally:
         group.close()
+
+
+@pytest.mark.parametrize(
+    "sanitizers", ["", pytest.param(RACES, marks=pytest.mark.slow), pytest.param(MEMORY, marks=pytest.mark.slow)]
+)
+def test_threads_offer_and_serve_while_programs_change(tmp_path: Path, sanitizers: str) -> None:
+    run_program("holding", tmp_path, 20_000 if sanitizers else 5_000, sanitizers=sanitizers)
