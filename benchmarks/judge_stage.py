@@ -167,13 +167,16 @@ def _is_comparable(earlier: Program, later: Program) -> bool:
     """Whether both keep the same state at a reload.
 
     What `on_limit: latest` holds, the library keeps by names, Python by all that the table says of the target. What
-    waits for a bandwidth leaves at once where the topic of the message's route changes; Python keeps it waiting.
+    waits for a bandwidth leaves at once where the topic of the message's route changes; Python keeps it waiting. What
+    leaves later feeds the deadmen of the next table, in Python those of its own.
     """
     before, after = (_targets(program) for program in (earlier, later))
     routes = {(route, label) for route, _, label in after}
     for place, target in before.items():
         route, _, label = place
         if place not in after and target.is_deferred and (route, label) in routes:
+            return False
+        if target.is_deferred and place in after and target.deadmen != after[place].deadmen:
             return False
         is_held = target.on_limit is OnLimit.LATEST and place in after
         if is_held and target != after[place] and target.max_rate == after[place].max_rate:
