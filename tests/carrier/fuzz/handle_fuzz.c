@@ -2,13 +2,14 @@
  * balance. The first byte of an input selects listener and sender, the rest is the datagram. */
 #include <stdlib.h>
 
+#include "defer.h"
 #include "receive.c"
 #include "schemas.h"
 
 enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 3 + REASONS };
 /* Counters of the one route behind those of listeners. */
 enum { ROUTE = LISTENERS * OF_LISTENER, ACCEPTED = ROUTE, SENT, SENT_BYTES, STALE, LIMITED, FULL, FAILED, WAITING,
-       QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
+       QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, PACED, HELD, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
 
 int LLVMFuzzerInitialize(int *count, char ***arguments);
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
@@ -29,14 +30,18 @@ static const struct layout layout = {.nodes = nodes, .defaults = defaults, .slot
 static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6}, {.kind = OP_LOAD, .slot = 2},
                                              {.kind = OP_DIVIDE}};
 
-static const struct target destinations[] = {
+static struct target destinations[] = {
     {.sender = &nowhere, .limit = &limit, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
      .dropped = {[LOSS_STALE] = STALE, [LOSS_RATE_LIMITED] = LIMITED, [LOSS_SEND_BUFFER_FULL] = FULL,
                  [LOSS_SEND_ERROR] = FAILED}},
     {.sender = &nowhere, .condition = {condition, 3, 0}, .filtered = UNMET,
-     .dropped = {[LOSS_MAPPING_ERROR] = REFUSED, [LOSS_STALE] = MET, [LOSS_SEND_ERROR] = MET}}};
+     .dropped = {[LOSS_MAPPING_ERROR] = REFUSED, [LOSS_STALE] = MET, [LOSS_SEND_ERROR] = MET}},
+    {.sender = &nowhere, .trims = 1, .priority = PRIORITY_BULK,
+     .dropped = {[LOSS_STALE] = PACED, [LOSS_QUEUE_FULL] = PACED, [LOSS_SEND_ERROR] = PACED}},
+    {.sender = &nowhere, .period = 1000000,
+     .dropped = {[LOSS_STALE] = HELD, [LOSS_RATE_LIMITED] = HELD, [LOSS_SEND_ERROR] = HELD}}};
 static const struct route only = {
-    .sends = {.ttl = 1000000000, .layout = &layout, .sources = sources, .targets = destinations, .count = 2,
+    .sends = {.ttl = 1000000000, .layout = &layout, .sources = sources, .targets = destinations, .count = 4,
               .topic = NO_NAME},
     .publishes = {.targets = &published, .count = 1},
     .last_message = LAST_MESSAGE, .duration = DURATION};
@@ -72,7 +77,15 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
     }
     struct ring *events = ring_open(1 << 15);
     carrier = carrier_open(timers_open(counters, events), counters, events, ring_open(1 << 15));
-    struct change first = {.program = &program};
+    struct pacer *pacer = pacer_open(100000);
+    struct adoption adopted[] = {{(struct timer *)pacer, NULL, NULL}, {NULL, &only.sends, &destinations[2]},
+                                 {NULL, &only.sends, &destinations[3]}};
+    for (int index = 1; index < 3; index++) {
+        struct deferral *deferral = deferral_open(index == 1 ? pacer : NULL);
+        destinations[1 + index].deferral = deferral;
+        adopted[index].timer = (struct timer *)deferral;
+    }
+    struct change first = {.program = &program, .timers = {.adopted = adopted, .adopted_count = 3}};
     carrier_adopt_first(carrier, &first);
     carrier_mirror(carrier, ring_open(1 << 15), LOST);
     return 0;
@@ -94,5 +107,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     demand(counters[ACCEPTED] == counters[STALE] + counters[LIMITED] + counters[FAILED]);
     demand(counters[ACCEPTED] == counters[MET] + counters[UNMET] + counters[REFUSED]);
     demand(counters[ACCEPTED] == counters[WAITING] + counters[QUEUE_FULL]);
+    demand(counters[PACED] <= counters[ACCEPTED] && counters[ACCEPTED] - counters[PACED] <= 100000 / BYTES_PER_WAITING);
+    demand(counters[HELD] <= counters[ACCEPTED] && counters[ACCEPTED] - counters[HELD] <= 1);
+    serve_due(carrier);
     return 0;
 }
