@@ -22,10 +22,10 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.metrics import Report
 from router.compiler.program import Program
-from router.engine import InboundEngine
-from router.engine.freshness import Freshness
 from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Ledger, Rig
+from tests.oracles.python_engine import InboundEngine
+from tests.oracles.python_engine.freshness import Freshness
 from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.program import Program
 from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import DATAGRAM, Published, context_of

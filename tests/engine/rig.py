@@ -14,13 +14,13 @@ from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import DROP_REASONS, HISTOGRAM_CELLS, Counters, Report
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine import InboundEngine, OutboundEngine
-from router.engine.binding import EngineContext, TimerGroup
-from router.engine.deadman import Deadman, commander
-from router.engine.delivery import FrameOutcome, Outcome
-from router.engine.freshness import Freshness
-from router.engine.pacing import Pacer
-from router.engine.timers import Timer
+from tests.oracles.python_engine import InboundEngine, OutboundEngine
+from tests.oracles.python_engine.binding import EngineContext, TimerGroup
+from tests.oracles.python_engine.deadman import Deadman, commander
+from tests.oracles.python_engine.delivery import FrameOutcome, Outcome
+from tests.oracles.python_engine.freshness import Freshness
+from tests.oracles.python_engine.pacing import Pacer
+from tests.oracles.python_engine.timers import Timer
 from tests.tables import PROTOS
 
 HEAD = """version: 1

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine import collecting
-from router.engine.collecting import MOST_PARTS, Collector
-from router.engine.pacing import NS
 from router.errors import MappingError
 from tests.engine.rig import Topic, serve
+from tests.oracles.python_engine import collecting
+from tests.oracles.python_engine.collecting import MOST_PARTS, Collector
+from tests.oracles.python_engine.pacing import NS
 
 MS = 1_000_000
 Part = tuple[Hashable, int, int]

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from router.compiler.metrics import Counters, Report
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import GREETING, START, START_AGAIN, Deadman, commander, feeder
-from router.engine.delivery import Stale
-from router.engine.timers import Timer
+from tests.oracles.python_engine.deadman import GREETING, START, START_AGAIN, Deadman, commander, feeder
+from tests.oracles.python_engine.delivery import Stale
+from tests.oracles.python_engine.timers import Timer
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -7,9 +7,9 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.delivery import immediately
-from router.engine.pacing import NS, Latest
 from tests.engine.rig import Destination, play, serve
+from tests.oracles.python_engine.delivery import immediately
+from tests.oracles.python_engine.pacing import NS, Latest
 
 MS = 1_000_000
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 from router.table.model import Priority
 from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Destination, play, serve
+from tests.oracles.python_engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 
 COMMAND, TELEMETRY, BULK = Priority
 MS = 1_000_000

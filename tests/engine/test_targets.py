@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.compiler.program import Program
-from router.engine.delivery import Stale
 from tests.engine.rig import BASESTATION, DRIVING_BOARD, SENSOR_BOARD, STRANGER, PublishError, Rig, program
 from tests.engine.wire import I32, envelopes, framed, rover_envelope, tag
+from tests.oracles.python_engine.delivery import Stale
 
 ROUTES = """\
   imu_info:

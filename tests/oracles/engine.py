@@ -5,11 +5,11 @@ from __future__ import annotations
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from router.engine.binding import bind
-from router.engine.freshness import Freshness
 from router.table.model import Framing
 from router.types.framing import MAX_DATAGRAM, restored
 from tests.engine.rig import Rig
+from tests.oracles.python_engine.binding import bind
+from tests.oracles.python_engine.freshness import Freshness
 
 
 class Naive:

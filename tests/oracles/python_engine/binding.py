@@ -8,11 +8,13 @@ from types import FunctionType
 from typing import Any, Protocol, TypeVar, cast
 
 from router.compiler.metrics import Counters, Report
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.program import Handler, TargetPlan
-from router.engine.collecting import Collector
-from router.engine.deadman import CommandMaker
-from router.engine.delivery import (
-    MAPPING_FAILURES,
+from router.table.model import OnLimit
+from router.types.board_limits import BoardLimits
+from tests.oracles.python_engine.collecting import Collector
+from tests.oracles.python_engine.deadman import CommandMaker
+from tests.oracles.python_engine.delivery import (
     Deliver,
     FrameOutcome,
     Outcome,
@@ -21,11 +23,9 @@ from router.engine.delivery import (
     immediately,
     only_what_fits,
 )
-from router.engine.freshness import Freshness
-from router.engine.pacing import Latest, Pacer, RateLimit
-from router.engine.timers import Locked
-from router.table.model import OnLimit
-from router.types.board_limits import BoardLimits
+from tests.oracles.python_engine.freshness import Freshness
+from tests.oracles.python_engine.pacing import Latest, Pacer, RateLimit
+from tests.oracles.python_engine.timers import Locked
 
 T = TypeVar("T")
 
@@ -188,5 +188,5 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))
         return locked(latest, only_what_fits(latest.offer, board, outcome))
-    assert pacer is not None  # noqa: S101 - the other reason to defer
+    assert pacer is not None
     return locked(pacer, only_what_fits(deliver, board, outcome))

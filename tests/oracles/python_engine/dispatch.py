@@ -15,12 +15,12 @@ from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program, TargetPlan
 from router.datagrams import Peer
-from router.engine.binding import EngineContext, Handle, bind, unbind
-from router.engine.delivery import Outcome
-from router.engine.freshness import Born, Freshness
-from router.engine.slow_path import Rejected, SlowPath
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
+from tests.oracles.python_engine.binding import EngineContext, Handle, bind, unbind
+from tests.oracles.python_engine.delivery import Outcome
+from tests.oracles.python_engine.freshness import Born, Freshness
+from tests.oracles.python_engine.slow_path import Rejected, SlowPath
 
 Receive = Callable[[bytes, Peer], str]
 """Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
