@@ -118,7 +118,7 @@ class Published:
         self.topics = {target.label for target in handler.targets if target.is_topic}
         self.reports, self.sent, self._published = rig.reports, rig.sent, rig.published
         self._is_aged = handler.ttl is not None
-        self._handle = bind(handler, program.counters, rig.context, Freshness())
+        self._handle = bind(program, handler, rig.context, Freshness())
 
     def __call__(self, message: Any) -> dict[str, bytes]:
         """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""

@@ -19,6 +19,7 @@ from tests.oracles.python_engine.binding import EngineContext, TimerGroup
 from tests.oracles.python_engine.deadman import Deadman, commander
 from tests.oracles.python_engine.delivery import FrameOutcome, Outcome
 from tests.oracles.python_engine.freshness import Freshness
+from tests.oracles.python_engine.handlers import remember
 from tests.oracles.python_engine.pacing import Pacer
 from tests.oracles.python_engine.timers import Timer
 from tests.tables import PROTOS
@@ -70,6 +71,7 @@ def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = N
     path.write_text(head.replace("PROTOS", str(protos or PROTOS)) + routes)
     checked = check_table(path, {}, _definitions())
     assert checked.program is not None, "\n".join(map(str, checked.diagnostics))
+    remember(checked)
     return checked.program
 
 
@@ -267,7 +269,7 @@ class _Target:
         for reason in DROP_REASONS:
             self._counters.index("messages_dropped", self.route, name, reason)
         self._counts = self._counters.fresh_counts()
-        self._plan = TargetPlan(name, name, is_topic, None)
+        self._plan = TargetPlan(name, is_topic, None)
 
     def counted(self) -> Mapping[str, int]:
         """What is not zero, by metric, of what was dropped by reason."""

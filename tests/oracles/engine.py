@@ -19,9 +19,7 @@ class Naive:
         self.rig = rig
         self.program = rig.program
         handlers = [(number, handler) for number, [handler] in self.program.inbound.items()]
-        self.handles = {
-            number: bind(handler, self.program.counters, rig.context, Freshness()) for number, handler in handlers
-        }
+        self.handles = {number: bind(self.program, handler, rig.context, Freshness()) for number, handler in handlers}
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:
         self._add(1, "datagrams_received", listener)
