@@ -18,7 +18,6 @@ from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.fuzz_engine import MUTATIONS
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program, TargetPlan
@@ -27,6 +26,7 @@ from router.rehearsal.rehearsal import Dropped, Event, Published, Rehearsal, Rej
 from router.table.model import OnLimit
 from router.types.model import MessageType
 from tests.carrier.random_tables import PEERS, RandomTable, Tables, datagram, ros_message
+from tests.mutations import MUTATIONS
 from tests.oracles.engine_rehearsal import EngineRehearsal
 from tests.oracles.python_engine.handlers import remember
 from tests.tables import PROTOS

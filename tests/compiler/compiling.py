@@ -18,9 +18,9 @@ from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
-from tests.engine.rig import Rig
 from tests.oracles.python_engine.binding import bind
 from tests.oracles.python_engine.freshness import Born, Freshness
+from tests.oracles.python_engine.rig import Rig
 from tests.oracles.reference import fill
 from tests.oracles.reference_expressions import Context
 from tests.oracles.reference_kinds import View
