@@ -18,7 +18,6 @@ from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.fuzz_engine import MUTATIONS
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program, TargetPlan
@@ -27,7 +26,9 @@ from router.rehearsal.rehearsal import Dropped, Event, Published, Rehearsal, Rej
 from router.table.model import OnLimit
 from router.types.model import MessageType
 from tests.carrier.random_tables import PEERS, RandomTable, Tables, datagram, ros_message
+from tests.mutations import MUTATIONS
 from tests.oracles.engine_rehearsal import EngineRehearsal
+from tests.oracles.python_engine.handlers import remember
 from tests.tables import PROTOS
 
 MS = 1_000_000
@@ -61,6 +62,7 @@ class Judge:
             table = self._tables.next(previous) if previous else self._tables.table()
             self._path.write_text(table.text.replace("PROTOS", str(PROTOS)))
             checked = check_table(self._path, {}, self._definitions)
+            remember(checked)
             program = checked.program_in(self._program.counters.continued()) if previous else checked.program
             if program is not None and (previous is None or _is_comparable(self._program, program)):
                 return table, checked, program

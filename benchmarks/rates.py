@@ -22,10 +22,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from router.engine.pacing import BURST
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS
 from tests.acceptance.site import ROOT, RouterProcess, site
+from tests.oracles.python_engine.pacing import BURST
 
 NS = 1_000_000_000
 INPUT_HERTZ = (20, 29, 31, 45, 100, 500, 2000)

@@ -23,21 +23,20 @@ IMPORTS = {
     "values": "errors types",
     "compiler": "errors assets table types",
     "datagrams": "errors table types",
-    "engine": f"{LANGUAGE} datagrams",
     "net": f"{GROUND} {LANGUAGE} datagrams",
     "carrier": f"{GROUND} {LANGUAGE} datagrams net",
     "ros": f"{GROUND} {LANGUAGE}",
     "gateway": f"{GROUND} {LANGUAGE} datagrams net carrier ros",
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
-    "rehearsal": f"{LANGUAGE} values datagrams engine carrier recording",
-    "tools": f"{GROUND} {LANGUAGE} values datagrams engine net carrier ros gateway recording observe rehearsal",
+    "rehearsal": f"{LANGUAGE} values datagrams carrier recording",
+    "tools": f"{GROUND} {LANGUAGE} values datagrams net carrier ros gateway recording observe rehearsal",
     "app": f"{GROUND} {LANGUAGE} values datagrams net carrier ros gateway recording observe",
     "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools carrier app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"errors", "table", "types", "values", "compiler", "datagrams", "engine"}
+PURE = {"errors", "table", "types", "values", "compiler", "datagrams"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -11,7 +11,7 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.table.model import Route, RouteTable, Transport
-from tests.engine.rig import Rig
+from tests.oracles.python_engine.rig import Rig
 from tests.tables import ROUTES
 
 Publish = Callable[..., dict[str, bytes]]

@@ -18,7 +18,7 @@ from benchmarks.versus.building import PROGRAMS
 from benchmarks.versus.contenders import PAYLOADS, datagrams
 from benchmarks.versus.helpers import ALL_TOPICS
 from router.types.wire import LEN
-from tests.engine.wire import tag
+from tests.envelopes import tag
 from tests.tables import PROTOS
 
 SMALL, LARGE = 26, 260

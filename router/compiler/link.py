@@ -5,12 +5,10 @@ Expects a table without errors: nothing here is checked.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from itertools import count
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.deadmen import deadman_plan
-from router.compiler.handlers import HandlerSource, function_name
 from router.compiler.lookup import layout
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
@@ -24,7 +22,6 @@ from router.compiler.program import (
     TopicPlan,
 )
 from router.compiler.series import open_series
-from router.compiler.source import Source, namespace_name
 from router.compiler.topics import qos_of
 from router.table.model import ANY, Route, RouteTable, Topic
 from router.types.board_limits import BoardLimits
@@ -128,54 +125,27 @@ def _handler(
     """The handler of `feed`, or of a route from UDP."""
     route = checked.route
     targets = feed.targets if feed else checked.targets
-    plans = _target_plans(targets)
-
-    def generate(served: Sequence[TargetPlan]) -> Source:
-        generator = HandlerSource(route, checked.case, counters)
-        named = [(plan.identifier, target) for plan, target in zip(plans, targets, strict=True) if plan in served]
-        if feed:
-            generator.outbound(feed, named)
-        else:
-            generator.inbound(named, checked.collect)
-        return generator.out
-
-    places = [feed.topic.span] if feed else [target.span for target in targets if target.topic] or [route.span]
     return Handler(
         route=route.name,
         case=checked.case,
-        targets=plans,
+        targets=tuple(map(_target_plan, targets)),
         sources=sources,
-        generate=generate,
-        function=function_name(route),
-        file=places[0].file,
         topic=feed.topic.topic.value if feed else None,
         ttl=route.ttl.value if route.ttl else None,
         collect_timeout=route.collect.timeout.value if route.collect and checked.collect else None,
     )
 
 
-def _target_plans(targets: Sequence[CheckedTarget]) -> tuple[TargetPlan, ...]:
-    plans: list[TargetPlan] = []
-    for target in targets:
-        plans.append(
-            TargetPlan(
-                identifier=_unique(namespace_name(target.label), {plan.identifier for plan in plans}),
-                label=target.label,
-                is_topic=target.topic is not None,
-                max_rate=target.declared.max_rate,
-                on_limit=target.declared.on_limit,
-                priority=target.priority,
-                is_deferred=target.is_deferred,
-                deadmen=target.deadmen,
-            )
-        )
-    return tuple(plans)
-
-
-def _unique(base: str, taken: Collection[str]) -> str:
-    """Return a Python name that no other target has: `a/b` and `a_b` are different topics."""
-    candidates = (f"{base}_{number}" if number > 1 else base for number in count(1))
-    return next(name for name in candidates if name not in taken)
+def _target_plan(target: CheckedTarget) -> TargetPlan:
+    return TargetPlan(
+        label=target.label,
+        is_topic=target.topic is not None,
+        max_rate=target.declared.max_rate,
+        on_limit=target.declared.on_limit,
+        priority=target.priority,
+        is_deferred=target.is_deferred,
+        deadmen=target.deadmen,
+    )
 
 
 def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable) -> DeadmanPlan:

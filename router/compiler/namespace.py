@@ -5,6 +5,7 @@ A value that a field cannot hold raises MappingError.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
 from typing import Any, TypeVar
 
@@ -28,6 +29,9 @@ from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.source import Source
 from router.errors import MappingError, SourceSpan
 from router.types.framing import trimmed
+
+MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
+"""What a value in a message can make a mapping raise. Any other exception is a bug of the router and propagates."""
 
 Values = TypeVar("Values", bound=Sized)
 

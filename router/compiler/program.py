@@ -1,21 +1,13 @@
-"""The compiled table: all handlers, and what must be opened for them.
-
-A program is plain data; handlers are generated when something asks for them. `engine` binds it to sockets, publishers
-and counts.
-"""
+"""The compiled table: what is known of its routes, what the carrier runs, and what must be opened. Plain data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import chain
-from types import CodeType
 
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
-from router.compiler.namespace import NAMESPACE
-from router.compiler.source import Source
 from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
@@ -66,14 +58,13 @@ class TopicPlan:
 
 @dataclass(frozen=True, slots=True)
 class TargetPlan:
-    """A target of a generated function: `label` in metrics, `identifier` in the names that the function calls.
+    """A target of a route: `label` in metrics.
 
     `is_deferred` says that it may be served later and by another thread: it has `on_limit: latest`, or its
     endpoint has a bandwidth. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or
-    disarms. It holds no positions of the table, since the engine keeps state by it from one table to the next.
+    disarms. It holds no positions of the table, since a reload keeps state by it.
     """
 
-    identifier: str
     label: str
     is_topic: bool
     max_rate: float | None
@@ -118,48 +109,21 @@ class GatewayPlan:
     inbound: Mapping[str, InboundPlan]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Handler:
-    """What serves one route in Python, or one of the topics of a route from ROS.
+    """What is known of a route, or of one of the topics of a route from ROS.
 
-    It serves one message: a parsed payload, or the CDR bytes from `topic`. `sources` are the endpoints that may send
-    the message, perhaps with STRANGER among them; a route from ROS has none. `ttl` and `collect_timeout` in ns, None
-    for none.
-
-    `generate` writes the function called `function`, which serves the given targets, and `file` is what its tracebacks
-    name. It is generated and compiled on first use, because most handlers are never called: the carrier serves their
-    targets.
+    `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS has none.
+    `ttl` and `collect_timeout` in ns, None for none.
     """
 
     route: str
     case: PayloadCase
     targets: tuple[TargetPlan, ...]
     sources: frozenset[str | None]
-    generate: Callable[[Sequence[TargetPlan]], Source] = field(repr=False, compare=False)
-    function: str
-    file: str
     topic: str | None = None
     ttl: int | None = None
     collect_timeout: int | None = None
-
-    @cached_property
-    def source(self) -> Source:
-        return self.generate(self.targets)
-
-    @cached_property
-    def code(self) -> CodeType:
-        """Defines the function. Its namespace needs `constants` and what the engine binds for `targets`."""
-        return self.source.compile(self.file)
-
-    @property
-    def constants(self) -> Mapping[str, object]:
-        return {**NAMESPACE, **self.source.constants}
-
-    def part(self, targets: Sequence[TargetPlan]) -> Handler:
-        """Return the handler of these targets only, with the same counters and TargetPlans."""
-        has_topics = any(target.is_topic for target in targets)
-        served = tuple(target for target in self.targets if target in targets)
-        return replace(self, targets=served, collect_timeout=self.collect_timeout if has_topics else None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,10 @@ from google.protobuf.message import Message
 from router.clock import wall_ns
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
 from router.datagrams import Decoded, Wire
-from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
 from router.recording.mirror import MirroredDatagram

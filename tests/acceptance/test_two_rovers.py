@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 from router.ros.topics import TopicListener
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import ROOT, RouterProcess, Site, key, udp, wait_until
-from tests.engine.wire import rover_envelope
+from tests.envelopes import rover_envelope
 from tests.ports import free_port
 
 SENSOR_BOARD, DRIVING_BOARD, ROUTER = "127.0.0.30", "127.0.0.31", "127.0.0.5"

@@ -26,7 +26,7 @@ from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
-from tests.engine.rig import Ledger
+from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 16
 _LOST = Struct("@IIIIIIiIII")

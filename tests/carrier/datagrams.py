@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-from benchmarks.fuzz_engine import MUTATIONS
-from tests.engine.wire import I32, I64, LEN, VARINT, tag, varint
+from tests.envelopes import I32, I64, LEN, VARINT, tag, varint
+from tests.mutations import MUTATIONS
 
 GROUP, GROUP_END = 3, 4
 

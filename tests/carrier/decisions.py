@@ -13,7 +13,8 @@ from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.types.framing import MAX_DATAGRAM
-from tests.engine.rig import Rig, program
+from tests.oracles.python_engine.rig import Rig
+from tests.small_tables import program
 from tests.tables import PROTOS
 
 TESTS = Path(__file__).parents[1]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from router.types.protobuf import PayloadCase
 from router.types.wire import delimited, parses
-from tests.engine.wire import I32, I64, LEN, VARINT, tag, varint
+from tests.envelopes import I32, I64, LEN, VARINT, tag, varint
 
 GROUP, GROUP_END = 3, 4
 _DEEPEST = 3

@@ -14,12 +14,11 @@ from router.compiler.expressions.kinds import UINT32, ListKind
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable, paths_in
 from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
 from router.compiler.python import NO_VALUES, render
 from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Located, NonFiniteError
 from router.table.model import Destination, FieldMap, Topic
 from router.types.model import MessageType

@@ -25,7 +25,7 @@ from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.carrier.state import State
 from router.compiler.program import Handler, Program, TargetPlan
-from tests.engine.rig import Ledger
+from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 12
 _LOST = Struct("@IIIIIIiIII")

@@ -9,7 +9,7 @@ from typing import Any
 
 from router.rehearsal.cdr import serialize
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
-from tests.engine.test_both_directions import enveloped
+from tests.small_tables import enveloped
 
 HEAD = """version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}

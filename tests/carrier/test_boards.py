@@ -15,7 +15,7 @@ from router.carrier.boards import NativeBoards
 from router.errors import Located, SourceSpan
 from router.types.board_limits import NON_FINITE, TOO_LARGE, BoardLimits, Refusal, board_fields
 from router.types.protobuf import find_envelope, load_protos
-from tests.engine.wire import I32, I64, VARINT, framed, tag, varint
+from tests.envelopes import I32, I64, VARINT, framed, tag, varint
 
 PROTOS = Path(__file__).parent / "protos_of_boards"
 TEXTS, NUMBERS, TREE = 1, 2, 3

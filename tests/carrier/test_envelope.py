@@ -18,8 +18,8 @@ from router.errors import Code
 from router.types.framing import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
 from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
-from tests.engine.rig import program
-from tests.engine.wire import I32, I64, LEN, VARINT, damaged, framed, tag, varint
+from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint
+from tests.small_tables import program
 
 Sides = tuple[Program, PythonSide, CarrierSide]
 

@@ -31,8 +31,8 @@ from router.ros.node import close_node, open_node
 from router.ros.qos import qos_profile
 from router.ros.receiving import RESET, TAKE, RawSubscription
 from router.ros.types import installed_class
-from tests.engine.rig import program
 from tests.ros.peers import Publisher, wait_until
+from tests.small_tables import program
 
 HEAD = """version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}

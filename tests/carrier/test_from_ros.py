@@ -19,7 +19,8 @@ from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
-from tests.engine.rig import Ledger, Rig, program
+from tests.oracles.python_engine.rig import Rig
+from tests.small_tables import Ledger, program
 
 ROUTES = """\
   drive_motor:

@@ -15,8 +15,8 @@ import pytest
 from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.commanding import middleware
 from tests.carrier.publishing import Publishing, wait_until
-from tests.engine.rig import STRANGER, Rig, program
-from tests.engine.test_both_directions import enveloped
+from tests.oracles.python_engine.rig import Rig
+from tests.small_tables import STRANGER, enveloped, program
 
 _FLOAT = "type: std_msgs/msg/Float32, fields: {data: "
 ROUTES = f"""\

@@ -15,7 +15,7 @@ from router.types.wire import delimited, varint
 from tests.carrier.evaluating import TEXT, C, Layout, Machine, Node, NodeField, Operation, load
 from tests.carrier.messages import some_payloads
 from tests.compiler.payloads import wire_of
-from tests.engine.wire import VARINT, tag
+from tests.envelopes import VARINT, tag
 
 CLOSED = (-1, 0, 1, 2)
 _HARD = wire_of(Path(__file__).parent / "protos", "PBEnvelope")[1]

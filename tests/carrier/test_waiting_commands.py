@@ -14,9 +14,8 @@ import pytest
 from router.carrier.events import Changed
 from router.carrier.rehearsal import Left, Stage, Time
 from router.compiler.program import Program
-from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, Ledger, program
-from tests.engine.test_both_directions import BRAKE, MS, SECOND, enveloped
-from tests.engine.wire import LEN, framed, tag, varint
+from tests.envelopes import LEN, framed, tag, varint
+from tests.small_tables import BASESTATION, BRAKE, HEAD, MS, SECOND, SENSOR_BOARD, Ledger, enveloped, program
 
 FAR = "  far_board: {address: 192.168.0.70:8, kind: tool, bandwidth: 10kB/s}\nroutes:"
 TURN = enveloped(manual_drive={"turn": 5})

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from router.types.wire import delimited, varint
 from tests.carrier.evaluating import CDR_HEADER, Machine, Operation, Refusal, integer, load, real, text
 from tests.compiler.payloads import wire_of
-from tests.engine.wire import I32, I64, LEN, VARINT
+from tests.envelopes import I32, I64, LEN, VARINT
 
 _HARD = wire_of(Path(__file__).parent / "protos", "PBEnvelope")[1]
 HEADER = Operation("OP_KNOWN", 1, data=CDR_HEADER)

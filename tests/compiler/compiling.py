@@ -9,19 +9,18 @@ from router.compiler.cdr import write_message
 from router.compiler.expressions import Scope, check
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.program import Handler, Program
 from router.compiler.python import render
 from router.compiler.source import Source
-from router.engine.binding import bind
-from router.engine.delivery import MAPPING_FAILURES
-from router.engine.freshness import Born, Freshness
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
-from tests.engine.rig import Rig
+from tests.oracles.python_engine.binding import bind
+from tests.oracles.python_engine.freshness import Born, Freshness
+from tests.oracles.python_engine.rig import Rig
 from tests.oracles.reference import fill
 from tests.oracles.reference_expressions import Context
 from tests.oracles.reference_kinds import View
@@ -119,7 +118,7 @@ class Published:
         self.topics = {target.label for target in handler.targets if target.is_topic}
         self.reports, self.sent, self._published = rig.reports, rig.sent, rig.published
         self._is_aged = handler.ttl is not None
-        self._handle = bind(handler, program.counters, rig.context, Freshness())
+        self._handle = bind(program, handler, rig.context, Freshness())
 
     def __call__(self, message: Any) -> dict[str, bytes]:
         """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""

@@ -21,12 +21,11 @@ from router.compiler.expressions.kinds import UINT32, BoolKind, Kind, ListKind, 
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable, paths_in
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
 from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, Diagnostic, NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr

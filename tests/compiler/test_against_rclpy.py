@@ -12,7 +12,7 @@ from hypothesis import given
 
 from router.compiler import Checked
 from router.compiler.lookup import Definitions
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same, without_nul
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import MappingError
 from router.rehearsal.cdr import deserialize as parse
 from router.rehearsal.cdr import serialize as cdr

@@ -12,7 +12,7 @@ import pytest
 from router.compiler import check_table
 from router.compiler.expressions import ExpressionError
 from router.compiler.mapping import build
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import Code
 from router.table.model import Expression, FieldMap
 from router.types.model import Bool, Enum, Field, Float, Int, MessageType, String

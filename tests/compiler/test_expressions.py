@@ -41,10 +41,9 @@ from router.compiler.expressions.tree import (
     paths_in,
 )
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, context_of, outcome, reference_bytes, scope_of, serializer

@@ -6,15 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.program import Program
-from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import DATAGRAM, Published, context_of
@@ -119,17 +117,3 @@ def assert_agreement_on_any_message(checked: Checked, program: Program, route: C
         assert_agreement(checked, route, serve, route.case.message_class(**values))
 
     agree()
-
-
-def test_generating_handlers_opens_no_series(rover: Checked) -> None:
-    program = rover.program_in(None)
-    assert program is not None
-    series = dict(program.counters.series())
-    assert all(handler.code for handler in program.handlers)
-    assert dict(program.counters.series()) == series
-
-
-def test_a_program_generates_no_handler_by_itself(rover: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Source, "tree", lambda _: pytest.fail("a handler is compiled"))
-    monkeypatch.setattr(Source, "line", lambda *_: pytest.fail("a handler is generated"))
-    assert rover.program_in(None) is not None

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.compiler.expressions import DEEPEST, ExpressionError
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.python import render
 from router.compiler.source import Source
-from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, compiled, scope_of

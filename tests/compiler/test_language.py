@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from router.compiler.expressions import ExpressionError
 from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, Kind, StringKind
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import compiled, context_of, outcome, scope_of, written

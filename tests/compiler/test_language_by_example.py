@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type

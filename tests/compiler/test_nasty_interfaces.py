@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import assume, given
 
-from router.engine.delivery import MAPPING_FAILURES
+from router.compiler.namespace import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Field, Int, List, MessageType, String, Type
 from tests.compiler.comparing import assert_same_message, same

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.payload import constant_envelope
-from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, MappingError, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap

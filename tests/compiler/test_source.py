@@ -14,6 +14,8 @@ from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published
 from tests.compiler.conftest import CheckText
+from tests.oracles.python_engine import handlers
+from tests.oracles.python_engine.handlers import remember
 from tests.tables import ROUTES
 
 SPAN = SourceSpan("table.yaml", 3, 5, 9)
@@ -22,7 +24,8 @@ SPAN = SourceSpan("table.yaml", 3, 5, 9)
 def generated(checked: Checked) -> list[Source]:
     """The code of all routes of a table."""
     assert checked.program is not None
-    return [handler.source for handler in checked.program.handlers]
+    remember(checked)
+    return [handlers.generated(checked.program, handler).source for handler in checked.program.handlers]
 
 
 @pytest.mark.parametrize("table", ["rover", "sim", "legacy"])

@@ -11,13 +11,13 @@ from dataclasses import replace
 from router.compiler.metrics import Report, Series
 from router.compiler.program import DeadmanPlan, Program
 from router.datagrams import Peer
-from router.engine import InboundEngine, OutboundEngine
-from router.engine.binding import EngineContext, State, TimerGroup
-from router.engine.deadman import Deadman, commander
-from router.engine.freshness import Freshness
-from router.engine.pacing import Pacer
-from router.engine.timers import P, R, Timer
 from router.rehearsal.rehearsal import EVENTS, START, DeadmanChanged, Dropped, Event, Rejected
+from tests.oracles.python_engine import InboundEngine, OutboundEngine
+from tests.oracles.python_engine.binding import EngineContext, State, TimerGroup
+from tests.oracles.python_engine.deadman import Deadman, commander
+from tests.oracles.python_engine.freshness import Freshness
+from tests.oracles.python_engine.pacing import Pacer
+from tests.oracles.python_engine.timers import P, R, Timer
 
 
 class EngineRehearsal:

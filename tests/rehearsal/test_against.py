@@ -13,8 +13,8 @@ from router.cli import main
 from router.recording.mirror import MirroredDatagram
 from router.recording.reader import Recording
 from router.rehearsal.against import Against
-from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
 from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen, wire
+from tests.small_tables import BASESTATION, HEAD, SENSOR_BOARD, program
 from tests.tables import PROTOS
 
 FORWARD = "  imu_info: {source: sensor_board, destinations: [basestation]}\n"

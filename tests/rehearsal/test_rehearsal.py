@@ -28,8 +28,8 @@ from router.rehearsal.rehearsal import (
 from router.values import payload
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import wait_until
-from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, STRANGER, program
 from tests.ports import free_port
+from tests.small_tables import BASESTATION, HEAD, SENSOR_BOARD, STRANGER, program
 from tests.tables import PROTOS
 
 MS = 1_000_000

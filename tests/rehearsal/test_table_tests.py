@@ -15,7 +15,7 @@ from router.rehearsal.coverage import Coverage
 from router.rehearsal.fields import leaves, offset
 from router.rehearsal.reading import TestFile, find_test_files, read_test_file
 from router.rehearsal.running import run_tests
-from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
+from tests.small_tables import HEAD, HEAD_OF_LISTENERS
 from tests.tables import PROTOS
 
 DEFINITIONS = Definitions()

@@ -1,7 +1,6 @@
 /* Datagrams to payload cases: repair of the framing, and the decision whether an envelope is well formed.
  *
- * The decision is that of the protobuf library, so that what is forwarded is what the generated handlers would forward:
- * engine/dispatch.py and engine/slow_path.py have to give the same answers. */
+ * The decision is that of the protobuf library. */
 #ifndef ENVELOPE_H
 #define ENVELOPE_H
 

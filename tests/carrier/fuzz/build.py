@@ -1,8 +1,9 @@
-"""Build the libFuzzer targets for `envelope_read` and for all that becomes of a datagram, and seeds for them.
+"""Build the libFuzzer targets for `envelope_read`, for what becomes of a datagram and for frames, and seeds for them.
 
     python -m tests.carrier.fuzz.build /tmp/fuzz
     cd /tmp/fuzz && ./envelope_fuzz -runs=100000000 -max_len=400 corpus
     cd /tmp/fuzz && ./handle_fuzz -runs=100000000 -max_len=400 corpus
+    cd /tmp/fuzz && ./collect_fuzz -runs=1000000 -max_len=400 corpus
 
 Takes clang with its sanitizers. The folder is made; `corpus` in it grows while the target runs.
 """
@@ -23,7 +24,9 @@ from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
 SEEDS_OF_A_SCHEMA = 300
-TARGETS = ("envelope_fuzz", "handle_fuzz")
+TARGETS = ("envelope_fuzz", "handle_fuzz", "collect_fuzz")
+INCLUDED = {"handle_fuzz": "receive.c", "collect_fuzz": "collect.c"}
+"""What a target includes: it stands in the place of that source."""
 
 
 def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_libfuzzer) -> Path:
@@ -48,8 +51,7 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     )
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")
-    # A target that includes a source stands in its place.
-    files = [HERE / f"{name}.c", *(path for path in sources() if name != "handle_fuzz" or path.name != "receive.c")]
+    files = [HERE / f"{name}.c", *(path for path in sources() if path.name != INCLUDED.get(name))]
     program = folder / name
     compile_(files, program)
     return program

@@ -3,20 +3,29 @@
 The function takes a message and calls what the engine binds for each target NAME: `send_NAME` or `publish_NAME`
 and `wanted_NAME`, or `deliver_NAME` where that may be later; `limit_NAME` for a `max_rate`, and `lost_NAME` for
 whatever fails. With a `ttl` or deadmen, `send_NAME` is told when the message expires, checks that again and feeds
-the deadmen. It counts in a flat list. `router explain` prints it.
+the deadmen. It counts in a flat list.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import count
+from pathlib import Path
+from types import CodeType
 
 from router.compiler.cdr import CdrReads, write_message
-from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
+from router.compiler.check import Checked, check_table
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions.tree import Node, paths_in
+from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
+from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.plan import expressions
+from router.compiler.program import Handler, Program
 from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
@@ -27,10 +36,72 @@ Deliver = Callable[[str, CheckedTarget], None]
 """Appends the lines that hand the message to a target."""
 
 NamedTarget = tuple[str, CheckedTarget]
-"""A target with its part of the Python names (TargetPlan.identifier)."""
+"""A target with its part of the Python names, one of `identifiers`."""
 
 _EXPIRY = {True: "command_expires", False: "expires"}
 """The names of the time after which a message is stale, by whether the target is a board."""
+
+
+_checked: dict[tuple[Path, str], Sequence[CheckedRoute]] = {}
+"""The routes of tables, by path and checksum."""
+
+
+def remember(checked: Checked) -> None:
+    """Have `generated` find the routes of the table, whatever becomes of its file."""
+    if checked.table is not None:
+        _checked[checked.table.path, checked.table.sha256] = checked.routes
+
+
+@dataclass(frozen=True)
+class Generated:
+    """The source of a function, its name, and the file that its tracebacks name."""
+
+    source: Source
+    function: str
+    file: str
+
+    @cached_property
+    def code(self) -> CodeType:
+        return self.source.compile(self.file)
+
+    @property
+    def constants(self) -> Mapping[str, object]:
+        return {**NAMESPACE, **self.source.constants}
+
+
+def generated(program: Program, handler: Handler) -> Generated:
+    """The function that serves all targets of a handler."""
+    checked = next(each for each in _routes(program) if each.route.name == handler.route)
+    feed = next((each for each in checked.subscriptions if each.topic.topic.value == handler.topic), None)
+    targets = feed.targets if feed else checked.targets
+    named = list(zip(identifiers(handler), targets, strict=True))
+    generator = HandlerSource(checked.route, checked.case, program.counters)
+    if feed:
+        generator.outbound(feed, named)
+    else:
+        generator.inbound(named, checked.collect)
+    places = [feed.topic.span] if feed else [target.span for target in targets if target.topic] or [checked.route.span]
+    return Generated(generator.out, function_name(checked.route), places[0].file)
+
+
+def _routes(program: Program) -> Sequence[CheckedRoute]:
+    key = program.table.path, program.table.sha256
+    if key not in _checked:
+        checked = check_table(program.table.path, {}, Definitions(program.protos))
+        assert checked.table is not None
+        assert checked.table.sha256 == program.table.sha256
+        remember(checked)
+    return _checked[key]
+
+
+def identifiers(handler: Handler) -> list[str]:
+    """A Python name for each target, which no other one has: `a/b` and `a_b` are different topics."""
+    made: list[str] = []
+    for target in handler.targets:
+        base = namespace_name(target.label)
+        candidates = (f"{base}_{number}" if number > 1 else base for number in count(1))
+        made.append(next(name for name in candidates if name not in made))
+    return made
 
 
 def function_name(route: Route) -> str:
@@ -49,7 +120,7 @@ class HandlerSource:
     """The source of `def route_NAME(MESSAGE, received_at, now, source)` for one route, with the targets that it serves.
 
     MESSAGE is `m, datagram` of a route from UDP, `cdr` of one from ROS. With a `ttl` there is one more argument:
-    `born`, the arrival by the boot clock (engine.freshness.Born).
+    `born`, the arrival by the boot clock (freshness.Born).
     """
 
     def __init__(self, route: Route, case: PayloadCase, counters: Counters) -> None:

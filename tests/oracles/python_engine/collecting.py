@@ -7,8 +7,8 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from router.engine.timers import Timer
 from router.errors import MappingError
+from tests.oracles.python_engine.timers import Timer
 
 MOST_FRAMES = 64
 MOST_PARTS = 8192

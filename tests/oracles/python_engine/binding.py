@@ -8,11 +8,13 @@ from types import FunctionType
 from typing import Any, Protocol, TypeVar, cast
 
 from router.compiler.metrics import Counters, Report
-from router.compiler.program import Handler, TargetPlan
-from router.engine.collecting import Collector
-from router.engine.deadman import CommandMaker
-from router.engine.delivery import (
-    MAPPING_FAILURES,
+from router.compiler.namespace import MAPPING_FAILURES
+from router.compiler.program import Handler, Program, TargetPlan
+from router.table.model import OnLimit
+from router.types.board_limits import BoardLimits
+from tests.oracles.python_engine.collecting import Collector
+from tests.oracles.python_engine.deadman import CommandMaker
+from tests.oracles.python_engine.delivery import (
     Deliver,
     FrameOutcome,
     Outcome,
@@ -21,11 +23,10 @@ from router.engine.delivery import (
     immediately,
     only_what_fits,
 )
-from router.engine.freshness import Freshness
-from router.engine.pacing import Latest, Pacer, RateLimit
-from router.engine.timers import Locked
-from router.table.model import OnLimit
-from router.types.board_limits import BoardLimits
+from tests.oracles.python_engine.freshness import Freshness
+from tests.oracles.python_engine.handlers import generated, identifiers
+from tests.oracles.python_engine.pacing import Latest, Pacer, RateLimit
+from tests.oracles.python_engine.timers import Locked
 
 T = TypeVar("T")
 
@@ -105,10 +106,11 @@ class EngineContext:
     state: State = field(default_factory=State)
 
 
-def bind(handler: Handler, counters: Counters, context: EngineContext, freshness: Freshness) -> FunctionType:
+def bind(program: Program, handler: Handler, context: EngineContext, freshness: Freshness) -> FunctionType:
     """Execute the handler's code in a namespace of its own, and return the function that it defines."""
+    made, counters = generated(program, handler), program.counters
     namespace: dict[str, Any] = {
-        **handler.constants,
+        **made.constants,
         "counts": context.counts,
         "FAILURES": (*MAPPING_FAILURES, Stale, OSError, *context.publish_errors),
         "clock_ns": context.clock_ns,
@@ -116,10 +118,10 @@ def bind(handler: Handler, counters: Counters, context: EngineContext, freshness
     }
     if handler.collect_timeout is not None:
         namespace["collect"] = _collect(handler, handler.collect_timeout, counters, context)
-    for target in handler.targets:
-        namespace |= _target_names(target, handler, counters, context)
-    exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
-    handle: FunctionType = namespace[handler.function]
+    for name, target in zip(identifiers(handler), handler.targets, strict=True):
+        namespace |= _target_names(name, target, handler, counters, context)
+    exec(made.code, namespace)  # noqa: S102 - code that was made of a checked table
+    handle: FunctionType = namespace[made.function]
     return handle
 
 
@@ -128,8 +130,10 @@ def unbind(handle: FunctionType) -> None:
     handle.__globals__.clear()
 
 
-def _target_names(target: TargetPlan, handler: Handler, counters: Counters, context: EngineContext) -> dict[str, Any]:
-    name, route = target.identifier, handler.route
+def _target_names(
+    name: str, target: TargetPlan, handler: Handler, counters: Counters, context: EngineContext
+) -> dict[str, Any]:
+    route = handler.route
     place = route, handler.topic, target
     names: dict[str, Any] = {f"lost_{name}": Outcome(counters, context.counts, route, target, context.report).failed}
     if target.is_topic:
@@ -188,5 +192,5 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))
         return locked(latest, only_what_fits(latest.offer, board, outcome))
-    assert pacer is not None  # noqa: S101 - the other reason to defer
+    assert pacer is not None
     return locked(pacer, only_what_fits(deliver, board, outcome))

@@ -13,23 +13,18 @@ from google.protobuf.message import Message
 from router.compiler import STRANGER, source_label
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS, Report
 from router.compiler.network import recognisers
-from router.compiler.program import Handler, Program, TargetPlan
+from router.compiler.program import Handler, Program
 from router.datagrams import Peer
-from router.engine.binding import EngineContext, Handle, bind, unbind
-from router.engine.delivery import Outcome
-from router.engine.freshness import Born, Freshness
-from router.engine.slow_path import Rejected, SlowPath
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
+from tests.oracles.python_engine.binding import EngineContext, Handle, bind, unbind
+from tests.oracles.python_engine.freshness import Born, Freshness
+from tests.oracles.python_engine.slow_path import Rejected, SlowPath
 
 Receive = Callable[[bytes, Peer], str]
 """Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
 
 Take = Callable[[bytes, int, bool], None]
-
-ServePart = Callable[[bytes | None, bytes, int, int, str, Born], None]
-"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the wall clock and
-the boot clock at its receipt; the sender's name in expressions; and when it arrived in the kernel. Times in ns."""
 
 _Addresses = Sequence[tuple[object, str]]
 """Keys by which endpoints are recognised (IP address, or IP address and port), each with the endpoint's name."""
@@ -77,7 +72,7 @@ class InboundEngine:
         self._arrived_at = arrived_at
         self._freshness = freshness
         self._handles = {
-            handler.route: bind(handler, program.counters, context, self._freshness)
+            handler.route: bind(program, handler, context, self._freshness)
             for handlers in program.inbound.values()
             for handler in handlers
         }
@@ -203,55 +198,6 @@ class InboundEngine:
         return reject
 
 
-class PartEngine:
-    """Some targets of a program's routes from UDP, for datagrams that another thread has accepted and put into a queue.
-
-    `served` are these targets, by route. That thread has counted the datagrams as received; what becomes of them is
-    counted in `context.counts`.
-    """
-
-    def __init__(self, program: Program, context: EngineContext, served: Mapping[str, Sequence[TargetPlan]]) -> None:
-        self._program = program
-        self._context = context
-        self._served = served
-        self._handles: list[FunctionType] = []
-
-    def close(self) -> None:
-        """Free the handlers. None of the functions may be called afterwards."""
-        for handle in self._handles:
-            unbind(handle)
-
-    def functions(self) -> Mapping[str, tuple[ServePart, Sequence[int]]]:
-        """Compile and return the functions of these routes, each with the indexes of its targets' `messages_waiting`,
-        which are left to the caller. They never raise for what was received.
-        """
-        handlers = {handler.route: handler for handlers in self._program.inbound.values() for handler in handlers}
-        return {route: self._function(handlers[route].part(targets)) for route, targets in self._served.items()}
-
-    def _function(self, part: Handler) -> tuple[ServePart, Sequence[int]]:
-        counters, counts, route = self._program.counters, self._context.counts, part.route
-        handle = bind(part, counters, self._context, Freshness())  # it has no use for the time stamps of ROS
-        self._handles.append(handle)
-        waiting = [counters.index("messages_waiting", route, target.label) for target in part.targets]
-        outcomes = [Outcome(counters, counts, route, target, self._context.report) for target in part.targets]
-        parse, parse_envelope = part.case.message_class.FromString, self._program.envelope.message_class.FromString
-        name, is_aged = part.case.name, part.ttl is not None
-
-        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: Born) -> None:
-            try:
-                message = parse(payload) if payload is not None else getattr(parse_envelope(data), name)
-            except ProtobufError as error:
-                for outcome in outcomes:
-                    outcome.dropped("mapping_error", error)
-                return
-            if is_aged:
-                handle(message, data, received_at, now, source, born)
-            else:
-                handle(message, data, received_at, now, source)
-
-        return serve, waiting
-
-
 @dataclass(frozen=True, slots=True)
 class _OutboundRoute:
     handle: Handle
@@ -307,7 +253,7 @@ class OutboundEngine:
 
     def _route(self, handler: Handler) -> _OutboundRoute:
         counters = self._program.counters
-        self._handles.append(handle := bind(handler, counters, self._context, self._freshness))
+        self._handles.append(handle := bind(self._program, handler, self._context, self._freshness))
         return _OutboundRoute(
             handle=handle,
             is_aged=handler.ttl is not None,

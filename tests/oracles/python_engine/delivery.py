@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import errno
-import struct
 from collections.abc import Callable
 
 from router.compiler.metrics import DROP_REASONS, Counters, Report
+from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.program import TargetPlan
-from router.errors import MappingError, NonFiniteError
+from router.errors import NonFiniteError
 from router.types.board_limits import BoardLimits, Refusal
 from router.types.framing import restored
-
-MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
-"""What a value in a message can make a mapping raise. Any other exception is a bug of the router and propagates."""
 
 _BUFFER_FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
 

@@ -1,0 +1,119 @@
+"""Small tables of the rover's messages for tests, what they are counted by, and envelopes for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+from router.compiler import check_table
+from router.compiler.lookup import Definitions
+from router.compiler.metrics import HISTOGRAM_CELLS
+from router.compiler.program import Handler, Program
+from tests.envelopes import rover_envelope
+from tests.tables import PROTOS
+
+MS = 1_000_000
+SECOND = 1000 * MS
+
+HEAD = """version: 1
+envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
+listen:
+  trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}
+  exact: {address: 127.0.0.1:5001, framing: exact}
+endpoints:
+  sensor_board: {address: 192.168.0.30:8, kind: board}
+  driving_board: {address: 192.168.0.222:8, kind: board}
+  basestation: {address: 192.168.0.10:9000, kind: basestation}
+  recorder: {address: 192.168.0.20:9000, kind: tool, trim_trailing_zeros: true}
+  left_tool: {address: 192.168.0.60:7001, kind: tool, source_port: 8001}
+  right_tool: {address: 192.168.0.60:7002, kind: tool, source_port: 8002}
+routes:
+"""
+"""Every table of these tests begins like this; what follows are its routes, indented by two."""
+
+HEAD_OF_LISTENERS = (
+    HEAD.replace("kind: basestation}", "kind: basestation, listener: exact}")
+    .replace("source_port: 8001}", "source_port: 8001, listener: trimmed}")
+    .replace("source_port: 8002}", "source_port: 8002, listener: exact}")
+    .replace("  recorder:", "  impostor: {address: 192.168.0.10:9001, kind: tool, listener: trimmed}\n  recorder:")
+)
+"""With endpoints that are believed by one listener; `impostor` has the basestation's address on the other one."""
+
+SENSOR_BOARD = ("192.168.0.30", 8)
+DRIVING_BOARD = ("192.168.0.222", 8)
+BASESTATION = ("192.168.0.10", 9000)
+LEFT_TOOL = ("192.168.0.60", 8001)
+RIGHT_TOOL = ("192.168.0.60", 8002)
+STRANGER = ("192.168.0.99", 1234)
+
+
+def enveloped(**payload: object) -> bytes:
+    message: bytes = rover_envelope().message_class(**payload).SerializeToString()
+    return message
+
+
+BRAKE = enveloped(manual_brake={"brake": True})
+
+
+@cache
+def _definitions() -> Definitions:
+    return Definitions()
+
+
+def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = None) -> Program:
+    """The compiled table. What is wrong with it fails the test; a case that is not covered is fine."""
+    path = folder / "table.yaml"
+    path.write_text(head.replace("PROTOS", str(protos or PROTOS)) + routes)
+    checked = check_table(path, {}, _definitions())
+    assert checked.program is not None, "\n".join(map(str, checked.diagnostics))
+    return checked.program
+
+
+class Ledger:
+    """The counters of a program with their counts at the time of each call; timestamps and histograms left out."""
+
+    def __init__(self, program: Program, counts: Sequence[int]) -> None:
+        self._program = program
+        self._counts = counts
+
+    def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
+        """What is not zero, by metric and labels, of the metrics whose name starts like one of these."""
+        return {
+            (series.metric, *series.labels): self._counts[index]
+            for series, index in self._program.counters.series()
+            if self._counts[index] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
+        }
+
+    def total(self, metric: str, *labels: str) -> int:
+        """The sum over all series of a metric whose labels begin like this."""
+        return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
+
+    def imbalances(self) -> Iterator[str]:
+        """Expects that no frame is open, and nothing is held back for later."""
+        inbound = [handler for handlers in self._program.inbound.values() for handler in handlers]
+        outbound = [handler for handlers in self._program.outbound.values() for handler in handlers]
+        received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
+        accepted = sum(self.total("messages_received", handler.route) for handler in inbound)
+        if received != accepted + rejected:
+            yield f"received {received}, but accepted {accepted} and rejected {rejected}"
+        for handler in inbound:
+            yield from self._time_of_route(handler.route)
+        for handler in (*inbound, *outbound):
+            yield from self._fates(handler)
+
+    def _time_of_route(self, route: str) -> Iterator[str]:
+        accepted = self.total("messages_received", route)
+        first = self._program.counters.index("route_duration_seconds", route)
+        if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_CELLS - 1])):
+            yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
+
+    def _fates(self, handler: Handler) -> Iterator[str]:
+        route, accepted = handler.route, self.total("messages_received", handler.route)
+        for target in handler.targets:
+            delivered = "messages_published" if target.is_topic else "datagrams_sent"
+            metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected", "messages_waiting")
+            fates = [self.total(metric, route, target.label) for metric in metrics]
+            if accepted != sum(fates):
+                kinds = "delivered, dropped, filtered, collected, waiting"
+                yield f"{route} to {target.label}: accepted {accepted}, but {kinds} {fates}"
