@@ -40,6 +40,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "command_send": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32)),
     "command_send_at": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32, c_int64)),
     "deadman_await_subscribers": (None, (c_void_p, c_void_p, c_int64)),
+    "condition_holds": (c_int, (c_void_p, c_void_p, c_void_p, c_int64, c_void_p, c_size_t, c_void_p)),
     "deadman_close": (None, (c_void_p, c_void_p)),
     "deadman_end_by_thread": (None, (c_void_p, c_void_p)),
     "deadman_feed": (None, (c_void_p, c_void_p, c_int64)),

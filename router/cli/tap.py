@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     url = running_url(args)
     wire, _ = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
-    condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
+    cases = cases or list(wire.envelope.cases.values())
+    condition = Condition(args.where, wire.envelope, cases) if args.where else None
     taken = RunningTap(wire, args.cases, condition)
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.

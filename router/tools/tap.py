@@ -7,17 +7,19 @@ import json
 import socket
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
+from router.carrier.conditions import NativeCondition
+from router.carrier.library import library
 from router.clock import wall_ns
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
-from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
-from router.compiler.python import render
-from router.compiler.source import Source
+from router.compiler.expressions.tree import Node
+from router.compiler.lowering import lower_condition
+from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
@@ -26,53 +28,50 @@ from router.table.model import Expression
 from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
-from router.types.protobuf import PayloadCase
+from router.types.protobuf import Envelope, PayloadCase
 from router.values import compact, one_line, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.ros.topics import TopicListener
 
 
-Holds = Callable[[Message, str, int], bool]
-"""Whether a condition holds for a payload, from whom, received when (wall clock, ns)."""
-
-FUNCTION = "holds"
-
-
 class Condition:
     """One expression for several payload cases; it may be about fields that not all of them have.
 
-    `failure` is the first value that it could not be asked for, as in a division by zero: there it does not hold.
+    The library evaluates it, as it evaluates `when`. `failure` is the first case with a payload for which it has no
+    value, as in a division by zero: there it does not hold.
     """
 
-    def __init__(self, text: str, cases: Sequence[PayloadCase]) -> None:
-        """Raises UsageError where it suits none of the cases."""
+    def __init__(self, text: str, envelope: Envelope, cases: Sequence[PayloadCase]) -> None:
+        """Raises UsageError where it suits none of the cases, StartError without a library."""
         self.failure = ""
-        self._holds: dict[str, Holds] = {}
+        self._conditions: dict[str, NativeCondition] = {}
         findings: dict[str, Diagnostic] = {}
         for case in cases:
             try:
-                self._holds[case.name] = _compiled(text, case.type)
-            except ExpressionError as error:
+                lowered = lower_condition(_checked(text, case.type), case, envelope)
+                self._conditions[case.name] = NativeCondition(library(), lowered)
+            except (ExpressionError, TooLargeError) as error:
                 findings[case.name] = error.diagnostic
-        if not self._holds:
+        if not self._conditions:
             likely = min(findings.values(), key=lambda each: not each.hint.startswith("did you mean"))
             raise UsageError(f"--where: {likely.message}", likely.hint)
 
     @property
     def cases(self) -> frozenset[str]:
         """Those that it can be asked of."""
-        return frozenset(self._holds)
+        return frozenset(self._conditions)
 
     def holds(self, case: str, payload: Message, source: str, received_at: int) -> bool:
-        try:
-            return case in self._holds and self._holds[case](payload, source, received_at)
-        except MAPPING_FAILURES as error:
-            self.failure = self.failure or f"{case}: {error}"
+        if (condition := self._conditions.get(case)) is None:
             return False
+        holds = condition.holds(payload.SerializeToString(), source, received_at)
+        if holds is None:
+            self.failure = self.failure or f"{case}: it has no value for all payloads, as in a division by zero"
+        return bool(holds)
 
 
-def _compiled(text: str, message: MessageType) -> Holds:
+def _checked(text: str, message: MessageType) -> Node:
     """Raises ExpressionError."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
     place = TextPlace(span, ((0, span),))
@@ -81,12 +80,7 @@ def _compiled(text: str, message: MessageType) -> Holds:
         raise ExpressionError(
             span, Code.TYPE_MISMATCH, f"it is {node.kind}, not a bool", "compare something, as in speed > 0"
         )
-    out = Source()
-    with out.block(f"def {FUNCTION}(m, source, received_at):", span):
-        out.line(f"return {out.expression(render(node))}", span)
-    names: dict[str, object] = {**NAMESPACE}
-    exec(out.compile("--where"), names)  # noqa: S102 - of checked expressions, as in handlers
-    return cast("Holds", names[FUNCTION])
+    return node
 
 
 def _enums(message: MessageType) -> Iterator[Enum]:

@@ -71,14 +71,15 @@ class EngineRehearsal:
             if before.get(route, deadman) is not deadman:
                 deadman.replace(before[route])
         left = [timer for timer in reversed(self._timers) if any(timer is each for each in state.left())]
-        for timer in [each for each in left if not isinstance(each, Deadman)] + [
-            each for each in left if isinstance(each, Deadman)
-        ]:
+        for timer in left:
             self._timers.remove(timer)
+        for timer in [each for each in left if not isinstance(each, Deadman)]:
             timer.end(self.now)
         places = {(each.route, target.label) for each in program.handlers for target in each.targets}
         for pacer in pacers.values():
             pacer.keep_only(self.now, places)
+        for deadman in [each for each in left if isinstance(each, Deadman)]:  # after the commands that waited
+            deadman.end(self.now)
         state.forget_previous()
         self._state, self._deadmen = state, deadmen
 

@@ -62,11 +62,12 @@ def test_datagrams_are_heard_in_order(wire: Wire) -> None:
     assert first.peer.startswith("port ")
 
 
-CASES = sim_program().envelope.cases
+ENVELOPE = sim_program().envelope
+CASES = ENVELOPE.cases
 
 
 def holds(text: str, case: str, source: str = "sensor_board", **fields: object) -> bool:
-    return Condition(text, [CASES[case]]).holds(case, CASES[case].message_class(**fields), source, 0)
+    return Condition(text, ENVELOPE, [CASES[case]]).holds(case, CASES[case].message_class(**fields), source, 0)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +91,7 @@ def test_a_condition_is_an_expression_over_the_payload(text: str, is_true: bool)
 
 
 def test_cases_without_the_field_are_left_out() -> None:
-    condition = Condition("satellites < 4", list(CASES.values()))
+    condition = Condition("satellites < 4", ENVELOPE, list(CASES.values()))
     assert condition.cases == {"gps_info"}
     assert not condition.holds("imu_info", CASES["imu_info"].message_class(), "sensor_board", 0)
 
@@ -106,11 +107,11 @@ def test_cases_without_the_field_are_left_out() -> None:
 )
 def test_what_is_no_condition_is_refused(text: str, complaint: str) -> None:
     with pytest.raises(UsageError) as refused:
-        Condition(text, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
+        Condition(text, ENVELOPE, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
     assert str(refused.value).startswith(complaint)
 
 
 def test_where_it_cannot_be_computed_it_does_not_hold_and_is_remembered() -> None:
-    condition = Condition("altitude / speed > 1", [CASES["gps_info"]])
+    condition = Condition("altitude / speed > 1", ENVELOPE, [CASES["gps_info"]])
     assert not condition.holds("gps_info", CASES["gps_info"].message_class(), "sensor_board", 0)
     assert condition.failure.startswith("gps_info: ")

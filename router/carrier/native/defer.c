@@ -103,9 +103,9 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deferral *deferral = (struct deferral *)timer;
+    release(timers, deferral, now);
     deferral->has_ended = true;
     if (deferral->pacer) pacer_release(timers, deferral->pacer, &deferral->of, now);
-    release(timers, deferral, now);
     timers_remove(timers, timer);
 }
 

@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "evaluate.h"
 #include "route.h"
 
 struct rehearsal {
@@ -206,4 +207,28 @@ const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size) {
     *size = rehearsal->size;
     rehearsal->size = 0;
     return rehearsal->is_incomplete ? NULL : rehearsal->records;
+}
+
+/* ---- conditions by themselves ---- */
+
+static int evaluate_on_payload(struct machine *machine, const struct layout *layout, const struct code *condition,
+                               const struct value *source, int64_t received_at, const void *payload, size_t size,
+                               bool *holds) {
+    uint32_t at;
+    if (!machine_open(machine)) return LOSSES;
+    machine_begin(machine, layout);
+    machine->slots[SLOT_RECEIVED_AT].integer = received_at;
+    machine->slots[SLOT_SOURCE] = *source;
+    if (!machine_read(machine, NODE_PAYLOAD, payload, size)) return LOSS_MAPPING_ERROR;
+    return evaluate_condition(machine, condition, holds, &at);
+}
+
+int condition_holds(const struct layout *layout, const struct code *condition, const struct value *source,
+                    int64_t received_at, const void *payload, size_t size, bool *holds) {
+    struct machine *machine = calloc(1, sizeof *machine);
+    if (!machine) return LOSSES;
+    int outcome = evaluate_on_payload(machine, layout, condition, source, received_at, payload, size, holds);
+    machine_close(machine);
+    free(machine);
+    return outcome;
 }

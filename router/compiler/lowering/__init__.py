@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions.kinds import UINT32, StringKind
+from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.nodes import Node
@@ -18,7 +19,7 @@ from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
 from router.compiler.lowering.sources import Collected, Datagram, Elements, RosMessage
 from router.errors import Diagnostic
 from router.table.model import Route
-from router.types.protobuf import Envelope
+from router.types.protobuf import Envelope, PayloadCase
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +95,14 @@ class LoweredFeed:
 
 
 @dataclass(frozen=True, slots=True)
+class LoweredCondition:
+    """A condition on a payload, and the fields that it reads. Slots are those of a LoweredRoute."""
+
+    code: Code
+    layout: Layout
+
+
+@dataclass(frozen=True, slots=True)
 class Lowered:
     """All that the carrier runs for a table.
 
@@ -114,6 +123,13 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Low
         table.add(checked)
     carried = {topic: tuple(feeds) for topic, feeds in table.from_ros.items()}
     return Lowered(table.conditions, table.topics, carried), table.findings
+
+
+def lower_condition(condition: Tree, case: PayloadCase, envelope: Envelope) -> LoweredCondition:
+    """Lower a condition on a payload by itself. Raises TooLargeError."""
+    source = Datagram(case, envelope)
+    code = source.condition(source.lowering(), [condition]).code
+    return LoweredCondition(code, source.layout(condition.span))
 
 
 class _Table:

@@ -1,0 +1,35 @@
+"""Conditions on payloads by themselves, evaluated as `when` of a route is."""
+
+from __future__ import annotations
+
+import ctypes
+
+from router.carrier.lowered import Programs, native_values
+from router.carrier.structures import LOSSES
+from router.compiler.lowering import LoweredCondition
+
+_EVALUATED = -1
+
+
+class NativeCondition:
+    """A condition on the payloads of one case."""
+
+    def __init__(self, library: ctypes.CDLL, lowered: LoweredCondition) -> None:
+        self._arrays: list[object] = []
+        programs = Programs(lowered.layout, self._arrays)
+        self._code = programs.code(lowered.code)
+        self._layout = programs.layout()
+        self._holds = library.condition_holds
+
+    def holds(self, payload: bytes, source: str, received_at: int) -> bool | None:
+        """Whether it holds for a payload, from whom, received when (wall clock, ns); None where it has no value.
+
+        Raises MemoryError.
+        """
+        named: list[object] = []
+        sender, holds = native_values([source.encode()], named), ctypes.c_bool()
+        code, size = ctypes.byref(self._code), len(payload)
+        outcome = self._holds(self._layout, code, sender, received_at, payload, size, ctypes.byref(holds))
+        if outcome == len(LOSSES):
+            raise MemoryError("a condition cannot be evaluated")
+        return holds.value if outcome == _EVALUATED else None
