@@ -21,7 +21,7 @@ struct name {
         uint8_t text[LONGEST_NAME];
     };
 };
-enum { IS_INTEGER = UINT32_MAX };
+#define IS_INTEGER UINT32_MAX
 
 /* A datagram of a frame. */
 struct part {

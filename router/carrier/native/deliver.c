@@ -140,17 +140,9 @@ static enum loss loss_of(int error) {
     return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
 }
 
-static void send_it(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
-                    size_t size, int64_t expires, int64_t now) {
-    int error = stage->send(stage, target, data, size, expires);
-    if (error == COMMAND_STALE) {
-        lose_stale(stage, to, target, now);
-    } else if (error) {
-        lose_message(stage, to, target, now, (struct lost_event){.reason = loss_of(error), .error = error}, "");
-    } else {
-        stage_count(stage, target->delivered, 1);
-        stage_count(stage, target->delivered_bytes, (int64_t)size);
-    }
+static void lose_unsent(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int error) {
+    if (error == COMMAND_STALE) lose_stale(stage, to, target, now);
+    else lose_message(stage, to, target, now, (struct lost_event){.reason = loss_of(error), .error = error}, "");
 }
 
 static bool publish_it(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
@@ -164,11 +156,23 @@ static bool publish_it(struct stage *stage, const struct targets *to, const stru
     }
 }
 
+/* As `deliver_now`; part of `deliver`, where each instruction counts. */
+static inline bool leave(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+                         size_t size, int64_t expires, int64_t now) {
+    if (target->topic) return publish_it(stage, to, target, now);
+    int error = stage->send(stage, target, data, size, expires);
+    if (error) {
+        lose_unsent(stage, to, target, now, error);
+    } else {
+        stage_count(stage, target->delivered, 1);
+        stage_count(stage, target->delivered_bytes, (int64_t)size);
+    }
+    return true;
+}
+
 bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
                  size_t size, int64_t expires, int64_t now) {
-    if (target->topic) return publish_it(stage, to, target, now);
-    send_it(stage, to, target, data, size, expires, now);
-    return true;
+    return leave(stage, to, target, data, size, expires, now);
 }
 
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
@@ -188,7 +192,7 @@ bool deliver(struct stage *stage, const struct targets *to, const struct target 
     if (!fits_board(&of)) return true;
     if (target->trims) of.size = trimmed_size(of.data, of.size);
     if (target->deferral) return defer(stage, target->deferral, of.data, of.size, of.expires, message->now);
-    return deliver_now(stage, to, target, of.data, of.size, of.expires, message->now);
+    return leave(stage, to, target, of.data, of.size, of.expires, message->now);
 }
 
 bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message) {
