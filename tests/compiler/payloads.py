@@ -13,7 +13,6 @@ from router.compiler.expressions import Scope
 from router.compiler.expressions.tree import paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
-from router.compiler.payload import write_envelope
 from router.compiler.plan import expressions
 from router.compiler.python import NO_VALUES
 from router.compiler.source import Source
@@ -22,6 +21,7 @@ from router.table.model import FieldMap
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
+from tests.oracles.python_engine.payload import write_envelope
 from tests.oracles.reference import fill_given
 from tests.oracles.reference_protobuf import envelope_of
 from tests.tables import PROTOS

@@ -15,10 +15,10 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
+from router.compiler.constants import constant_envelope
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
 from router.compiler.namespace import MAPPING_FAILURES
-from router.compiler.payload import constant_envelope
 from router.errors import Code, MappingError, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
