@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
+from router.compiler.constants import constant_envelope
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
-from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import Code, Diagnostic, Located, MappingError, SourceSpan, did_you_mean

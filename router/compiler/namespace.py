@@ -1,4 +1,4 @@
-"""The names that generated code can call, beside those that the engine binds for its targets.
+"""The names that generated code in Python can call.
 
 A value that a field cannot hold raises MappingError.
 """

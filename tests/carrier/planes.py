@@ -15,7 +15,6 @@ from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable,
 from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
 from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
-from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
 from router.compiler.python import NO_VALUES, render
 from router.compiler.source import Source
@@ -26,6 +25,7 @@ from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import FILTERED, Delivering
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, written
 from tests.compiler.payloads import Wire
+from tests.oracles.python_engine.payload import write_envelope
 
 TOPIC = "topic"
 MAPPING_ERROR, NON_FINITE = "mapping_error", "non_finite"

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from router.compiler.lookup import Definitions
 from router.rehearsal.cdr import serialize as cdr
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import FILTERED
 from tests.carrier.planes import MAPPING_ERROR, Made, Misfit, Plane, from_ros
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome
 from tests.compiler.generated_types import mirror, payload_sources, values
-from tests.compiler.payloads import Wire, made_wire, rover_wire
+from tests.compiler.payloads import Wire, as_ros, made_wire, rover_wire
 from tests.compiler.test_expressions import SOURCE as PAYLOAD
 from tests.oracles.reference import fill
 
@@ -39,33 +39,6 @@ def serialized(declared: MessageType, message: Any) -> bytes:
 
 def source_of(**fields: Type) -> MessageType:
     return MessageType("made/msg/Source", tuple(Field(name, type_) for name, type_ in fields.items()))
-
-
-def as_ros(declared: Type) -> Any:
-    """A type that ROS has, whose values fill the same fields."""
-    match declared:
-        case Bytes():
-            return List(U8)
-        case Enum():
-            return U8
-        case List():
-            return List(as_ros(declared.element), declared.length, declared.bound)
-        case MessageType():
-            possible = [field for field in declared.fields if _exists_in_ros(field.type)]
-            return MessageType(declared.name, tuple(Field(field.name, as_ros(field.type)) for field in possible))
-        case _:
-            return declared
-
-
-def _exists_in_ros(declared: Type) -> bool:
-    """There are no lists of lists, and messages with nothing else in them have nothing in common with others."""
-    match declared:
-        case List():
-            return not isinstance(declared.element, (Bytes, List)) and _exists_in_ros(declared.element)
-        case MessageType():
-            return not declared.fields or any(_exists_in_ros(field.type) for field in declared.fields)
-        case _:
-            return True
 
 
 def messages(declared: MessageType) -> st.SearchStrategy[bytes]:

@@ -22,7 +22,6 @@ from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable, paths_in
 from router.compiler.mapping import build
 from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
-from router.compiler.payload import write_envelope
 from router.compiler.plan import Record, expressions
 from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source
@@ -36,6 +35,7 @@ from tests.carrier.messages import some_payloads
 from tests.compiler.comparing import same
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, written
 from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
+from tests.oracles.python_engine.payload import write_envelope
 from tests.oracles.reference import fill, fill_given
 from tests.oracles.reference_expressions import Context, meaning_of
 from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Message, Refused, View, Whole

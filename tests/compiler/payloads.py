@@ -1,26 +1,27 @@
-"""Payloads of every kind of field (`protos/made`), and mappings compiled to functions that make envelopes of them."""
+"""Payloads of every kind of field (`protos/made`), and mappings that make envelopes of them."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 from types import SimpleNamespace
 from typing import Any
 
-from router.compiler.cdr import CdrReads
+from router.carrier.build import LIBRARY, is_current
+from router.carrier.build import build as build_library
+from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions import Scope
-from router.compiler.expressions.tree import paths_in
+from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
-from router.compiler.payload import write_envelope
-from router.compiler.plan import expressions
-from router.compiler.python import NO_VALUES
-from router.compiler.source import Source
-from router.errors import Located
-from router.table.model import FieldMap
-from router.types.model import Field, MessageType, Type
+from router.errors import Located, MappingError
+from router.rehearsal.cdr import serialize as cdr
+from router.table.model import Destination, FieldMap, Topic
+from router.types.model import Bytes, Enum, Field, Int, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
+from tests.carrier.delivering import Delivering, delivering
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
 from tests.oracles.reference import fill_given
 from tests.oracles.reference_protobuf import envelope_of
@@ -28,7 +29,7 @@ from tests.tables import PROTOS
 
 Wire = tuple[ProtoSchema, Envelope]
 MakeEnvelope = Callable[[Any], bytes]
-"""Takes a message of the source's type. Raises one of MAPPING_FAILURES."""
+"""Takes a message of the source's type. Raises MappingError, or one of MAPPING_FAILURES."""
 
 
 @cache
@@ -48,25 +49,81 @@ def wire_of(root: Path, name: str) -> Wire:
     return schema, find_envelope(schema, Located("payload", SPAN))
 
 
-def compiled_envelope(
-    wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType, *, is_serialized: bool = False
-) -> MakeEnvelope:
-    """What the compiler makes of a mapping without findings. The message comes as an object, or as CDR bytes."""
-    schema, _ = wire
-    scope = Scope(source, tuple(schema.enums.values()), ())
-    mapping = build(fields, case.type, scope, SPAN)
+def compiled_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
+    """What the machine in C makes of a mapping without findings, of a message that comes from ROS."""
+    received = as_ros(source)
+    made = machine_envelope(wire, case, fields, received)
+    return lambda message: made(cdr(received, as_values(received, message)))
+
+
+def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> Callable[[bytes], bytes]:
+    """The same, of messages in CDR. `source` is a type that ROS has."""
+    schema, envelope = wire
+    mapping = build(fields, case.type, Scope(source, tuple(schema.enums.values()), ()), SPAN)
     assert mapping.findings == []
-    out = Source()
-    with out.block(f"def envelope({'cdr' if is_serialized else 'm'}, source, received_at):", SPAN):
-        reads = CdrReads(source, (path for node in expressions(mapping.plan) for path in paths_in(node)))
-        if is_serialized:
-            reads.write(out, SPAN)
-        values = reads.values if is_serialized else NO_VALUES
-        out.line(f"return {write_envelope(out, mapping.plan, case, 'it', values)}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    function = namespace["envelope"]
-    return lambda message: function(message, SOURCE, RECEIVED_AT)
+    route: Any = SimpleNamespace(name="route", ttl=None, ignore=None, span=SPAN)
+    target = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=mapping.plan)
+    feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, None, None, (target,))
+    lowered, findings = lower_table([CheckedRoute(route, case, subscriptions=(feed,))], envelope)
+    assert findings == []
+    carrier = Delivering(_functions(), lowered.from_ros[SOURCE][0], RECEIVED_AT, "not of ROS")
+
+    def make(message: bytes) -> bytes:
+        (outcome,) = carrier.from_ros(message)
+        if isinstance(outcome.got, str):
+            raise MappingError(outcome.got)
+        return outcome.got
+
+    return make
+
+
+@cache
+def _functions() -> ctypes.CDLL:
+    folder = Path(mkdtemp())
+    library = LIBRARY if is_current() else build_library(folder / LIBRARY.name)
+    return delivering(folder / "delivering.so", library, is_sanitized=False)
+
+
+def as_ros(declared: Type) -> Any:
+    """A type that ROS has, whose values fill the same fields."""
+    match declared:
+        case Bytes():
+            return List(Int(8, signed=False))
+        case Enum():
+            return Int(32, signed=True)
+        case List():
+            return List(as_ros(declared.element), declared.length, declared.bound)
+        case MessageType():
+            possible = [field for field in declared.fields if _exists_in_ros(field.type)]
+            return MessageType(declared.name, tuple(Field(field.name, as_ros(field.type)) for field in possible))
+        case _:
+            return declared
+
+
+def _exists_in_ros(declared: Type) -> bool:
+    """There are no lists of lists, and messages with nothing else in them have nothing in common with others."""
+    match declared:
+        case List():
+            return not isinstance(declared.element, (Bytes, List)) and _exists_in_ros(declared.element)
+        case MessageType():
+            return not declared.fields or any(_exists_in_ros(field.type) for field in declared.fields)
+        case _:
+            return True
+
+
+def as_values(declared: MessageType, message: Any) -> dict[str, Any]:
+    """A message by the names of its fields, in it as well."""
+    return {field.name: _value(field.type, getattr(message, field.name)) for field in declared.fields}
+
+
+def _value(declared: Type, value: Any) -> Any:
+    match declared:
+        case MessageType():
+            return as_values(declared, value)
+        case List():
+            return [_value(declared.element, each) for each in value]
+        case _:
+            return value
 
 
 def reference_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
@@ -99,10 +156,9 @@ def made(case: str, fields: FieldMap, /, **given: tuple[Type, Any]) -> Any:
 
 
 def assert_same_bytes(wire: Wire, found: bytes, expected: bytes) -> None:
-    """Assert that two envelopes are the same bytes, but for the order of a map's entries: protobuf does not fix it."""
+    """Assert that two envelopes are equal, but for the entries of a map: in any order, of a key the last counts."""
     payload = wire[1].message_class.FromString(expected)
     if any(isinstance(value, Mapping) for _, case in payload.ListFields() for _, value in case.ListFields()):
-        assert len(found) == len(expected)
         found, expected = (
             wire[1].message_class.FromString(each).SerializeToString(deterministic=True) for each in (found, expected)
         )

@@ -23,7 +23,6 @@ from router.compiler.expressions.tree import Node, paths_in
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
 from router.compiler.namespace import NAMESPACE
-from router.compiler.payload import write_envelope
 from router.compiler.plan import expressions
 from router.compiler.program import Handler, Program
 from router.compiler.python import NO_VALUES, Values, render
@@ -31,6 +30,7 @@ from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
 from router.table.model import OnLimit, Route
 from router.types.protobuf import PayloadCase
+from tests.oracles.python_engine.payload import write_envelope
 
 Deliver = Callable[[str, CheckedTarget], None]
 """Appends the lines that hand the message to a target."""

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from router.compiler.expressions.tree import Call, Constant, Element, Node, Read, Variable
-from router.compiler.namespace import constant_bytes
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.python import NO_VALUES, Values, lists_of, render
 from router.compiler.source import Source, attribute, call, load, placed
@@ -39,14 +38,6 @@ def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str, valu
     out.line(f"payload = {make}()", plan.span)
     _Writer(out, present, clear, values).fill("payload", plan)
     return f"{envelope}({serialize}(payload))"
-
-
-def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
-    """The envelope of a plan whose expressions read no message.
-
-    Raises MappingError or ValueError when it cannot be built.
-    """
-    return constant_bytes(lambda out: write_envelope(out, plan, case, case.name), plan.span)
 
 
 def _envelope(number: int) -> Callable[[bytes], bytes]:
@@ -131,7 +122,7 @@ class _Writer:
         """Set one entry of a map; of two with the same key the later one stays."""
         plans = {member.name: made for member, made in entry.members}
         key, value = plans["key"], plans["value"]
-        assert isinstance(key, Leaf)  # noqa: S101 - both parts are required
+        assert isinstance(key, Leaf)
         place = f"{where}[{self._value(key)}]"
         if isinstance(value, Leaf):
             self.out.line(f"{place} = {self._value(value)}", entry.span)
