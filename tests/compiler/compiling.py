@@ -5,19 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from router.compiler.cdr import write_message
 from router.compiler.expressions import Scope, check
-from router.compiler.expressions.tree import Node
+from router.compiler.expressions.kinds import (
+    BoolKind,
+    BytesKind,
+    EnumKind,
+    FloatKind,
+    IntKind,
+    Kind,
+    ListKind,
+    StringKind,
+    TimeKind,
+    element_of,
+)
+from router.compiler.expressions.tree import Each as Computed
+from router.compiler.expressions.tree import Listed, Node, Variable
 from router.compiler.mapping import build
-from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
+from router.compiler.plan import Each, Items, Leaf, Record
 from router.compiler.program import Handler, Program
-from router.compiler.python import render
-from router.compiler.source import Source
 from router.errors import Diagnostic, Located, SourceSpan
+from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
-from router.types.model import Enum, MessageType, Type
+from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.machine import FAILURES, machine
 from tests.oracles.python_engine.binding import bind
 from tests.oracles.python_engine.freshness import Born, Freshness
 from tests.oracles.python_engine.rig import Rig
@@ -70,24 +82,57 @@ def compiled(
 ) -> tuple[Node, Callable[[Any], Any]]:
     """A checked expression, and as a function of the message. Raises ExpressionError."""
     node = check(written(expression) if isinstance(expression, str) else expression, scope, expected)
-    out = Source()
-    with out.block("def evaluate(m, source, received_at):", SPAN):
-        out.line(f"return {out.expression(render(node))}", SPAN)
-    namespace: dict[str, Any] = dict(NAMESPACE)
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return node, lambda message: namespace["evaluate"](message, SOURCE, RECEIVED_AT)
+    return node, lambda message: _evaluator(node, scope)(message)  # noqa: PLW0108 - most are not run
+
+
+def _evaluator(node: Node, scope: Scope) -> Callable[[Any], Any]:
+    planned = _planned(node)
+    target = MessageType("made/msg/It", (Field("it", planned.type),))
+    make = machine(Record(target, ((target.fields[0], planned),), SPAN), scope.message, target, RECEIVED_AT, SOURCE)
+
+    def evaluate(message: Any) -> Any:
+        made = deserialize(target, make(message)).it
+        return bytes(made) if isinstance(node.kind, BytesKind) else made
+
+    return evaluate
+
+
+def _planned(node: Node) -> Leaf | Items | Each:
+    """A field that an expression fills as it is."""
+    element = element_of(node.kind)
+    if element is None and not isinstance(node.kind, ListKind):
+        return Leaf(_type_of(node.kind), node, SPAN)
+    declared = List(_type_of(element) if element is not None else Float(64))
+    if isinstance(node, Listed):
+        return Items(declared, tuple(Leaf(declared.element, item, SPAN) for item in node.items), SPAN)
+    assert element is not None
+    if isinstance(node, Computed):
+        return Each(declared, node.lists, Leaf(declared.element, node.element, SPAN), SPAN)
+    variable = Variable(element, SPAN, "an element")
+    return Each(declared, ((variable.name, node),), Leaf(declared.element, variable, SPAN), SPAN)
+
+
+def _type_of(kind: Kind) -> Type:
+    match kind:
+        case BoolKind():
+            return Bool()
+        case FloatKind():
+            return Float(64)
+        case StringKind():
+            return String()
+        case IntKind(high=high):
+            return Int(64, signed=high < 1 << 63)
+        case EnumKind() | TimeKind():
+            return Int(64, signed=True)
+        case _:
+            raise AssertionError(f"{kind} is no value")
 
 
 def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[[Any], bytes]:
     """A function from a message to the CDR bytes of the topic that `fields` fills."""
     mapping = build(fields, target, scope, SPAN)
     assert mapping.findings == []
-    out = Source()
-    with out.block("def serialize(m, source, received_at):", SPAN):
-        out.line(f"return {write_message(out, mapping.plan, 'it')}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return lambda message: bytes(namespace["serialize"](message, SOURCE, RECEIVED_AT))
+    return machine(mapping.plan, scope.message, target, RECEIVED_AT, SOURCE)
 
 
 def findings_of(fields: FieldMap, target: MessageType, scope: Scope) -> list[Diagnostic]:
@@ -102,8 +147,8 @@ def outcome(make: Callable[[], Any]) -> Any:
     """What `make` gives, or the class of the failure: every one that the engine counts is equal here."""
     try:
         return make()
-    except MAPPING_FAILURES:
-        return MAPPING_FAILURES
+    except FAILURES:
+        return FAILURES
 
 
 DATAGRAM = b"\x18\x01"

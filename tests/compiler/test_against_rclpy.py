@@ -12,11 +12,11 @@ from hypothesis import given
 
 from router.compiler import Checked
 from router.compiler.lookup import Definitions
-from router.compiler.namespace import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same, without_nul
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer
 from tests.compiler.generated_types import EACH_TYPE, mirror, values
+from tests.compiler.machine import FAILURES
 from tests.compiler.reading import WHOLE, at, field_values, plain, reader, wanted_paths
 from tests.oracles.reference import fill
 
@@ -42,7 +42,7 @@ def assert_equal_bytes(declared: MessageType, source: MessageType, message: Any)
     """`source` is the declared type's mirror, so that `auto` maps all of it."""
     value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
     ours = outcome(lambda: serializer(AUTO, declared, scope_of(source))(message))
-    if value is MAPPING_FAILURES or ours is MAPPING_FAILURES:
+    if value is FAILURES or ours is FAILURES:
         assert value is ours
         return
     assert_same_message(ours, serialized(declared.name, value), declared, value)

@@ -12,11 +12,11 @@ import pytest
 from router.compiler import check_table
 from router.compiler.expressions import ExpressionError
 from router.compiler.mapping import build
-from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import Code
 from router.table.model import Expression, FieldMap
 from router.types.model import Bool, Enum, Field, Float, Int, MessageType, String
 from tests.compiler.compiling import SPAN, chosen, compiled, field_map, scope_of, serializer, written
+from tests.compiler.machine import FAILURES
 from tests.tables import ROUTES
 
 GEAR = Enum("Gear", (("PARK", 0), ("DRIVE", 1), ("REVERSE", -1), ("GO", 1)))
@@ -44,7 +44,7 @@ def test_an_enum_chooses_by_the_names_of_its_values() -> None:
 def test_a_number_without_a_name_is_refused_without_else_and_takes_it_with_one(gear: int) -> None:
     named = {"PARK": "1", "DRIVE": "2", "REVERSE": "3"}
     assert value(chosen("gear", named, "4"), gear=gear) == 4
-    with pytest.raises(MAPPING_FAILURES):
+    with pytest.raises(FAILURES):
         value(chosen("gear", named), gear=gear)
 
 

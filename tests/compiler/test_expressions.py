@@ -41,7 +41,7 @@ from router.compiler.expressions.tree import (
     paths_in,
 )
 from router.compiler.mapping import build
-from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
+from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
 from router.rehearsal.cdr import serialize as cdr
@@ -58,6 +58,7 @@ from tests.compiler.compiling import (
     written,
 )
 from tests.compiler.generated_types import values
+from tests.compiler.machine import FAILURES
 from tests.compiler.reading import TIMES
 from tests.oracles.reference import Value
 from tests.oracles.reference_expressions import evaluate
@@ -279,7 +280,7 @@ def test_integer_is_a_float_where_an_expression_gives_either(text: str) -> None:
 def test_a_time_has_64_bits(text: str, time: int | None) -> None:
     _, run = compiled(text, scope_of(SOURCE))
     message = SimpleNamespace(u64=(1 << 64) - 1)
-    assert outcome(lambda: run(message)) == (MAPPING_FAILURES if time is None else time)
+    assert outcome(lambda: run(message)) == (FAILURES if time is None else time)
 
 
 def test_bounds_of_clamp_and_wrap_come_from_the_field() -> None:

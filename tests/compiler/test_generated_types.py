@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
-from router.compiler.namespace import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, context_of, outcome, reference_bytes, scope_of, serializer
 from tests.compiler.generated_types import STATE, pairs, values
+from tests.compiler.machine import FAILURES
 from tests.oracles.reference import Value, fill
 
 MANY = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
@@ -29,7 +29,7 @@ def test_compiled_bytes_equal_the_reference(data: st.DataObject) -> None:
     message = data.draw(values(source))
     scope, context = scope_of(source, [STATE]), context_of(message, source, [STATE])
     compiled = outcome(lambda: serializer(AUTO, target, scope)(message))
-    event("refused" if compiled is MAPPING_FAILURES else "published")
+    event("refused" if compiled is FAILURES else "published")
     assert compiled == outcome(lambda: reference_bytes(AUTO, target, context))
 
 
@@ -43,7 +43,7 @@ def test_reference_bytes_equal_those_of_rosbags(data: st.DataObject) -> None:
         return  # rosbags has none
     message = data.draw(values(source))
     value = outcome(lambda: fill(AUTO, target, context_of(message, source, [STATE])))
-    if value is not MAPPING_FAILURES:
+    if value is not FAILURES:
         assert cdr(target, value) == rosbags_bytes(target, value)
 
 

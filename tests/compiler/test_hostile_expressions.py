@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.compiler.expressions import DEEPEST, ExpressionError
-from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.python import render
 from router.compiler.source import Source
 from router.errors import Code
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, compiled, scope_of
+from tests.compiler.machine import FAILURES
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))
 INNER = MessageType("Inner", (Field("x", Float(32)),))
@@ -156,5 +156,5 @@ def test_what_is_well_formed_fails_only_in_ways_that_are_counted() -> None:
     for text in ["1 / a", "f ** 8", "numbers[0]", "round(f * 10)", "sqrt(-1)", "1 % a", "float32(f)",
                  "(round(f) ** 8) / 2", "many[3].x", "time_from_seconds(f * f)"]:  # fmt: skip
         _, run = compiled(text, scope_of(SOURCE, [MODE]))
-        with pytest.raises(MAPPING_FAILURES):
+        with pytest.raises(FAILURES):
             run(message)

@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 from router.compiler.expressions import ExpressionError
 from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, Kind, StringKind
-from router.compiler.namespace import MAPPING_FAILURES
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import compiled, context_of, outcome, scope_of, written
@@ -37,6 +36,7 @@ from tests.compiler.judging import (
     question,
 )
 from tests.compiler.language import Language, language_wire, some_language
+from tests.compiler.machine import FAILURES
 from tests.oracles.reference_expressions import Context, evaluate
 from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused
 
@@ -235,7 +235,7 @@ def test_values_are_in_the_range_that_the_compiler_knows(noise: random.Random) -
         reject()
     for _, view in messages(noise, language):
         value = outcome(partial(run, view.message))
-        if value is not MAPPING_FAILURES:
+        if value is not FAILURES:
             assert_of_kind(value, node.kind)
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import compiled, field_map, scope_of, serializer
+from tests.compiler.machine import FAILURES
 
 I64, U64, U32 = Int(64, signed=True), Int(64, signed=False), Int(32, signed=False)
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))
@@ -167,7 +167,7 @@ def test_value_with_lists(text: str, given: dict[str, Any], expected: object) ->
     ],
 )
 def test_what_has_no_value_is_a_mapping_error(text: str, given: dict[str, Any]) -> None:
-    with pytest.raises(MAPPING_FAILURES) as caught:
+    with pytest.raises(FAILURES) as caught:
         value(text, **given)
     assert not isinstance(caught.value, NonFiniteError)
 
@@ -223,5 +223,5 @@ def _plain(found: Any) -> list[Any]:
     ],
 )
 def test_what_does_not_fit_is_refused(declared: Type, text: str, given: dict[str, Any]) -> None:
-    with pytest.raises(MAPPING_FAILURES):
+    with pytest.raises(FAILURES):
         filled(declared, text, **given)

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from hypothesis import assume, given
 
-from router.compiler.namespace import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Field, Int, List, MessageType, String, Type
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
 from tests.compiler.generated_types import EACH_TYPE, mirror, values
 from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
+from tests.compiler.machine import FAILURES
 from tests.compiler.reading import WHOLE, field_values, reader
 from tests.oracles.reference import fill
 
@@ -64,7 +64,7 @@ def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) 
     def equal(message: Any) -> None:
         value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
         ours = outcome(lambda: serializer(AUTO, declared, scope_of(source))(message))
-        if value is MAPPING_FAILURES or ours is MAPPING_FAILURES:
+        if value is FAILURES or ours is FAILURES:
             assert ours is value
             return
         assert ours == cdr(declared, value)
@@ -85,7 +85,7 @@ def test_message_of_rclpy_is_read(package: InterfacePackage, name: str) -> None:
     @given(values(source))
     def equal(message: Any) -> None:
         value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
-        assume(value is not MAPPING_FAILURES)
+        assume(value is not FAILURES)
         theirs, _ = package.ask(name, value, cdr(declared, value))
         (found,) = read_whole(theirs)
         assert same(field_values(found, declared), value)
@@ -108,4 +108,4 @@ def test_text_with_a_nul_is_refused_because_rclpy_would_cut_it() -> None:
     target = MessageType("made/msg/Text", fields=(Field("text", String()),))
     source = MessageType("Source", fields=(Field("text", String()),))
     message = SimpleNamespace(text="a\0b")
-    assert outcome(lambda: serializer(AUTO, target, scope_of(source))(message)) is MAPPING_FAILURES
+    assert outcome(lambda: serializer(AUTO, target, scope_of(source))(message)) is FAILURES
