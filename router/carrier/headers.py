@@ -56,7 +56,7 @@ class _Declared:
     constants: list[tuple[str, str]] = field(default_factory=list)
     """By name, what each one is in Python."""
     enums: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
-    """By tag, the enumerators."""
+    """By tag, the enumerators and what each one is in Python."""
     structures: dict[str, list[_Member]] = field(default_factory=dict)
     functions: dict[str, tuple[str, str]] = field(default_factory=dict)
     python: dict[str, str] = field(default_factory=dict)
@@ -74,15 +74,24 @@ def declarations(folder: Path, checksum: str) -> str:
 def checks(folder: Path, made: ModuleType) -> str:
     """C that no compiler takes unless the structures and enumerators of a module are those of the headers."""
     lines = [f'#include "{path.name}"' for path in sorted(folder.glob("*.h"))]
-    for name, structure in made.STRUCTURES.items():
-        lines.append(_asserted(f"sizeof(struct {name})", ctypes.sizeof(structure)))
-        lines += [
-            _asserted(f"offsetof(struct {name}, {each[0]})", getattr(structure, each[0]).offset)
-            for each in structure._fields_
-            if not each[0].startswith("_")
-        ]
+    for tag, structure in made.STRUCTURES.items():
+        lines.append(_asserted(f"sizeof(struct {tag})", ctypes.sizeof(structure)))
+        for name in _names(structure):
+            member = getattr(structure, name)
+            lines.append(_asserted(f"offsetof(struct {tag}, {name})", member.offset))
+            lines.append(_asserted(f"sizeof(((struct {tag} *)0)->{name})", member.size))
     lines += [_asserted(name, value) for name, value in made.ENUMERATORS.items()]
     return "\n".join(["#include <stddef.h>", *lines, ""])
+
+
+def _names(structure: type[ctypes.Structure | ctypes.Union]) -> Iterator[str]:
+    """Its fields, with those of unions in it."""
+    unions = getattr(structure, "_anonymous_", ())
+    for name, kind, *_ in structure._fields_:
+        if name in unions:
+            yield from _names(kind)  # type: ignore[arg-type]
+        else:
+            yield name
 
 
 def _asserted(what: str, value: int) -> str:
@@ -164,8 +173,9 @@ def _declare_enum(tag: str, body: str, declared: _Declared) -> None:
     for at, (name, value) in enumerate(enumerators):
         if value:
             base, since = re.sub(r"[A-Z]\w+", lambda found: declared.python[found[0]], value), at
-        plain = _NUMBER.fullmatch(base) is not None
-        python = str(int(base) + at - since) if plain else f"({base}) + {at - since}" if at > since else base
+        python = f"({base}) + {at - since}" if at > since else base
+        if _NUMBER.fullmatch(base):
+            python = str(int(base) + at - since)
         if tag:
             short = name.removeprefix(prefix)
             declared.enums[tag].append((short, python))
@@ -176,7 +186,7 @@ def _declare_enum(tag: str, body: str, declared: _Declared) -> None:
 
 
 def _members(body: str) -> list[_Member] | None:
-    """None if one has a type that Python has no use for, such as a function or something atomic."""
+    """None if one has a type that ctypes has not, such as a function's or an atomic one."""
     made: list[_Member] = []
     for text in _split(body):
         if text.startswith("union {"):
@@ -268,16 +278,13 @@ def _known(structures: Mapping[str, list[_Member]]) -> Iterator[tuple[str, list[
     """Those of which Python knows all members; others are only pointed to."""
     known: set[str] = set()
 
-    def is_known(members: Iterable[_Member]) -> bool:
-        return all(
-            each.pointers or is_known(each.parts)
-            if each.pointers or each.parts
-            else each.type in _PLAIN or each.type.startswith("enum ") or each.type.removeprefix("struct ") in known
-            for each in members
-        )
+    def is_known(member: _Member) -> bool:
+        if member.pointers or member.parts:
+            return all(map(is_known, member.parts))
+        return member.type in _PLAIN or member.type.startswith("enum ") or member.type.removeprefix("struct ") in known
 
     for tag, members in structures.items():
-        if is_known(members):
+        if all(map(is_known, members)):
             known.add(tag)
             yield tag, members
 
