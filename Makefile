@@ -68,5 +68,5 @@ lint: tools  ## ruff, mypy, and what the C compiler warns of
 	@$(ENV) .venv/bin/mypy
 
 clean:  ## remove .venv and what tools left behind
-	rm -rf .venv router/carrier/native/libcarrier.so build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv router/carrier/native/libcarrier.so router/declared.py build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,6 +1,6 @@
 """Puts the carrier's library into a wheel, which is then for one platform and any Python.
 
-Without a C compiler the wheel has none, and is for any platform: Python does the library's work.
+Without a C compiler the wheel has none, only what its headers declare, and is for any platform: nothing runs by it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 LIBRARY = "router/carrier/native/libcarrier.so"
+DECLARED = "router/declared.py"
 
 
 class CarrierBuildHook(BuildHookInterface):  # type: ignore[type-arg]  # what it is generic in is said nowhere
@@ -28,6 +29,9 @@ class CarrierBuildHook(BuildHookInterface):  # type: ignore[type-arg]  # what it
         done = subprocess.run(
             [sys.executable, build, "--output", library], stderr=subprocess.PIPE, text=True, check=False
         )
+        declared = library.with_name(Path(DECLARED).name)
+        if declared.exists():
+            build_data["force_include"][str(declared)] = DECLARED
         if done.returncode:
             self.app.display_warning(f"the wheel lacks the carrier's library\n{done.stderr}")
             return

@@ -10,9 +10,10 @@ from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
+from router.declared import MAX_DATAGRAM
 from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
 from router.table.model import RouteTable
-from router.types.framing import MAX_DATAGRAM, restored
+from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 

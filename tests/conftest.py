@@ -13,16 +13,17 @@ import pytest
 from hypothesis import settings
 
 from router.carrier.build import build, is_current
+
+# Routers of tests run on the library of the sources that there are now.
+if not is_current():
+    build()
+
 from tests.gateway.browser import Browser, executable
 from tests.lanes import LANE
 
 # Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
 os.environ["ROS_DOMAIN_ID"] = str(1 + LANE)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
-# Routers of tests run on the library of the sources that there are now.
-if not is_current():
-    build()
 
 # The rover's table records what came before a deadman trips.
 _recordings = tempfile.TemporaryDirectory(prefix="recordings-")

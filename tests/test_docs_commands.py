@@ -115,6 +115,7 @@ def fresh_clone(folder: Path) -> None:
             tar -C {ROOT} --null --ignore-failed-read -T - -c 2> /dev/null | tar -x
         ln -s {ROOT}/.venv .venv
         cp {ROOT}/router/carrier/native/libcarrier.so router/carrier/native/ 2> /dev/null
+        cp {ROOT}/router/declared.py router/ 2> /dev/null
         echo 'echo "setup: .venv is up to date"' > deploy/setup.sh
         git init -q && git add -A && git -c user.name=test -c user.email=test@localhost commit -qm clone
     """

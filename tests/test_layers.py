@@ -10,19 +10,20 @@ from pathlib import Path
 ROUTER = Path(__file__).parents[1] / "router"
 MODULES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROUTER.rglob("*.py"))}
 
-GROUND = "errors assets clock log threads"
-LANGUAGE = "errors assets table types compiler"
+GROUND = "declared errors assets clock log threads"
+LANGUAGE = "declared errors assets table types compiler"
 IMPORTS = {
+    "declared": "",
     "errors": "",
     "assets": "",
     "clock": "",
     "log": "clock errors",
     "threads": "clock log",
     "table": "errors assets",
-    "types": "errors assets",
+    "types": "declared errors assets",
     "values": "errors types",
-    "compiler": "errors assets table types",
-    "datagrams": "errors table types",
+    "compiler": "declared errors assets table types",
+    "datagrams": "declared errors table types",
     "net": f"{GROUND} {LANGUAGE} datagrams",
     "carrier": f"{GROUND} {LANGUAGE} datagrams net",
     "ros": f"{GROUND} {LANGUAGE}",
@@ -36,7 +37,7 @@ IMPORTS = {
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"errors", "table", "types", "values", "compiler", "datagrams"}
+PURE = {"declared", "errors", "table", "types", "values", "compiler", "datagrams"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -15,10 +15,10 @@ from functools import partial
 from itertools import count
 from time import monotonic, sleep
 
+from router import declared as c
 from router.app.counts import ThreadCounts
 from router.app.from_ros import FromRos, RosTopics
 from router.app.publishing import Publishing, functions_of_rcl
-from router.carrier import structures as c
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen

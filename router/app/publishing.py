@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.outlets import Names
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring

@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from enum import IntFlag
 
-from router.carrier import structures as c
-from router.carrier.schema import WireKind, wire_kind
+from router import declared as c
+from router.carrier.schema import wire_kind
+from router.declared import BoardFlag, WireKind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
-
-
-class _Flag(IntFlag):
-    """`enum board_flag` in board.h."""
-
-    IS_FLOAT = 1
-    IS_REPEATED = 2
-    HAS_FIXED_LENGTH = 4
-    HAS_FIXED_COUNT = 8
 
 
 class NativeBoards:
@@ -30,7 +21,9 @@ class NativeBoards:
             key = id(limits.fields)
             if key not in trees:
                 trees[key] = _Tree(limits.fields)
-            self._boards[name] = c.Board(trees[key].messages, limits.longest, limits.allows_non_finite)
+            self._boards[name] = c.Board(
+                messages=trees[key].messages, longest=limits.longest, allows_non_finite=limits.allows_non_finite
+            )
         self._trees = trees
 
     def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
@@ -57,7 +50,9 @@ class _Tree:
         fields = [self._field(number, field, counters.get(number, 0)) for number, field in ordered]
         array = (c.BoardField * len(fields))(*fields)
         self._arrays.append(array)
-        self._messages[index] = c.BoardMessage(array, len(fields), first, self._counters - first)
+        self._messages[index] = c.BoardMessage(
+            fields=array, count=len(fields), first_counter=first, counter_count=self._counters - first
+        )
         return index
 
     def _counter(self) -> int:
@@ -65,15 +60,15 @@ class _Tree:
         return self._counters - 1
 
     def _field(self, number: int, field: BoardField, counter: int) -> c.BoardField:
-        flags = _Flag(0)
+        flags = 0
         if field.is_float:
-            flags |= _Flag.IS_FLOAT
+            flags |= BoardFlag.IS_FLOAT
         if field.most is not None:
-            flags |= _Flag.IS_REPEATED
+            flags |= BoardFlag.IS_REPEATED
         if field.has_fixed_length:
-            flags |= _Flag.HAS_FIXED_LENGTH
+            flags |= BoardFlag.HAS_FIXED_LENGTH
         if field.has_fixed_count:
-            flags |= _Flag.HAS_FIXED_COUNT
+            flags |= BoardFlag.HAS_FIXED_COUNT
         return c.BoardField(
             number=number,
             kind=WireKind.BYTES if field.longest is not None else wire_kind(field.descriptor),

@@ -1,7 +1,9 @@
-"""Compiles the carrier's library. Needs a C compiler and nothing else, not even the router's dependencies:
+"""Compiles the carrier's library, and makes `router/declared.py` of its headers.
+
+Needs a C compiler and nothing else, not even the router's dependencies:
 
 python router/carrier/build.py              compile it; `$CC` is the compiler, `cc` unless set
-python router/carrier/build.py --output F   to another file
+python router/carrier/build.py --output F   to another file, with `declared.py` beside it
 python router/carrier/build.py --rcl        fail without headers of rcl to check rcl_types.h with
 python router/carrier/build.py --check      exit with 0 if it is up to date, else with 1
 python router/carrier/build.py --lint       exit with 0 if the compiler has nothing to warn of
@@ -16,11 +18,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from hashlib import sha256
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 NATIVE = Path(__file__).parent / "native"
 LIBRARY = NATIVE / "libcarrier.so"
+DECLARED = NATIVE.parents[1] / "declared.py"
+"""What the headers declare, for Python."""
 
 _OPTIMIZED = (
     "-O2",
@@ -64,12 +69,12 @@ def _prefixes() -> list[str]:
 
 
 def checksum() -> str:
-    """The SHA-256 of all that the library is made of: sources, headers, this file, and for which processor.
+    """The SHA-256 of all that the library is made of: sources, headers, what reads them, and for which processor.
 
-    `carrier_checksum` returns it.
+    `carrier_checksum` returns it, and `router.declared` has it.
     """
     digest = sha256(platform.machine().encode())
-    for path in [*sorted(NATIVE.glob("*.[ch]")), Path(__file__)]:
+    for path in [*sorted(NATIVE.glob("*.[ch]")), Path(__file__), Path(__file__).with_name("headers.py")]:
         content = path.read_bytes()
         digest.update(f"{path.name} {len(content)}\n".encode() + content)
     return digest.hexdigest()
@@ -77,21 +82,47 @@ def checksum() -> str:
 
 def is_current(library: Path = LIBRARY) -> bool:
     """Whether the library was made of the files that are there now. It is not loaded for that."""
-    return library.exists() and checksum().encode() in library.read_bytes()
+    current = checksum().encode()
+    return all(made.exists() and current in made.read_bytes() for made in (library, declared_by(library)))
+
+
+def declared_by(library: Path) -> Path:
+    """The Python module that is made together with a library."""
+    return DECLARED if library == LIBRARY else library.with_name(DECLARED.name)
 
 
 def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, compiler: str | None = None) -> Path:
     """Compile the library and put it in place of `output` at once: a running router keeps the one that it has loaded.
 
-    Raises BuildError.
+    The module that it goes with is made first, and also without a compiler. Raises BuildError.
     """
     if sys.maxsize < 2**32:
         raise BuildError("the carrier is for 64-bit processors only, and this Python is one for 32 bits")
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
-        made = Path(folder) / output.name
-        compile_c([*map(str, sources()), "-fPIC", "-shared", *rcl_headers(), *flags, "-o", str(made)], compiler)
+        made, checks = Path(folder) / output.name, _declare(output, Path(folder))
+        files = [*map(str, sources()), str(checks), f"-I{NATIVE}"]
+        compile_c([*files, "-fPIC", "-shared", *rcl_headers(), *flags, "-o", str(made)], compiler)
         made.replace(output)
     return output
+
+
+def _declare(library: Path, folder: Path) -> Path:
+    """Make the module of a library. Return C in that folder with which only what was read correctly compiles."""
+    from router.carrier.headers import HeaderError, checks, declarations
+
+    made = folder / DECLARED.name
+    try:
+        made.write_text(declarations(NATIVE, checksum()), encoding="utf-8")
+    except HeaderError as error:
+        raise BuildError(str(error)) from None
+    spec = spec_from_file_location("declared", made)
+    assert spec is not None and spec.loader is not None  # noqa: S101, PT018 - it is a file of Python
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    checked = folder / "declared.c"
+    checked.write_text(checks(NATIVE, module), encoding="utf-8")
+    made.replace(declared_by(library))
+    return checked
 
 
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
@@ -134,4 +165,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     sys.exit(main())

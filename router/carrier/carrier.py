@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from threading import Lock
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.program import NativeProgram
 from router.carrier.ring import Ring
 from router.errors import StartError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.lowered import Programs
 from router.carrier.state import State
 from router.compiler.lowering import LoweredCollect

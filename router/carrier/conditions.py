@@ -5,10 +5,8 @@ from __future__ import annotations
 import ctypes
 
 from router.carrier.lowered import Programs, native_values
-from router.carrier.structures import LOSSES
 from router.compiler.lowering import LoweredCondition
-
-_EVALUATED = -1
+from router.declared import EVALUATED, LOSSES
 
 
 class NativeCondition:
@@ -30,6 +28,6 @@ class NativeCondition:
         sender, holds = native_values([source.encode()], named), ctypes.c_bool()
         code, size = ctypes.byref(self._code), len(payload)
         outcome = self._holds(self._layout, code, sender, received_at, payload, size, ctypes.byref(holds))
-        if outcome == len(LOSSES):
+        if outcome == LOSSES:
             raise MemoryError("a condition cannot be evaluated")
-        return holds.value if outcome == _EVALUATED else None
+        return holds.value if outcome == EVALUATED else None

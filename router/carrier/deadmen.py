@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.outlets import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender

@@ -6,14 +6,11 @@ import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.limits import period
 from router.carrier.state import State
 from router.compiler.program import Handler, TargetPlan
-from router.table.model import OnLimit, Priority
-
-PRIORITIES = tuple(Priority)
-"""`enum priority` in native/pace.h."""
+from router.table.model import OnLimit
 
 
 class NativePacer:
@@ -94,13 +91,20 @@ class Adoption:
 
 def timer_change(adopted: Sequence[Adoption], ended: Sequence[int]) -> c.TimerChange:
     """What a reload does to timers. What ends goes first: a pacer before its deferrals, and deadmen last."""
-    adoptions = [c.Adoption(each.timer, each.targets, each.target) for each in adopted]
+    adoptions = [
+        c.Adoption(timer=_at(c.Timer, each.timer), to=_at(c.Targets, each.targets), target=_at(c.Target, each.target))
+        for each in adopted
+    ]
     return c.TimerChange(
         adopted=(c.Adoption * len(adoptions))(*adoptions),
         ended=(ctypes.c_void_p * len(ended))(*ended),
         adopted_count=len(adoptions),
         ended_count=len(ended),
     )
+
+
+def _at(kind: type[ctypes.Structure], address: int | None) -> ctypes._Pointer[ctypes.Structure] | None:
+    return ctypes.pointer(kind.from_address(address)) if address else None
 
 
 def held_period(target: TargetPlan) -> int:

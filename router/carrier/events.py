@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from socket import inet_ntoa
-from struct import Struct
 
 from router.carrier.outlets import Names
+from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.ring import Ring
-from router.carrier.structures import LOSSES, NO_NAME
-from router.compiler.metrics import REJECT_REASONS, Report
+from router.compiler.metrics import Report
+from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, RejectedEvent
 from router.threads import Thread, join_or_leave
-
-_TRIPPED, _RELEASED, _DEADMAN_ERROR, _REJECTED, _LOST = range(1, 6)
-"""`enum event_kind`."""
-
-_REASONS = tuple(REJECT_REASONS)
-_HEAD = Struct("@II")
-_DEADMAN = Struct("@IIIIiI")
-_REJECT = Struct("@IIIIIIII")
-_LOSS = Struct("@IIIIIIiIII")
 
 _PULSE_MS = 5000
 
@@ -61,33 +53,35 @@ class EventReader:
         self._place = place
 
     def read(self, kind: int, record: memoryview) -> Changed | Told:
-        if kind in {_TRIPPED, _RELEASED}:
-            _, _, route, _, _, _ = _DEADMAN.unpack_from(record)
-            return Changed(self._name(route), kind == _TRIPPED)
-        if kind == _REJECTED:
+        if kind == EventKind.REJECTED:
             return self._rejected(record)
-        if kind == _LOST:
+        if kind == EventKind.LOST:
             return self._lost(record)
-        _, _, route, target, number, counter = _DEADMAN.unpack_from(record)
-        error = _error(number) or OSError(f"it cannot be published: {_text(record[_DEADMAN.size :])}")
-        return Told(counter, Report("deadman", self._name(route), self._name(target), "send_error", error))
+        event = DeadmanEvent.from_buffer(record)
+        route = self._name(event.deadman)
+        if kind != EventKind.DEADMAN_ERROR:
+            return Changed(route, kind == EventKind.TRIPPED)
+        text = _text(record[ctypes.sizeof(event) :])
+        error = _error(event.error) or OSError(f"it cannot be published: {text}")
+        return Told(event.counter, Report("deadman", route, self._name(event.destination), "send_error", error))
 
     def _rejected(self, record: memoryview) -> Told:
-        _, _, listener, reason, address, port, length, counter = _REJECT.unpack_from(record)
-        place, data = self._name(listener), bytes(record[_REJECT.size : _REJECT.size + length])
-        sender = f"from {inet_ntoa(address.to_bytes(4, 'big'))}:{port}"
-        what = self._detail(place, data, length)
+        event, begin = RejectedEvent.from_buffer(record), ctypes.sizeof(RejectedEvent)
+        place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
+        sender = f"from {inet_ntoa(event.address.to_bytes(4, 'big'))}:{event.port}"
+        what = self._detail(place, data, event.length)
         detail = f"{sender}: {what}" if what else sender
-        return Told(counter, Report("reject", place, "", _REASONS[reason], None, detail))
+        return Told(event.counter, Report("reject", place, "", REJECTIONS[event.reason], None, detail))
 
     def _lost(self, record: memoryview) -> Told:
-        _, _, of_route, of_topic, of_target, loss, number, counter, generation, place = _LOSS.unpack_from(record)
-        route, target = self._name(of_route), self._name(of_target)
-        detail = _text(record[_LOSS.size :])
-        if generation:  # a program of the table refused the message
-            topic = self._name(of_topic) if of_topic != NO_NAME else None
-            detail = ": ".join(filter(None, (self._place(route, topic, target, generation, place), detail)))
-        return Told(counter, Report("drop", route, target, LOSSES[loss], _error(number), detail))
+        event = LostEvent.from_buffer(record)
+        route, target = self._name(event.route), self._name(event.target)
+        detail = _text(record[ctypes.sizeof(event) :])
+        if event.generation:  # a program of the table refused the message
+            topic = self._name(event.topic) if event.topic != NO_NAME else None
+            place = self._place(route, topic, target, event.generation, event.place)
+            detail = ": ".join(filter(None, (place, detail)))
+        return Told(event.counter, Report("drop", route, target, LOSSES[event.reason], _error(event.error), detail))
 
 
 class EventThread:
@@ -139,9 +133,9 @@ class EventThread:
             while records := ring.take():
                 position = 0
                 while position < len(records):
-                    size, kind = _HEAD.unpack_from(records, position)
-                    self._tell(kind, records[position : position + size], counters, last)
-                    position += size
+                    head = EventHead.from_buffer(records, position)
+                    self._tell(head.kind, records[position : position + head.size], counters, last)
+                    position += head.size
             for counter, (_, report) in list(last.items()):  # those for which no event was written
                 self._count(counter, report, counters, last)
 

@@ -11,15 +11,15 @@ from threading import Lock
 from time import sleep
 from typing import Protocol
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.deferrals import Adoption
 from router.carrier.lowered import Programs
 from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.targets import TargetWriter
 from router.compiler.lowering import LoweredElements, LoweredFeed
-from router.compiler.lowering.operations import NONE
 from router.compiler.program import Handler, Program
+from router.declared import NONE
 from router.threads import StuckError
 
 _IN_TRANSIT_S = 0.01

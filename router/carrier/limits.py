@@ -6,7 +6,7 @@ import ctypes
 from math import ceil
 from typing import NamedTuple
 
-from router.carrier import structures as c
+from router import declared as c
 
 _UNKNOWN = -(1 << 63)
 _NS = 1_000_000_000
@@ -53,7 +53,7 @@ class RateLimit:
 def open_limit(hertz: float) -> c.Limit:
     """Return a limit of which nothing was used: a whole period ago at any time, as the boot clock is not negative."""
     between = period(hertz)
-    return c.Limit(between, between - between // 2, -between)
+    return c.Limit(period=between, late=between - between // 2, next_pass=-between)
 
 
 def period(hertz: float) -> int:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 from functools import cache
 from socket import inet_ntoa
-from struct import Struct
 
 from router.carrier.outlets import Names
+from router.carrier.reasons import REJECTIONS
 from router.carrier.ring import Ring
-from router.compiler.metrics import REJECT_REASONS
 from router.datagrams import Peer
+from router.declared import ROUTED, MirrorRecord
 
-_RECORD = Struct("@IIqIIIiiI")
-"""`struct mirror_record`."""
-
-_REASONS = (*REJECT_REASONS, "")
-"""By `enum reason`; the last one is also ROUTED, -1."""
+_HEAD = ctypes.sizeof(MirrorRecord)
 
 
 class MirrorRing:
@@ -28,15 +25,15 @@ class MirrorRing:
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
         """Return what was received since the last call, as `recording.mirror.Mirrored`. For one thread."""
         taken: list[tuple[int, str, Peer, str, str, bytes]] = []
-        head = _RECORD.size
         while records := self.ring.take():
             position = 0
             while position < len(records):
-                size, listener, at, address, port, length, why, who, _ = _RECORD.unpack_from(records, position)
-                data = bytes(records[position + head : position + head + length])
-                sender = self._name(who) if who >= 0 else ""
-                taken.append((at, self._name(listener), (_host(address), port), sender, _REASONS[why], data))
-                position += size
+                it = MirrorRecord.from_buffer(records, position)
+                data = bytes(records[position + _HEAD : position + _HEAD + it.length])
+                sender = self._name(it.endpoint) if it.endpoint >= 0 else ""
+                why = REJECTIONS[it.reason] if it.reason != ROUTED else ""
+                taken.append((it.at, self._name(it.listener), (_host(it.address), it.port), sender, why, data))
+                position += it.size
         return taken
 
 

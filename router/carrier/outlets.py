@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.collectors import NativeCollector
 from router.carrier.deferrals import NativeDeferral

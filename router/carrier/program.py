@@ -11,12 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.deferrals import Adoption
 from router.carrier.outlets import Outlets
+from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetWriter
-from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
+from router.compiler.metrics import UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Handler, Program, source_label
 from router.table.model import Framing
@@ -46,9 +47,9 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         listener_count=len(program.listeners),
         case_count=len(program.envelope.cases),
         unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
-        schema=ctypes.addressof(schema.schema),
+        schema=ctypes.pointer(schema.schema),
         listeners=writer.array(c.Listener, writer.listeners()),
-        cases=writer.array(c.Case, writer.cases()),
+        cases=writer.array(c.PayloadCase, writer.cases()),
         routes=writer.array(c.Route, [writer.route(handler) for handler in handlers]),
     )
     made.adopted = targets.adopted
@@ -80,11 +81,11 @@ class _Writer:
 
     # senders and payload cases
 
-    def cases(self) -> list[c.Case]:
+    def cases(self) -> list[c.PayloadCase]:
         cases = sorted(self.program.envelope.cases.values(), key=lambda case: case.number)
         rows = {number: row for row, number in enumerate(self.program.inbound)}
         return [
-            c.Case(
+            c.PayloadCase(
                 number=case.number,
                 row=rows.get(case.number, -1),
                 is_ignored=case.number in self.program.ignored,
@@ -99,7 +100,7 @@ class _Writer:
     def _listener(self, name: str, framing: Framing) -> c.Listener:
         opened, counters = self.outlets.listeners[name], self.counters
         peers = list(self._peers(name))
-        rejected = [counters.index("datagrams_rejected", name, reason) for reason in REJECT_REASONS]
+        rejected = [counters.index("datagrams_rejected", name, reason) for reason in REJECTIONS]
         return c.Listener(
             fd=opened.socket.fileno(),
             id=self.outlets.names.number(name),
@@ -112,7 +113,7 @@ class _Writer:
             received=counters.index("datagrams_received", name),
             received_bytes=counters.index("received_bytes", name),
             padded=counters.index("datagrams_padded", name),
-            rejected=(ctypes.c_uint32 * c.REASONS)(*rejected),
+            rejected=tuple(rejected),
         )
 
     def _peers(self, listener: str) -> Iterator[c.Peer]:

@@ -6,7 +6,7 @@ import ctypes
 from threading import Lock
 from time import sleep
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.ring import Ring
 from router.clock import monotonic_ns
 

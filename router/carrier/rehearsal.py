@@ -6,12 +6,11 @@ import ctypes
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from struct import Struct
 from types import SimpleNamespace
 from typing import NamedTuple, Union
 from weakref import finalize
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.collectors import kept_collector
 from router.carrier.deadmen import NativeDeadman, open_deadman
@@ -24,16 +23,12 @@ from router.carrier.program import NativeProgram, native_program
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.state import State
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
+from router.declared import RecordKind
 from router.table.model import Endpoint
 
 Peer = tuple[str, int]
 
 _MOST_COUNTERS = 1 << 18
-_TIME, _COUNTED, _SENT, _BRAKED, _PUBLISHED = range(32, 37)
-"""`enum record_kind` in rehearsal.h."""
-
-_HEAD = Struct("@II")
-_TIME_RECORD, _COUNTED_RECORD, _LEFT_RECORD = Struct("@IIq"), Struct("@IIqII"), Struct("@IIII")
 
 
 class Time(NamedTuple):
@@ -134,22 +129,22 @@ class Stage:
         address = self._library.rehearsal_records(self._address, ctypes.byref(size))
         if size.value and not address:
             raise MemoryError("there is no room for what becomes of messages")
-        records = memoryview(ctypes.string_at(address, size.value) if address else b"")
+        records = memoryview(bytearray(ctypes.string_at(address, size.value) if address else b""))
         at = 0
         while at < len(records):
-            length, kind = _HEAD.unpack_from(records, at)
-            yield self._record(kind, records[at : at + length])
-            at += length
+            head = c.EventHead.from_buffer(records, at)
+            yield self._record(head.kind, records[at : at + head.size])
+            at += head.size
 
     def _record(self, kind: int, record: memoryview) -> Record:
-        if kind == _TIME:
-            return Time(_TIME_RECORD.unpack(record)[2])
-        if kind == _COUNTED:
-            _, _, amount, counter, _ = _COUNTED_RECORD.unpack(record)
-            return Counted(counter, amount)
-        if kind in {_SENT, _BRAKED, _PUBLISHED}:
-            _, _, target, length = _LEFT_RECORD.unpack_from(record)
-            return Left(self._names.name(target), bytes(record[_LEFT_RECORD.size : _LEFT_RECORD.size + length]))
+        if kind == RecordKind.TIME:
+            return Time(c.TimeRecord.from_buffer(record).at)
+        if kind == RecordKind.COUNTED:
+            counted = c.CountedRecord.from_buffer(record)
+            return Counted(counted.counter, counted.amount)
+        if kind in {RecordKind.SENT, RecordKind.BRAKED, RecordKind.PUBLISHED}:
+            left, begin = c.LeftRecord.from_buffer(record), ctypes.sizeof(c.LeftRecord)
+            return Left(self._names.name(left.target), bytes(record[begin : begin + left.length]))
         return self._reader.read(kind, record)
 
     @property

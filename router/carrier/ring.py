@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-from router.carrier.structures import MessageRecord
-from router.types.framing import MAX_DATAGRAM
+from router.declared import MAX_DATAGRAM, MessageRecord
 
 LONGEST_RECORD = ctypes.sizeof(MessageRecord) + MAX_DATAGRAM + 8
 

@@ -5,48 +5,24 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-from router.carrier.structures import Schema, WireField, WireType
+from router import declared as c
+from router.declared import WireFlag, WireKind
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope
 from router.types.undecidable import all_fields, all_types
 from router.types.wire import I32, I64, VARINT, delimited, parses, validates_text, wire_type_of
 
 
-class WireKind(IntEnum):
-    """`enum wire_kind` in envelope.h."""
-
-    VARINT = 0
-    I64 = 1
-    I32 = 2
-    BYTES = 3
-    STRING = 4
-    MESSAGE = 5
-    GROUP = 6
-
-
-class WireFlag(IntFlag):
-    """`enum wire_flag` in envelope.h."""
-
-    PACKABLE = 1
-    CASE = 2
-    ROUTED = 4
-
-
 @dataclass(frozen=True, slots=True)
 class WireSchema:
     """A `struct wire_schema`, and the arrays that it points to. C may use it as long as this object lives."""
 
-    schema: Schema
-    types: ctypes.Array[WireType]
-    fields: Sequence[ctypes.Array[WireField]]
-
-    @property
-    def address(self) -> int:
-        return ctypes.addressof(self.schema)
+    schema: c.WireSchema
+    types: ctypes.Array[c.WireType]
+    fields: Sequence[ctypes.Array[c.WireField]]
 
 
 def wire_kind(field: FieldDescriptor) -> WireKind:
@@ -69,33 +45,33 @@ def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
     flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
     indexes = all_types(descriptor)
     arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
-    types = (WireType * len(arrays))(
+    types = (c.WireType * len(arrays))(
         *(
-            WireType(fields, len(fields), parses(each, delimited(0, b"")))
+            c.WireType(fields=fields, count=len(fields), accepts_zero=parses(each, delimited(0, b"")))
             for fields, each in zip(arrays, indexes, strict=True)
         )
     )
-    return WireSchema(Schema(types, len(types)), types, arrays)
+    return WireSchema(c.WireSchema(types=types, count=len(types)), types, arrays)
 
 
-def _case_flags(number: int, routed: Container[int]) -> WireFlag:
+def _case_flags(number: int, routed: Container[int]) -> int:
     return WireFlag.CASE | WireFlag.ROUTED if number in routed else WireFlag.CASE
 
 
 def _lowered(
-    descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, WireFlag]
-) -> ctypes.Array[WireField]:
+    descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, int]
+) -> ctypes.Array[c.WireField]:
     fields = sorted(all_fields(descriptor), key=lambda field: field.number)
-    lowered = [_lowered_field(field, indexes, flags.get(field.number, WireFlag(0))) for field in fields]
-    return (WireField * len(lowered))(*lowered)
+    lowered = [_lowered_field(field, indexes, flags.get(field.number, 0)) for field in fields]
+    return (c.WireField * len(lowered))(*lowered)
 
 
-def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: WireFlag) -> WireField:
+def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: int) -> c.WireField:
     kind = _kind(field)
     if kind in {WireKind.MESSAGE, WireKind.GROUP}:
-        return WireField(field.number, kind, flags, indexes[message_of(field)])
+        return c.WireField(number=field.number, kind=kind, flags=flags, type=indexes[message_of(field)])
     is_packable = field.is_repeated and kind in {WireKind.VARINT, WireKind.I64, WireKind.I32}
-    return WireField(field.number, kind, WireFlag.PACKABLE if is_packable else WireFlag(0), 0)
+    return c.WireField(number=field.number, kind=kind, flags=WireFlag.PACKABLE if is_packable else 0)
 
 
 def _kind(field: FieldDescriptor) -> WireKind:

@@ -6,11 +6,12 @@ import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.collectors import native_collect
-from router.carrier.deferrals import PRIORITIES, Adoption, held_period
+from router.carrier.deferrals import Adoption, held_period
 from router.carrier.lowered import Programs, native_values
 from router.carrier.outlets import Outlets
+from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredRoute, LoweredTarget
 from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
 
@@ -83,10 +84,10 @@ class TargetWriter:
         if plan.is_topic and handler.collect_timeout is not None:
             made.collected = counters.index("messages_collected", *place)
         made.delivered = counters.index("messages_published" if plan.is_topic else "datagrams_sent", *place)
-        made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in c.LOSSES]
+        made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in LOSSES]
         if not plan.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
-        made.period, made.priority = held_period(plan), PRIORITIES.index(plan.priority)
+        made.period, made.priority = held_period(plan), c.Priority[plan.priority.name]
         if (deferral := self.outlets.deferral(handler, plan)) is not None:
             made.deferral = deferral.address
             self.arrays.append(deferral)

@@ -189,6 +189,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             _leave(sys.stdout)
             print(f"router {_verb(arguments) or ''}".rstrip() + f": stdout: {error.strerror}", file=sys.stderr)
             return UNWRITTEN
+        if isinstance(error, ImportError) and "declared" in error.msg:
+            what = f"router {_verb(arguments)}: router/declared.py was not made of the present headers"
+            print(with_help(what, "run 'make setup'"), file=sys.stderr)
+            return BAD_TABLE
         # Each of them may say that memory could not be had.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise

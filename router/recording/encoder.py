@@ -22,9 +22,9 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk as ChunkRecord
 
 from router.datagrams import Peer
+from router.declared import MAX_DATAGRAM
 from router.recording.channels import Channels, Datagram
 from router.recording.mirror import Classifier, Mirrored
-from router.types.framing import MAX_DATAGRAM
 from router.types.protobuf import PayloadCase
 from router.types.wire import LEN, varint
 

@@ -14,9 +14,10 @@ from google.protobuf.message import Message
 
 from router.compiler.network import recognisers
 from router.datagrams import Peer
+from router.declared import MAX_DATAGRAM
 from router.table.model import Framing, RouteTable
 from router.threads import Thread, join_or_leave
-from router.types.framing import MAX_DATAGRAM, restored
+from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import LEN, varint
 

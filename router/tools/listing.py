@@ -13,9 +13,10 @@ from enum import Enum
 from router.compiler.checked import CheckedRoute
 from router.compiler.expressions import tree
 from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredTarget
-from router.compiler.lowering.layout import Layout, NodeField, ReadKind, ReadOperation
-from router.compiler.lowering.operations import NONE, Code, Compared, Op, Operation, Relation, Scalar, Sign
+from router.compiler.lowering.layout import Layout, NodeField, ReadOperation
+from router.compiler.lowering.operations import Code, Operation
 from router.compiler.program import Program
+from router.declared import NONE, Compared, Op, ReadKind, Relation, Scalar, Sign
 from router.errors import plural
 
 _INDENT = "  "
@@ -221,7 +222,7 @@ def _write(line: _Line) -> str:
 
 def _signs(line: _Line) -> str:
     """Which integers are unsigned."""
-    named = [_word(sign) for sign in Sign if line.operation.flag & sign]
+    named = [_word(sign).removesuffix(" unsigned") for sign in Sign if line.operation.flag & sign]
     return f"unsigned: {', '.join(named)}" if named else ""
 
 

@@ -6,10 +6,8 @@ padded with zeros. Both can be undone, because a tag is never zero and the last 
 
 from __future__ import annotations
 
+from router.declared import MAX_DATAGRAM
 from router.types.wire import I32, I32_SIZE, I64, I64_SIZE, LEN, VARINT, read_varint
-
-MAX_DATAGRAM = 16 * 1024
-"""The longest accepted datagram, in bytes; a longer one is rejected as `truncated`."""
 
 _FIXED = {I64: I64_SIZE, I32: I32_SIZE}
 """Bytes of a value, by wire type."""

@@ -25,12 +25,12 @@ from router.app.publishing import Publishing
 from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
 from router.compiler.metrics import REJECT_REASONS
+from router.declared import MAX_DATAGRAM
 from router.errors import StartError
 from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
 from router.recording.recorder import Recorder, RecordError
-from router.types.framing import MAX_DATAGRAM
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
 from tests.ports import free_port

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import pytest
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen, NativeDeadman

@@ -12,7 +12,7 @@ from router.carrier.library import load
 from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
-from router.types.framing import MAX_DATAGRAM
+from router.declared import MAX_DATAGRAM, Envelope
 from tests.oracles.python_engine.rig import Rig
 from tests.small_tables import program
 from tests.tables import PROTOS
@@ -97,19 +97,6 @@ class PythonSide:
         return Decision(report.reason, int(field[1]) if field else 0, is_repaired)
 
 
-class _Envelope(ctypes.Structure):
-    """`struct envelope` in envelope.h."""
-
-    _fields_ = (
-        ("case_number", ctypes.c_uint32),
-        ("size", ctypes.c_uint32),
-        ("start", ctypes.c_uint32),
-        ("length", ctypes.c_uint32),
-        ("is_single", ctypes.c_bool),
-        ("is_repaired", ctypes.c_bool),
-    )
-
-
 class CarrierSide:
     """`envelope_read` in the carrier's library."""
 
@@ -118,14 +105,14 @@ class CarrierSide:
         self._read = library.envelope_read
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
-        self._envelope = _Envelope()
+        self._envelope = Envelope()
 
     def decide(self, data: bytes, repairs: bool) -> Decision:
         kept = data[:MAX_DATAGRAM]
         # What an earlier datagram left behind this one must not count.
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
-        code = self._read(self._lowered.address, self._buffer, len(data), repairs, ctypes.byref(self._envelope))
-        envelope = self._envelope
+        schema, envelope = self._lowered.schema, self._envelope
+        code = self._read(ctypes.byref(schema), self._buffer, len(data), repairs, ctypes.byref(envelope))
         return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
 
     def whole(self) -> bytes:

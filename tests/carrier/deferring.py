@@ -9,16 +9,17 @@ from pathlib import Path
 from struct import Struct
 from typing import NamedTuple
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.deferrals import PRIORITIES, NativeDeferral, NativePacer
+from router.carrier.deferrals import NativeDeferral, NativePacer
 from router.carrier.limits import period
+from router.carrier.reasons import LOSSES
 from router.table.model import Priority
 from tests.carrier.building import MEMORY, sanitizing
 
 NEVER = (1 << 63) - 1
 _NOTED = Struct("@IIqII")
-_FATES = ("sent", "bytes", *c.LOSSES)
+_FATES = ("sent", "bytes", *LOSSES)
 
 _FUNCTIONS: dict[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_open": (c_void_p, ()),
@@ -87,7 +88,7 @@ class Deferring:
     def _add(self, deferral: NativeDeferral, hertz: float | None, priority: Priority, *, is_topic: bool) -> int:
         self._are_topics.append(is_topic)
         between = period(hertz) if hertz else 0
-        rank = PRIORITIES.index(priority)
+        rank = c.Priority[priority.name]
         return int(self._functions.seam_target(self._address, deferral.address, between, rank, is_topic))
 
     def offer(self, target: int, data: bytes, expires: int | None = None, *, is_written: bool = False) -> None:

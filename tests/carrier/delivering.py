@@ -9,19 +9,20 @@ from pathlib import Path
 from struct import Struct
 from typing import NamedTuple, Union
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.collectors import NativeCollector, native_collect
 from router.carrier.from_ros import native_for_each
 from router.carrier.lowered import Programs, native_values
+from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredFeed, LoweredRoute
-from router.compiler.lowering.operations import NONE
+from router.declared import NONE
 from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"
 _NOTED = Struct("@IIiIII")
 _OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_LOSS = range(6)
-_OF_TARGET = _FIRST_LOSS + len(c.LOSSES)
+_OF_TARGET = _FIRST_LOSS + c.LOSSES
 _LOSS = Struct("@6Ii3I")
 """`struct lost_event`."""
 
@@ -92,7 +93,7 @@ class Delivering:
             made = c.Target(condition=programs.code(target.condition), message=programs.code(target.message))
             made.id, made.delivered, made.filtered = number, first + _DELIVERED, first + _FILTERED
             made.collected, made.delivered_bytes = first + _COLLECTED, first + _BYTES
-            made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(len(c.LOSSES))]
+            made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(c.LOSSES)]
             if target.message and not is_from_ros:
                 made.topic = ctypes.pointer(topic)
             targets.append(made)
@@ -107,10 +108,10 @@ class Delivering:
             self._route = c.RosRoute(
                 for_each=native_for_each(lowered.for_each, programs), seconds=NONE, nanoseconds=NONE
             )
-        self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.addressof(self._targets)))
+        self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.pointer(self._targets)))
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
             collector = NativeCollector(functions, timeout)
-            self._adopted[0].timer = collector.address
+            self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
             collect = native_collect(lowered.collect, programs, collector, range(1 + len(others)))
             self._targets.collect = ctypes.pointer(collect)
         self._targets.layout = programs.layout()
@@ -154,7 +155,7 @@ class Delivering:
 
     def end_frames(self) -> None:
         """End all frames, and the collector."""
-        ended = (c_void_p * 1)(self._adopted[0].timer)
+        ended = (c_void_p * 1)(ctypes.cast(self._adopted[0].timer, c_void_p))
         self._functions.seam_adopt(self._address, byref(c.TimerChange(ended=ended, ended_count=1)))
 
     def losses(self) -> list[tuple[str, str]]:
@@ -174,7 +175,7 @@ class Delivering:
         """What a target has counted."""
         number = [each.label for each in self._lowered].index(label)
         of_target = self._counters[1 + number * _OF_TARGET :][:_OF_TARGET]
-        names = (None, "delivered", "filtered", "collected", None, *c.LOSSES)
+        names = (None, "delivered", "filtered", "collected", None, *LOSSES)
         return {name: count for name, count in zip(names, of_target, strict=True) if name and count}
 
     def from_ros(self, data: bytes) -> list[Outcome]:
@@ -195,5 +196,5 @@ class Delivering:
                 start = at + _NOTED.size
                 yield Outcome(lowered.label, notes[start : start + length])
             else:
-                yield Outcome(lowered.label, FILTERED if outcome == -2 else c.LOSSES[outcome], lowered.places[place])
+                yield Outcome(lowered.label, FILTERED if outcome == -2 else LOSSES[outcome], lowered.places[place])
             at += size

@@ -3,36 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-import re
-import struct
 from collections.abc import Sequence
-from ctypes import byref, c_bool, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from ctypes import byref, c_bool, c_int, c_size_t, c_uint32, c_void_p
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from tests.carrier.building import MEMORY, sanitizing
 
 SOURCES = ("machine.c", "read_protobuf.c", "read_cdr.c", "evaluate.c")
-NONE, EVALUATED = 0xFFFF, -1
 CDR_HEADER = b"\0\1\0\0"
 
 
-def _numbers() -> dict[str, int]:
-    """The constants of the enums in operations.h and events.h."""
-    numbers: dict[str, int] = {}
-    for header in ("operations.h", "events.h"):
-        text = re.sub(r"/\*.*?\*/", "", (NATIVE / header).read_text(), flags=re.DOTALL)
-        for body in re.findall(r"enum(?: \w+)? \{(.*?)\}", text, re.DOTALL):
-            following = 0
-            for name, value in re.findall(r"([A-Z]\w*)(?: = ([^,]+))?", body):
-                following = int(value) if value.strip().isdigit() else following
-                numbers[name] = following
-                following += 1
-    return numbers
-
-
-C = _numbers()
+C = c.ENUMERATORS
 """Constants of the headers, by name."""
 
 _LOSSES = {C["LOSS_MAPPING_ERROR"]: "mapping_error", C["LOSS_NON_FINITE"]: "non_finite"}
@@ -59,10 +43,12 @@ class Operation:
             if number < 0:
                 number = len(literals)
                 literals += self.data
-        head = struct.pack("<BBHI", C[self.name], self.flag, self.slot, size)
-        return head + (
-            struct.pack("<d", number) if isinstance(number, float) else struct.pack("<Q", number % (1 << 64))
-        )
+        made = c.Operation(C[self.name], self.flag, self.slot, size)
+        if isinstance(number, float):
+            made.real = number
+        else:
+            made.integer = number
+        return bytes(made)
 
 
 @dataclass(frozen=True)
@@ -70,13 +56,13 @@ class Step:
     """`struct read_operation`."""
 
     kind: str
-    slot: int = NONE
+    slot: int = c.NONE
     size: int = 0
     type: str = "SCALAR_BOOL"
     count: int = 0
 
     def packed(self) -> bytes:
-        return struct.pack("<4B2HI", C[self.kind], self.size, C[self.type], 0, self.slot, 0, self.count)
+        return bytes(c.ReadOperation(C[self.kind], self.size, C[self.type], slot=self.slot, count=self.count))
 
 
 @dataclass(frozen=True)
@@ -85,17 +71,17 @@ class NodeField:
 
     number: int
     type: str
-    slot: int = NONE
+    slot: int = c.NONE
     is_repeated: bool = False
-    presence: int = NONE
-    node: int = NONE
-    choice: int = NONE
+    presence: int = c.NONE
+    node: int = c.NONE
+    choice: int = c.NONE
     cleared: tuple[int, int] = (0, 0)
-    closed: int = NONE
+    closed: int = c.NONE
 
     def packed(self) -> bytes:
         fixed = self.slot, self.presence, self.node, self.choice, *self.cleared, self.closed
-        return struct.pack("<I2B7H", self.number, C[self.type], self.is_repeated, *fixed)
+        return bytes(c.NodeField(self.number, C[self.type], self.is_repeated, *fixed))
 
 
 @dataclass(frozen=True)
@@ -103,28 +89,6 @@ class Node:
     entries: Sequence[NodeField | Step]
     first_slot: int = 0
     slot_count: int = 0
-
-
-class _Value(ctypes.Structure):
-    _fields_ = (("bits", c_uint64), ("size", c_uint32), ("reserved", c_uint32))
-
-    def real(self) -> float:
-        return float(struct.unpack("<d", struct.pack("<Q", self.bits))[0])
-
-
-class _Cell(ctypes.Structure):
-    _fields_ = (("value", _Value), ("next", c_uint32), ("reserved", c_uint32))
-
-
-class _Code(ctypes.Structure):
-    _fields_ = (("operations", c_void_p), ("count", c_uint32), ("reserved", c_uint32))
-
-
-class _Layout(ctypes.Structure):
-    _fields_ = (
-        ("nodes", c_void_p), ("defaults", c_void_p), ("closed", c_void_p), ("literals", c_void_p),
-        ("slot_count", c_uint32), ("is_cdr", c_uint32),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -183,47 +147,47 @@ class Machine:
         return bool(self._library.seam_machine_read(self._address, byref(self._layout), copy, len(data)))
 
     def slot(self, index: int) -> int:
-        return int(_Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index).bits)
+        return int(c.Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index).bits)
 
     def listed(self, index: int, of: str = INTEGER) -> list[object]:
         """A slot's list in cells."""
-        return self._elements(_Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index), of)
+        return self._elements(c.Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index), of)
 
     def value(self, *code: Operation, of: str = INTEGER) -> object:
         """What a program leaves on the stack: an int64 for INTEGER, the elements of LISTs in cells as integers."""
-        value, at = _Value(), c_uint32()
+        value, at = c.Value(), c_uint32()
         made = self._code(code)
         outcome = self._library.seam_machine_value(self._address, byref(made), byref(value), byref(at))
-        return self._made(value, of) if outcome == EVALUATED else Refusal(_LOSSES[outcome], at.value)
+        return self._made(value, of) if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
 
     def condition(self, *code: Operation) -> bool | Refusal:
         is_true, at = c_bool(), c_uint32()
         made = self._code(code)
         outcome = self._library.evaluate_condition(self._address, byref(made), byref(is_true), byref(at))
-        return is_true.value if outcome == EVALUATED else Refusal(_LOSSES[outcome], at.value)
+        return is_true.value if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
 
     def message(self, *code: Operation) -> bytes | Refusal:
         at, size = c_uint32(), c_size_t()
         made = self._code(code)
         outcome = self._library.evaluate_message(self._address, byref(made), byref(at))
-        if outcome != EVALUATED:
+        if outcome != c.EVALUATED:
             return Refusal(_LOSSES[outcome], at.value)
         return ctypes.string_at(self._library.seam_machine_output(self._address, byref(size)), size.value)
 
-    def _made(self, value: _Value, of: str) -> object:
+    def _made(self, value: c.Value, of: str) -> object:
         if of == INTEGER:
-            return int.from_bytes(struct.pack("<Q", value.bits), "little", signed=True)
+            return value.integer
         if of == REAL:
-            return value.real()
+            return value.real
         if of == TEXT:
             return ctypes.string_at(value.bits, value.size)
         return self._elements(value, INTEGER)
 
-    def _elements(self, value: _Value, of: str) -> list[object]:
+    def _elements(self, value: c.Value, of: str) -> list[object]:
         cells = self._library.seam_machine_cells(self._address)
-        index, made = value.bits & 0xFFFF_FFFF, []
+        index, made = value.list.first, []
         for _ in range(value.size):
-            cell = _Cell.from_address(cells + ctypes.sizeof(_Cell) * index)
+            cell = c.Cell.from_address(cells + ctypes.sizeof(c.Cell) * index)
             made.append(self._made(cell.value, of))
             index = cell.next
         return made
@@ -233,37 +197,40 @@ class Machine:
         self._kept.append(array)
         return ctypes.addressof(array)
 
-    def _native_layout(self, layout: Layout) -> _Layout:
-        nodes = b"".join(
-            struct.pack("<QIHH", self._keep(b"".join(each.packed() for each in node.entries)), len(node.entries),
-                        node.first_slot, node.slot_count)
-            for node in layout.nodes
-        )  # fmt: skip
-        closed = b"".join(
-            struct.pack("<QII", self._keep(struct.pack(f"<{len(numbers)}i", *numbers)), len(numbers), 0)
-            for numbers in layout.closed
+    def _native_layout(self, layout: Layout) -> c.Layout:
+        nodes = [self._node(node, is_cdr=layout.is_cdr) for node in layout.nodes]
+        closed = [c.ClosedEnum((ctypes.c_int32 * len(each))(*each), len(each)) for each in layout.closed]
+        defaults = (c.Value * layout.slot_count)()
+        for index, value in layout.defaults.items():
+            if isinstance(value, bytes):
+                defaults[index].bits, defaults[index].size = self._keep(value), len(value)
+            elif isinstance(value, float):
+                defaults[index].real = value
+            else:
+                defaults[index].integer = value
+        self._room = ctypes.create_string_buffer(1 << 16)
+        return c.Layout(
+            nodes=(c.Node * len(nodes))(*nodes),
+            defaults=defaults,
+            closed=(c.ClosedEnum * len(closed))(*closed),
+            literals=ctypes.addressof(self._room),
+            slot_count=layout.slot_count,
+            is_cdr=layout.is_cdr,
         )
-        defaults = b"".join(self._default(layout.defaults.get(index, 0)) for index in range(layout.slot_count))
-        self._kept.append(literals := ctypes.create_string_buffer(1 << 16))
-        self._room = literals
-        return _Layout(self._keep(nodes), self._keep(defaults), self._keep(closed), ctypes.addressof(literals),
-                       layout.slot_count, layout.is_cdr)  # fmt: skip
 
-    def _default(self, value: int | float | bytes) -> bytes:  # noqa: PYI041 - not the same here
-        match value:
-            case bytes():
-                return struct.pack("<QII", self._keep(value), len(value), 0)
-            case float():
-                return struct.pack("<dII", value, 0, 0)
-            case _:
-                return struct.pack("<QII", value % (1 << 64), 0, 0)
+    def _node(self, node: Node, *, is_cdr: bool) -> c.Node:
+        entries = self._keep(b"".join(each.packed() for each in node.entries))
+        made = c.Node(count=len(node.entries), first_slot=node.first_slot, slot_count=node.slot_count)
+        if is_cdr:
+            made.steps = ctypes.cast(entries, ctypes.POINTER(c.ReadOperation))
+        else:
+            made.fields = ctypes.cast(entries, ctypes.POINTER(c.NodeField))
+        return made
 
-    def _code(self, operations: Sequence[Operation]) -> _Code:
+    def _code(self, operations: Sequence[Operation]) -> c.Code:
         packed = b"".join(each.packed(self._literals) for each in operations)
         ctypes.memmove(self._room, bytes(self._literals), len(self._literals))
-        made = ctypes.create_string_buffer(packed, max(1, len(packed)))
-        self._running = made
-        return _Code(ctypes.addressof(made), len(operations), 0)
+        return c.Code((c.Operation * len(operations)).from_buffer_copy(packed), len(operations))
 
 
 def integer(value: int) -> Operation:

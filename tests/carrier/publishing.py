@@ -13,7 +13,7 @@ from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.carrier import Carrier
 from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen

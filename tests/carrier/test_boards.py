@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier.boards import NativeBoards
+from router.declared import BoardRefusal, Loss
 from router.errors import Located, SourceSpan
 from router.types.board_limits import NON_FINITE, TOO_LARGE, BoardLimits, Refusal, board_fields
 from router.types.protobuf import find_envelope, load_protos
@@ -20,18 +21,12 @@ from tests.envelopes import I32, I64, VARINT, framed, tag, varint
 PROTOS = Path(__file__).parent / "protos_of_boards"
 TEXTS, NUMBERS, TREE = 1, 2, 3
 LONGEST = 120
-REASONS = {1: NON_FINITE, 8: TOO_LARGE}
+REASONS = {Loss.NON_FINITE: NON_FINITE, Loss.TOO_LARGE: TOO_LARGE}
 """Those of `enum loss`."""
 
 ONE = b"\0\0\x80\x3f"
 NAN, INF = b"\0\0\xc0\x7f", b"\0\0\x80\x7f"
 WIDE_INF = bytes(6) + b"\xf0\xff"
-
-
-class _Refusal(ctypes.Structure):
-    """`struct board_refusal` in board.h."""
-
-    _fields_ = (("reason", ctypes.c_int), ("text", ctypes.c_char * 256))
 
 
 class Boards:
@@ -49,7 +44,7 @@ class Boards:
         self._takes = library.board_takes
 
     def carrier(self, data: bytes, board: str = "strict") -> Refusal | None:
-        found = _Refusal()
+        found = BoardRefusal()
         if self._takes(self._native.pointer(board), data, len(data), ctypes.byref(found)):
             return None
         return Refusal(REASONS[found.reason], found.text.decode())

@@ -23,7 +23,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from router.carrier import structures as c
+from router import declared as c
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.outlets import Names
 from router.carrier.ring import Ring

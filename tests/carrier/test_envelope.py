@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.declared import MAX_DATAGRAM
 from router.errors import Code
-from router.types.framing import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
 from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
 from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint

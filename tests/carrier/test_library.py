@@ -3,71 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
-from router.carrier import build, library, structures
-from router.carrier.library import FUNCTIONS, STRUCTURES, load
+from router import declared
+from router.carrier import build, library
+from router.carrier.library import load
 from router.errors import StartError
-
-HEADERS = "".join(path.read_text() for path in sorted(build.NATIVE.glob("*.h")))
-PROTOTYPE = re.compile(r"^(\w[\w ]*?[ *]+)(\w+)\(([^()]+)\);", re.MULTILINE)
-KINDS = {
-    "void": None,
-    "bool": ctypes.c_bool,
-    "int": ctypes.c_int,
-    "int64_t": ctypes.c_int64,
-    "size_t": ctypes.c_size_t,
-    "uint16_t": ctypes.c_uint16,
-    "uint32_t": ctypes.c_uint32,
-    "uint64_t": ctypes.c_uint64,
-}
-
-
-def kind(declared: str) -> type | None:
-    """The type that ctypes has for that of a parameter, with its name, or of a function."""
-    if "*" in declared:
-        return ctypes.c_void_p
-    first, *more = declared.split()
-    return STRUCTURES[more[0]] if first == "struct" else KINDS[first]
-
-
-def test_functions_are_declared_as_in_the_headers() -> None:
-    declared = {
-        name: (kind(returned), tuple(kind(each.strip()) for each in taken.split(",") if each != "void"))
-        for returned, name, taken in PROTOTYPE.findall(HEADERS)
-        if name in FUNCTIONS
-    }
-    assert declared == FUNCTIONS
-
-
-def test_python_calls_nothing_that_is_not_declared() -> None:
-    """ctypes would cut its pointers to 32 bits."""
-    exported = {name for _, name, _ in PROTOTYPE.findall(HEADERS)}
-    router = build.NATIVE.parents[1]
-    called = {name for path in router.rglob("*.py") for name in re.findall(r"library\.(\w+)", path.read_text())}
-    assert called & exported <= FUNCTIONS.keys()
-
-
-def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
-    lines = [
-        f'printf("{name} {field[0]} %zu %zu\\n", offsetof(struct {name}, {field[0]}), sizeof(struct {name}));'
-        for name, structure in STRUCTURES.items()
-        for field in structure._fields_
-    ]
-    main = tmp_path / "offsets.c"
-    headers = "".join(f"#include {name}\n" for name in ("<stdio.h>", '"collect.h"', '"from_ros.h"', '"publish.h"'))
-    main.write_text(f"{headers}int main(void) {{ {' '.join(lines)} }}\n")
-    build.compile_c([str(main), f"-I{build.NATIVE}", "-o", str(tmp_path / "offsets")])
-    printed = subprocess.check_output([tmp_path / "offsets"], text=True)
-    assert printed.splitlines() == [
-        f"{name} {field[0]} {getattr(structure, field[0]).offset} {ctypes.sizeof(structure)}"
-        for name, structure in STRUCTURES.items()
-        for field in structure._fields_
-    ]
 
 
 def test_without_a_library_nothing_runs(tmp_path: Path) -> None:
@@ -88,9 +31,9 @@ def test_what_is_no_library_is_refused(tmp_path: Path) -> None:
         load(path)
 
 
-def test_structures_of_another_size_are_refused(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library, "STRUCTURES", {**STRUCTURES, "entry": structures.Feed, "more": structures.Feed})
-    with pytest.raises(StartError, match="C and Python differ about struct entry, more"):
+def test_declarations_of_other_sources_are_refused(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(declared, "CHECKSUM", "0" * 64)
+    with pytest.raises(StartError, match="was built from other sources; run 'make setup'"):
         load(built)
 
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from router.declared import MAX_DATAGRAM
 from router.table.model import Priority
-from router.types.framing import MAX_DATAGRAM
 from tests.carrier.deferring import Deferring
 from tests.oracles.held_back import BURST, LEAST_OVERDRAFT, LEAST_ROOM, NS, OVERDRAFT
 

@@ -10,19 +10,10 @@ from time import thread_time_ns
 
 import pytest
 
+from router.declared import Share
+
 TURN = 100_000_000
 """ns"""
-
-
-class Share(ctypes.Structure):
-    """`struct share` in priority.h."""
-
-    _fields_ = (
-        ("may_be_first", ctypes.c_bool),
-        ("is_first", ctypes.c_bool),
-        ("began", ctypes.c_int64),
-        ("used", ctypes.c_int64),
-    )
 
 
 def in_a_thread(run: Callable[[], None]) -> None:

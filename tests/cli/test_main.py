@@ -173,3 +173,15 @@ def test_validate_imports_neither_ros_nor_what_a_person_looks_at() -> None:
     result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     unwanted = {"rclpy", "rich", "structlog", "prometheus_client", "router.app", "router.cli.run"}
     assert unwanted.isdisjoint(result.stderr.split())
+
+
+def test_without_what_the_headers_declare_a_sentence_says_what_to_do() -> None:
+    script = "import sys; sys.modules['router.declared'] = None; from router import main; sys.exit(main(['validate']))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (
+        BAD_TABLE,
+        "",
+        "router validate: router/declared.py was not made of the present headers\nhelp: run 'make setup'\n",
+    )

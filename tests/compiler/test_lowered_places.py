@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from router.compiler.lowering import LoweredTarget
-from router.compiler.lowering.operations import Op
+from router.declared import Op
 from tests.compiler.conftest import CheckText
 
 

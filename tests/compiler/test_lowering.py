@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
 from pathlib import Path
 
 import pytest
@@ -12,17 +11,17 @@ from router.compiler import check_table
 from router.compiler import lowering as compiler_lowering
 from router.compiler.expressions import check
 from router.compiler.lookup import Definitions
-from router.compiler.lowering import layout, operations
+from router.compiler.lowering import operations
 from router.compiler.lowering.cdr import cdr_message
-from router.compiler.lowering.layout import MOST_NODES_DEEP, ReadKind, ReadOperation
+from router.compiler.lowering.layout import ReadOperation
 from router.compiler.lowering.names import TooLargeError
-from router.compiler.lowering.operations import MOST_OPEN, Code, Op, Operation, Scalar, Sign, depths, most_executed
+from router.compiler.lowering.operations import Code, Operation, depths, most_executed
 from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.lowering.sources import MOST_CONDITION_OPERATIONS, Datagram, RosMessage
 from router.compiler.mapping import build
+from router.declared import MOST_NODES_DEEP, MOST_OPEN, Op, ReadKind, Scalar, Sign
 from router.errors import Code as FindingCode
 from router.types.model import Field, Float, Int, List, MessageType, String, Type
-from tests.carrier.evaluating import C
 from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
 from tests.compiler.conftest import CheckText
 from tests.compiler.payloads import made_wire, wire_of
@@ -64,32 +63,6 @@ def lowered(text: str) -> Code:
     return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE, [MODE])))
 
 
-# ---- the format
-
-
-@pytest.mark.parametrize(
-    ("declared", "prefix"),
-    [
-        (Op, "OP_"), (operations.Relation, ""), (operations.Compared, ""), (layout.FieldType, "TYPE_"),
-        (layout.ReadKind, "READ_"), (Scalar, "SCALAR_"),
-    ],
-)  # fmt: skip
-def test_enums_are_those_of_the_header(declared: type[IntEnum], prefix: str) -> None:
-    in_c = {name: number for name, number in C.items() if prefix and name.startswith(prefix)}
-    ours = {f"{prefix}{each.name}".replace("SCALAR_IN_CELLS", "IN_CELLS"): int(each) for each in declared}
-    assert {name: C[name] for name in ours} == ours
-    assert in_c.keys() <= ours.keys()
-
-
-def test_limits_are_those_of_the_header() -> None:
-    names = ("MOST_LOOPS", "MOST_OPEN")
-    assert [C[name] for name in names] == [getattr(operations, name) for name in names]
-    assert C["MOST_STACKED"] == operations.MOST_STACKED + 1
-    assert {f"{each.name}_UNSIGNED": int(each) for each in Sign} == {
-        name: number for name, number in C.items() if name.endswith("_UNSIGNED") and not name.startswith("SIGNED")
-    }
-
-
 # ---- expressions
 
 
@@ -118,11 +91,11 @@ def test_expressions_become_operations(text: str, expected: str) -> None:
 @pytest.mark.parametrize(
     ("text", "flag"),
     [
-        ("i64 + u64", Sign.SECOND),
-        ("u64 + 1", Sign.FIRST | Sign.RESULT),
-        ("u64 - u64", Sign.FIRST | Sign.SECOND),
+        ("i64 + u64", Sign.SECOND_UNSIGNED),
+        ("u64 + 1", Sign.FIRST_UNSIGNED | Sign.RESULT_UNSIGNED),
+        ("u64 - u64", Sign.FIRST_UNSIGNED | Sign.SECOND_UNSIGNED),
         ("i64 * i64", 0),
-        ("abs(i64) + 1", Sign.FIRST | Sign.RESULT),
+        ("abs(i64) + 1", Sign.FIRST_UNSIGNED | Sign.RESULT_UNSIGNED),
     ],
 )
 def test_signs_follow_from_ranges(text: str, flag: int) -> None:

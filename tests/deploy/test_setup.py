@@ -79,7 +79,8 @@ class Checkout:
         self.interfaces = folder / "comms"
         self._stubs = folder / "stubs"
         self._calls = folder / "calls"
-        for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", ONLY_NEEDED, "router/carrier/build.py"):
+        building = "router/carrier/build.py", "router/carrier/headers.py"
+        for file in ("pyproject.toml", "constraints.txt", "deploy/setup.sh", ONLY_NEEDED, *building):
             (self.root / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / file, self.root / file)
         shutil.copytree(ROOT / "schemas" / "comms", self.root / "schemas" / "comms")

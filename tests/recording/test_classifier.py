@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 
 from router.compiler import check_table
+from router.declared import MAX_DATAGRAM
 from router.recording.mirror import Classifier, first_field
-from router.types.framing import MAX_DATAGRAM
 from router.types.protobuf import PayloadCase
 from tests.observe.fake_running import sim_program
 from tests.recording.recorder_rig import classifier, datagrams

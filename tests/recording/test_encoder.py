@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from router.datagrams import Peer
+from router.declared import MAX_DATAGRAM
 from router.recording.channels import MOST_CHANNELS, Channels
 from router.recording.encoder import Encoder
-from router.types.framing import MAX_DATAGRAM
 from router.types.wire import varint
 from tests.recording.recorder_rig import (
     MILLISECOND,

@@ -8,10 +8,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { MAX_DATAGRAM = 16 * 1024 };
+enum { MAX_DATAGRAM = 16 * 1024 }; /* bytes; a longer datagram is rejected as TRUNCATED */
 
-/* Reasons to reject a datagram, in the order of REJECT_REASONS in compiler/metrics.py. */
-enum reason { TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD, UNKNOWN_CASE, UNHANDLED, IGNORED, SOURCE_MISMATCH, REASONS };
+/* Reasons to reject a datagram, by the names of REJECT_REASONS in compiler/metrics.py. */
+enum reason { TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD, UNKNOWN_CASE, UNHANDLED, IGNORED, SOURCE_MISMATCH };
+enum { REASONS = SOURCE_MISMATCH + 1 };
 
 /* The message types of an envelope, flattened by carrier/schema.py. */
 struct wire_field {

@@ -93,7 +93,7 @@ static int execute(struct machine *machine, const struct code *code, uint32_t *a
     struct loop loops[MOST_LOOPS + 1], *loop = loops; /* nor is the first of these */
     struct opened opened[MOST_OPEN + 1], *open = opened;
     for (const struct operation *op = operations, *end = op + code->count; op < end; op++) {
-        switch ((enum operation_kind)op->kind) {
+        switch ((enum op)op->kind) {
         case OP_INTEGER: (++top)->integer = op->integer; break;
         case OP_REAL: (++top)->real = op->real; break;
         case OP_TEXT: *++top = text_of(literals + op->integer, op->size); break;

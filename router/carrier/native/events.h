@@ -1,5 +1,4 @@
-/* What native threads tell Python for its log, as records of a ring. Each begins with `size` and `kind`. Ids stand for
- * names that Python knows. At most so many are written per window of time: Python reads in the counter that an event
+/* What native threads tell Python for its log, as records of a ring. Ids stand for names that Python knows. At most so many are written per window of time: Python reads in the counter that an event
  * names how many there were. */
 #ifndef EVENTS_H
 #define EVENTS_H
@@ -7,6 +6,11 @@
 #include <stdint.h>
 
 enum event_kind { EVENT_TRIPPED = 1, EVENT_RELEASED, EVENT_DEADMAN_ERROR, EVENT_REJECTED, EVENT_LOST };
+
+/* What every event begins with. */
+struct event_head {
+    uint32_t size, kind;
+};
 
 struct deadman_event {
     uint32_t size, kind;           /* EVENT_TRIPPED, EVENT_RELEASED or EVENT_DEADMAN_ERROR */
@@ -53,8 +57,8 @@ enum loss {
     LOSS_SEND_ERROR,
     LOSS_PUBLISH_ERROR,
     LOSS_TOO_LARGE,
-    LOSS_INCOMPLETE,
-    LOSSES
+    LOSS_INCOMPLETE
 };
+enum { LOSSES = LOSS_INCOMPLETE + 1 };
 
 #endif

@@ -62,7 +62,7 @@ enum scalar {
 /* ---- operations ---- */
 
 /* Operands come from the stack, and the result replaces them there. "Refuses" means that the message is dropped. */
-enum operation_kind {
+enum op {
     /* Values: */
     OP_INTEGER, /* pushes `integer` */
     OP_REAL,    /* pushes `real` */
@@ -183,7 +183,7 @@ enum compared {
 };
 
 struct operation {
-    uint8_t kind; /* enum operation_kind */
+    uint8_t kind; /* enum op */
     uint8_t flag;
     uint16_t slot;
     uint32_t size;

@@ -16,7 +16,8 @@
 #include "deliver.h"
 
 /* Who goes first. */
-enum priority { PRIORITY_COMMAND, PRIORITY_TELEMETRY, PRIORITY_BULK, PRIORITIES };
+enum priority { PRIORITY_COMMAND, PRIORITY_TELEMETRY, PRIORITY_BULK };
+enum { PRIORITIES = PRIORITY_BULK + 1 };
 
 /* How many bytes may wait: 1 s of the bandwidth, within these bounds; and how many datagrams: one for so many bytes. */
 enum { LEAST_ROOM = 1 << 16, MOST_ROOM = 1 << 24, BYTES_PER_WAITING = 16 };

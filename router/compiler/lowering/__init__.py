@@ -15,8 +15,9 @@ from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import signs
-from router.compiler.lowering.operations import NONE, Code, Scalar, Slot
+from router.compiler.lowering.operations import Code, Slot
 from router.compiler.lowering.sources import Collected, Datagram, Elements, RosMessage
+from router.declared import NONE, Scalar
 from router.errors import Diagnostic
 from router.table.model import Route
 from router.types.protobuf import Envelope, PayloadCase

@@ -47,10 +47,7 @@ from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
     Code,
-    Compared,
-    Op,
     Operation,
-    Scalar,
     Slot,
     chained,
     choice,
@@ -62,6 +59,7 @@ from router.compiler.lowering.operations import (
     real,
     text,
 )
+from router.declared import Compared, Op, Scalar
 from router.types.model import Field
 
 _REALS: Mapping[Operator, Op] = {

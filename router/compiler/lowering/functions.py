@@ -20,22 +20,8 @@ from router.compiler.expressions.tree import Binary, Call, Choice, Constant, Lis
 from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
-from router.compiler.lowering.operations import (
-    DROP,
-    WANT,
-    Code,
-    Compared,
-    Op,
-    Operation,
-    Relation,
-    code,
-    integer,
-    keep,
-    load,
-    real,
-    text,
-)
-from router.types.framing import MAX_DATAGRAM
+from router.compiler.lowering.operations import DROP, WANT, Code, Operation, code, integer, keep, load, real, text
+from router.declared import MAX_DATAGRAM, Compared, Op, Relation
 
 if TYPE_CHECKING:
     from router.compiler.lowering.expressions import Lowering

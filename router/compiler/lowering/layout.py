@@ -8,41 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import auto
 from itertools import chain
 from typing import NamedTuple, Union
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.compiler.lowering.nodes import Node, Wanted
-from router.compiler.lowering.operations import NONE, Counted, Scalar, Slot
+from router.compiler.lowering.operations import Slot
+from router.declared import NONE, FieldType, ReadKind, Scalar
 from router.types.descriptors import enum_of
 from router.types.model import Field as Member
 from router.types.model import MessageType
-
-MOST_NODES_DEEP = 32
-"""As in `native/read_protobuf.h`: messages in messages, of which the envelope is one."""
-
-
-class FieldType(Counted):
-    """`enum field_type`."""
-
-    BOOL = auto()
-    INT32 = auto()
-    INT64 = auto()
-    UINT32 = auto()
-    SINT32 = auto()
-    SINT64 = auto()
-    FIXED32 = auto()
-    SFIXED32 = auto()
-    FIXED64 = auto()
-    FLOAT = auto()
-    DOUBLE = auto()
-    BYTES = auto()
-    MESSAGE = auto()
-    GROUP = auto()
-    CLOSED_ENUM = auto()
-
 
 _FIELD_TYPES = {
     FieldDescriptor.TYPE_BOOL: FieldType.BOOL,
@@ -79,20 +55,6 @@ class NodeField(NamedTuple):
     cleared: int = 0
     cleared_count: int = 0
     closed: int = NONE
-
-
-class ReadKind(Counted):
-    """`enum read_kind`."""
-
-    SCALAR = auto()
-    SKIP = auto()
-    ARRAY = auto()
-    SEQUENCE = auto()
-    TEXT = auto()
-    EACH = auto()
-    EACH_SEQUENCE = auto()
-    AGAIN = auto()
-    TEXTS = auto()
 
 
 class ReadOperation(NamedTuple):

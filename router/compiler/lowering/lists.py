@@ -44,9 +44,7 @@ from router.compiler.lowering.operations import (
     SIZE,
     WANT,
     Code,
-    Op,
     Operation,
-    Scalar,
     Slot,
     choice,
     code,
@@ -56,6 +54,7 @@ from router.compiler.lowering.operations import (
     real,
     repeat,
 )
+from router.declared import Op, Scalar
 
 if TYPE_CHECKING:
     from router.compiler.lowering.expressions import Lowering

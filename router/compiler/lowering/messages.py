@@ -8,21 +8,9 @@ from typing import NamedTuple
 from router.compiler.lowering import lists
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
-from router.compiler.lowering.operations import (
-    WANT,
-    Code,
-    Compared,
-    Op,
-    Operation,
-    Relation,
-    code,
-    integer,
-    keep,
-    known,
-    load,
-    repeat,
-)
+from router.compiler.lowering.operations import WANT, Code, Operation, code, integer, keep, known, load, repeat
 from router.compiler.plan import Each
+from router.declared import Compared, Op, Relation
 from router.errors import SourceSpan
 from router.types.model import List
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Union
 
 from router.compiler.lowering.nodes import Node
-from router.compiler.lowering.operations import MOST_TEXT, Flag, Slot
+from router.compiler.lowering.operations import Flag, Slot
+from router.declared import MOST_TEXT
 from router.errors import Code, Diagnostic, SourceSpan
 
 Meaning = Union[Slot, Node]

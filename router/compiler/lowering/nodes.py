@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-from router.compiler.lowering.operations import Scalar, Slot
+from router.compiler.lowering.operations import Slot
+from router.declared import Scalar
 from router.types.descriptors import message_of
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from router.types.model import Field as Member

@@ -15,7 +15,8 @@ from router.compiler.expressions.kinds import (
     as_int,
 )
 from router.compiler.expressions.tree import Relation as TreeRelation
-from router.compiler.lowering.operations import Code, Compared, Op, Operation, Relation, Sign, code, integer
+from router.compiler.lowering.operations import Code, Operation, code, integer
+from router.declared import Compared, Op, Relation, Sign
 
 
 def bounds(kind: Kind) -> tuple[int, int]:
@@ -33,9 +34,9 @@ def is_unsigned(kind: Kind) -> bool:
 
 def signs(result: Kind, *operands: Kind) -> int:
     """The flag of an operation with integers."""
-    flags = (Sign.FIRST, Sign.SECOND, Sign.THIRD)
+    flags = (Sign.FIRST_UNSIGNED, Sign.SECOND_UNSIGNED, Sign.THIRD_UNSIGNED)
     unsigned = sum(int(flag) for flag, kind in zip(flags, operands, strict=False) if is_unsigned(kind))
-    return unsigned + int(Sign.RESULT) * is_unsigned(result)
+    return unsigned + int(Sign.RESULT_UNSIGNED) * is_unsigned(result)
 
 
 def to_real(made: Code, kind: Kind) -> Code:

@@ -14,8 +14,9 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
 from router.compiler.lowering.numbers import to_real
-from router.compiler.lowering.operations import Code, Op, Operation, known
+from router.compiler.lowering.operations import Code, Operation, known
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.declared import Op
 from router.types.descriptors import container, message_of
 from router.types.protobuf import PayloadCase
 from router.types.wire import GROUP, GROUP_END, LEN, varint, wire_type_of

@@ -14,30 +14,16 @@ from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.layout import MOST_NODES_DEEP, Layout, protobuf_layout
+from router.compiler.lowering.layout import Layout, protobuf_layout
 from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
 from router.compiler.lowering.nodes import Node
-from router.compiler.lowering.operations import (
-    MOST_LOOPS,
-    MOST_OPEN,
-    MOST_STACKED,
-    NONE,
-    Code,
-    Op,
-    Operation,
-    Scalar,
-    Slot,
-    chained,
-    depths,
-    most_executed,
-    nesting,
-)
+from router.compiler.lowering.operations import Code, Operation, Slot, chained, depths, most_executed, nesting
 from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.lowering.steps import TooManyListsError, cdr_layout
 from router.compiler.plan import Record
+from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_NODES_DEEP, MOST_OPEN, MOST_STACKED, NONE, Op, Scalar
 from router.errors import SourceSpan
-from router.types.framing import MAX_DATAGRAM
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
@@ -209,7 +195,7 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
     operations = [operation for operation, _ in placed]
     loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
     limits = (
-        (depths(operations), MOST_STACKED, "intermediate values are needed here", "use fewer brackets in brackets"),
+        (depths(operations), MOST_STACKED - 1, "intermediate values are needed here", "use fewer brackets in brackets"),
         (loops, MOST_LOOPS, "lists are nested here", "fill fewer lists in lists"),
         (opened, MOST_OPEN, "messages are nested here", "fill fewer messages in messages"),
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from router.compiler.lowering.layout import Layout, Numbering, PlacedNode, ReadKind, ReadOperation
+from router.compiler.lowering.layout import Layout, Numbering, PlacedNode, ReadOperation
 from router.compiler.lowering.nodes import Node, Wanted, scalar_of, size_of
 from router.compiler.lowering.offsets import HIGHEST, Offset
-from router.compiler.lowering.operations import MOST_LOOPS, Slot
+from router.compiler.lowering.operations import Slot
+from router.declared import MOST_LOOPS, ReadKind
 from router.types.model import List, MessageType, String, Type
 
 

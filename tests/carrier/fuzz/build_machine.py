@@ -16,7 +16,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from router.carrier.build import NATIVE
-from tests.carrier.evaluating import CDR_HEADER, NONE, SOURCES, Layout, Operation
+from router.declared import NONE
+from tests.carrier.evaluating import CDR_HEADER, SOURCES, Layout, Operation
 from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 from tests.carrier.fuzz.lowered_programs import Seeds, lowered_programs
 from tests.carrier.fuzz.random_programs import ForEach, Program, random_program

@@ -10,9 +10,9 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from router.declared import NONE
 from tests.carrier.evaluating import (
     CDR_HEADER,
-    NONE,
     C,
     Layout,
     Node,

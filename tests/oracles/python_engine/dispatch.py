@@ -15,7 +15,7 @@ from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
 from router.datagrams import Peer
-from router.types.framing import MAX_DATAGRAM
+from router.declared import MAX_DATAGRAM
 from router.types.wire import LEN
 from tests.oracles.python_engine.binding import EngineContext, Handle, bind, unbind
 from tests.oracles.python_engine.freshness import Born, Freshness

@@ -11,8 +11,9 @@ from google.protobuf.message import Message
 from router.compiler.metrics import UNKNOWN_CASE
 from router.compiler.program import Program
 from router.datagrams import why_no_payload
+from router.declared import MAX_DATAGRAM
 from router.table.model import Framing
-from router.types.framing import MAX_DATAGRAM, restored
+from router.types.framing import restored
 
 Case = TypeVar("Case")
 
