@@ -11,7 +11,6 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import MappingError
 from router.rehearsal.cdr import deserialize as parse
 from router.rehearsal.cdr import serialize as cdr
@@ -19,6 +18,7 @@ from router.types.model import Bool, Field, Float, Int, List, MessageType, Strin
 from tests.compiler.comparing import same
 from tests.compiler.compiling import outcome
 from tests.compiler.generated_types import values
+from tests.compiler.machine import FAILURES
 from tests.compiler.reading import TIMES, WHOLE, Path, at, field_values, messages, paths, plain, reader, wanted_paths
 from tests.oracles.reference import Value
 
@@ -67,10 +67,10 @@ def test_damaged_bytes_are_read_or_refused_as_the_reference_does(data: st.DataOb
         serialized[place : place + len(damage)] = damage
     damaged = bytes(serialized[: data.draw(st.none() | st.integers(0, len(serialized)))])
     ours = outcome(lambda: compiled(declared, damaged, [WHOLE]))
-    event("refused" if ours is MAPPING_FAILURES else "read")
+    event("refused" if ours is FAILURES else "read")
     assert same(ours, outcome(lambda: parsed(declared, damaged, [WHOLE])))
     some = data.draw(wanted_paths(declared))
-    if ours is not MAPPING_FAILURES:
+    if ours is not FAILURES:
         assert same(compiled(declared, damaged, some), parsed(declared, damaged, some))
     else:
         outcome(lambda: compiled(declared, damaged, some))
@@ -93,7 +93,7 @@ def test_length_beyond_the_end_is_refused_before_memory_is_taken_for_it(hostile:
         data = b"\0\1\0\0" + struct.pack("<I", length) + bytes(1000)
         tracemalloc.start()
         try:
-            with pytest.raises(MAPPING_FAILURES):
+            with pytest.raises(FAILURES):
                 read(data)
             assert tracemalloc.get_traced_memory()[1] < 500_000
         finally:
@@ -127,12 +127,12 @@ def test_bad_string_fails_where_it_is_used_and_nowhere_else(text: bytes) -> None
     _, read_after = reader(declared, [("after",)])
     assert read_after(data) == [7]
     _, read_text = reader(declared, [("text",)])
-    with pytest.raises(MAPPING_FAILURES):
+    with pytest.raises(FAILURES):
         read_text(data)
     _, read_elements = reader(message(elements=List(declared, length=1)), [("elements",)])
     ((element,),) = read_elements(data)
     assert element.after == 7
-    with pytest.raises(MAPPING_FAILURES):
+    with pytest.raises(FAILURES):
         _ = element.text
 
 
