@@ -87,7 +87,7 @@ def payload_of(source: MessageType) -> tuple[PayloadCase, Envelope]:
     around.oneof_decl.add(name="cases")
     around.field.add(name="payload", number=1, label=1, type=11, type_name=f".made.{payload}", oneof_index=0)
     pool = DescriptorPool()
-    pool.Add(file)  # type: ignore[attr-defined]  # of upb
+    pool.Add(file)
     classes = [GetMessageClass(pool.FindMessageTypeByName(f"made.{name}")) for name in (payload, "Envelope")]
     case = PayloadCase("payload", 1, source, classes[0], None)
     return case, Envelope("made.Envelope", "cases", classes[1], {"payload": case}, 0)
