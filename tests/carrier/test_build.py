@@ -44,6 +44,9 @@ def test_a_library_is_current_until_a_source_changes(made: Path, native: Path) -
     assert not build.is_current(made)
     build.build(made)
     assert build.is_current(made)
+    build.declared_by(made).unlink()  # what the headers declare
+    assert not build.is_current(made)
+    build.build(made)
     made.unlink()
     assert not build.is_current(made)
 
