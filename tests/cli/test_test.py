@@ -12,6 +12,7 @@ import jsonschema
 import pytest
 
 from router.assets import asset
+from router.carrier.library import load
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from router.cli.test import FAILED
 from router.compiler import check_table
@@ -67,6 +68,16 @@ def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
     assert covered[3] == covered[4]
     assert covered[5] == covered[6]
     assert out.endswith(" tests passed, in 1 file\n")
+
+
+def test_without_the_library_one_sentence_says_what_to_do(
+    rover: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("router.rehearsal.rehearsal.library", lambda: load(tmp_path / "libcarrier.so"))
+    assert main(["test", str(rover)]) == BAD_TABLE
+    what, remedy = capsys.readouterr().err.splitlines()
+    assert what == f"router test: {tmp_path}/libcarrier.so was not built, and nothing runs without it"
+    assert remedy.strip() == "help: run 'make setup'"
 
 
 @pytest.mark.parametrize(
