@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,10 +13,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 from router.compiler.program import Program
 from router.rehearsal.rehearsal import START, DeadmanChanged, Dropped, Event, Rehearsal, Sent
-from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
 from tests.oracles.ages_and_rates import Freshness, RateLimit
 from tests.oracles.deadman import Deadman, Deadmen
 from tests.rehearsal.test_rehearsal import datagram
+from tests.small_tables import BASESTATION, HEAD, SENSOR_BOARD, program
 
 MS = 1_000_000
 TTL, RATE = 200 * MS, 20.0
@@ -47,7 +47,8 @@ AHEAD = st.one_of(st.integers(-600 * MS, 600 * MS), st.sampled_from((0, 3 * MS, 
 def table(number: int) -> Program:
     """The table with these settings of the deadman; all of them count the same, so their counters are."""
     with TemporaryDirectory() as folder:
-        return program(Path(folder), ROUTES.replace("SETTINGS", SETTINGS[number]), HEAD)
+        made: Program = program(Path(folder), ROUTES.replace("SETTINGS", SETTINGS[number]), HEAD)
+    return made
 
 
 class Model:
@@ -152,7 +153,7 @@ class AgesRatesAndDeadmen(RuleBasedStateMachine):
         self.model.happened.clear()
 
 
-def _by_kind(events: list[Event]) -> Mapping[type[Event], list[Event]]:
+def _by_kind(events: Sequence[Event]) -> Mapping[type[Event], list[Event]]:
     """In order, but a deadman may say before or after its datagram what it does."""
     return {kind: [event for event in events if isinstance(event, kind)] for kind in (Sent, Dropped, DeadmanChanged)}
 
