@@ -80,8 +80,8 @@ class Model:
 
     def advance(self, to: int) -> None:
         while (due := self._deadmen.next_due) is not None and due <= to:
-            self.now = due
-            self._deadmen.serve(due)
+            self.now = max(self.now, due)
+            self._deadmen.serve(self.now)
             self._tell("manual_drive", by_deadman=True)
         self.now = to
 
