@@ -47,10 +47,12 @@ def native_library() -> ctypes.CDLL:
 
 
 def table(schema: str, folder: Path) -> Program:
-    """A table for one of SCHEMAS, with its file in `folder`."""
+    """A table for one of SCHEMAS, with its file in a folder of its own in `folder`: the oracle reads it again."""
     protos, cases = SCHEMAS[schema]
     routes = "".join(f"  {case}: {{source: any, destinations: [tool]}}\n" for case in cases)
-    return program(folder, routes, HEAD, protos)
+    own = folder / schema
+    own.mkdir(exist_ok=True)
+    return program(own, routes, HEAD, protos)
 
 
 @dataclass(frozen=True)
