@@ -139,6 +139,21 @@ def test_none_is_lost_where_another_subscription_takes_over(site: Site, publishe
         assert sorted(set(numbers(site, sent))) == list(range(1, sent + 1))
 
 
+def test_a_topic_of_two_names_feeds_the_routes_of_both(site: Site, publisher: Publisher) -> None:
+    both = UNHURRIED + f"""\
+  manual_drive:
+    source: {{topic: /drive_motor, type: {TYPE}, queue_depth: 1000}}
+    fields: {{turn: 7}}
+    destinations: [basestation]
+    deadman: {{none: for this test}}
+"""
+    with site.router(both) as router:
+        assert [publisher.line(), publisher.line()] == ["matched", "matched"]
+        publisher.publish(map(command, range(100)))
+        wait_until(lambda: router.total("datagrams_sent") == 200)
+        assert router.total("messages_received") == 200
+
+
 @contextmanager
 def commands_coming(publisher: Publisher) -> Iterator[list[int]]:
     """Commands with their numbers come all the time; yields those that were published."""

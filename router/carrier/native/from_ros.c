@@ -44,7 +44,7 @@ static void serve_message(struct from_ros *thread, const struct ros_topic *topic
     taken.received_at = wall_ns();
     taken.published_at = info->source_timestamp;
     taken.arrived_at = info->received_timestamp;
-    taken.publisher = find_publisher(&thread->routing, info->publisher);
+    taken.publisher = find_publisher(&thread->routing, info->publisher, topic->routes[0].targets.topic);
     if (is_new(taken.publisher, info->publication_sequence_number)) route_ros_message(&thread->routing, topic, &taken);
 }
 

@@ -172,7 +172,7 @@ void rehearsal_message(struct rehearsal *rehearsal, uint32_t topic, const void *
     static const uint8_t gid[GID_SIZE];
     struct taken taken = {.data = data, .size = size, .published_at = sent_at, .now = rehearsal->now,
                           .received_at = rehearsal->now + rehearsal->ahead,
-                          .publisher = find_publisher(&rehearsal->ros, gid)};
+                          .publisher = find_publisher(&rehearsal->ros, gid, NO_NAME)};
     taken.publisher->sent = taken.publisher->stamped = INT64_MIN; /* any of them may have sent it */
     route_ros_message(&rehearsal->ros, &rehearsal->topics[topic], &taken);
 }

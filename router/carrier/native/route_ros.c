@@ -79,12 +79,13 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
 
 /* ---- for others ---- */
 
-struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid) {
-    uint32_t hash = 2166136261; /* FNV-1a */
+struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid, uint32_t topic) {
+    uint32_t hash = 2166136261 ^ topic; /* FNV-1a */
     for (int index = 0; index < GID_SIZE; index++) hash = (hash ^ gid[index]) * 16777619;
     struct ros_publisher *found = &routing->publishers[hash % MOST_PUBLISHERS];
-    if (memcmp(found->gid, gid, GID_SIZE)) {
+    if (memcmp(found->gid, gid, GID_SIZE) || found->topic != topic) {
         memcpy(found->gid, gid, GID_SIZE);
+        found->topic = topic;
         found->number = 0;
         found->sent = found->stamped = INT64_MIN;
     }
@@ -99,7 +100,7 @@ bool is_new(struct ros_publisher *publisher, uint64_t number) {
 }
 
 void follow_publisher(struct ros_routing *routing, const struct ros_publisher *known) {
-    struct ros_publisher *publisher = find_publisher(routing, known->gid);
+    struct ros_publisher *publisher = find_publisher(routing, known->gid, known->topic);
     if (publisher->number < known->number) *publisher = *known;
 }
 

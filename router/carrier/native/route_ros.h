@@ -49,6 +49,7 @@ enum { MOST_PUBLISHERS = 64 };
  * stamps. */
 struct ros_publisher {
     uint8_t gid[GID_SIZE];
+    uint32_t topic;        /* as in events: a table may call a topic by two names, and has a subscription for each */
     uint64_t number;       /* 0 if it is not known, */
     int64_t sent, stamped; /* INT64_MIN if these are not */
 };
@@ -70,8 +71,8 @@ struct taken {
     struct ros_publisher *publisher;
 };
 
-/* Return what is known of a publisher. One with the same hash is forgotten. */
-struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid);
+/* Return what is known of a publisher on a topic. One with the same hash is forgotten. */
+struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid, uint32_t topic);
 
 /* Whether a message comes after the publisher's last one, as far as the middleware numbers them. Where one subscription
  * takes over from another, both receive what comes meanwhile. */
