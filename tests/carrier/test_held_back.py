@@ -132,9 +132,9 @@ class Model:
             deferral.change(self.now, change.hertz)
 
     def end(self, end: End) -> None:
+        self._deferrals[end.target].end(self.now)
         if self._pacer is not None:
             self._pacer.release(self.now, lambda message: message.target == end.target)
-        self._deferrals[end.target].end(self.now)
 
 
 def carried(

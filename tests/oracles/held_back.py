@@ -131,8 +131,8 @@ class Deferral:
             self.limit = RateLimit(hertz or 1)
 
     def end(self, now: int) -> None:
-        self.has_ended = True
         self._release(now)
+        self.has_ended = True
 
     def _release(self, now: int) -> None:
         held, self.held, self.next_due = self.held, None, None
