@@ -385,7 +385,7 @@ def test_of_taps_there_are_a_few_only_and_one_that_is_not_read_goes(
             assert refused.read() == b"there are 6 taps already: end one\n"
 
         def is_let_in() -> bool:
-            for _ in range(50):
+            for _ in range(0 if running.waiting else 50):  # a tap drops batches of many more
                 running.receive(bytes(60_000), ("127.0.0.99", 1))
             with asking(server, "/tap") as another:
                 return another.getresponse().status == 200
