@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 
 from tests.acceptance.ros_peer import PATIENCE
 
@@ -31,6 +31,7 @@ class ServiceManager:
         self._environment = environment
         self._log = folder / "router.log"
         self.sockets = [_held(address) for address in addresses]
+        sleep(0.2)  # the kernel begins to stamp datagrams a moment after the first socket has asked for it
         self.told: list[str] = []
         self.process: subprocess.Popen[bytes] | None = None
         self._hearing = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
