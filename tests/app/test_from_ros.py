@@ -140,13 +140,16 @@ def test_none_is_lost_where_another_subscription_takes_over(site: Site, publishe
 
 
 def test_a_topic_of_two_names_feeds_the_routes_of_both(site: Site, publisher: Publisher) -> None:
-    both = UNHURRIED + f"""\
+    both = (
+        UNHURRIED
+        + f"""\
   manual_drive:
     source: {{topic: /drive_motor, type: {TYPE}, queue_depth: 1000}}
     fields: {{turn: 7}}
     destinations: [basestation]
     deadman: {{none: for this test}}
 """
+    )
     with site.router(both) as router:
         assert [publisher.line(), publisher.line()] == ["matched", "matched"]
         publisher.publish(map(command, range(100)))

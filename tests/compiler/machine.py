@@ -55,7 +55,7 @@ def machine(
     route: Any = SimpleNamespace(name=_ROUTE, ttl=None, ignore=None, span=span)
     lowered, findings = lower_table([CheckedRoute(route, case, (checked,))], envelope)
     assert not findings, findings
-    carrier = Delivering(_functions(), lowered.topics[_ROUTE], received_at, sender)
+    carrier = Delivering(functions(), lowered.topics[_ROUTE], received_at, sender)
 
     def make(message: Any) -> bytes:
         payload: Any = case.message_class()
@@ -69,7 +69,8 @@ def machine(
 
 
 @cache
-def _functions() -> ctypes.CDLL:
+def functions() -> ctypes.CDLL:
+    """The functions by which tests deliver messages on the machine in C."""
     folder = Path(mkdtemp())
     library = LIBRARY if is_current() else build(folder / LIBRARY.name)
     return delivering(folder / "delivering.so", library, is_sanitized=False)

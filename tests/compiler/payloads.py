@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from types import SimpleNamespace
 from typing import Any
 
-from router.carrier.build import LIBRARY, is_current
-from router.carrier.build import build as build_library
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions import Scope
 from router.compiler.lowering import lower_table
@@ -21,8 +17,9 @@ from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Destination, FieldMap, Topic
 from router.types.model import Bytes, Enum, Field, Int, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
-from tests.carrier.delivering import Delivering, delivering
+from tests.carrier.delivering import Delivering
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
+from tests.compiler.machine import functions
 from tests.oracles.reference import fill_given
 from tests.oracles.reference_protobuf import envelope_of
 from tests.tables import PROTOS
@@ -66,7 +63,7 @@ def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: Me
     feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, None, None, (target,))
     lowered, findings = lower_table([CheckedRoute(route, case, subscriptions=(feed,))], envelope)
     assert findings == []
-    carrier = Delivering(_functions(), lowered.from_ros[SOURCE][0], RECEIVED_AT, "not of ROS")
+    carrier = Delivering(functions(), lowered.from_ros[SOURCE][0], RECEIVED_AT, "not of ROS")
 
     def make(message: bytes) -> bytes:
         (outcome,) = carrier.from_ros(message)
@@ -75,13 +72,6 @@ def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: Me
         return outcome.got
 
     return make
-
-
-@cache
-def _functions() -> ctypes.CDLL:
-    folder = Path(mkdtemp())
-    library = LIBRARY if is_current() else build_library(folder / LIBRARY.name)
-    return delivering(folder / "delivering.so", library, is_sanitized=False)
 
 
 def as_ros(declared: Type) -> Any:

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from router.carrier.state import State
 from router.compiler.metrics import Report, Series
 from router.compiler.program import DeadmanPlan, Program
 from router.datagrams import Peer
 from router.rehearsal.rehearsal import EVENTS, START, DeadmanChanged, Dropped, Event, Rejected
 from tests.oracles.python_engine import InboundEngine, OutboundEngine
-from tests.oracles.python_engine.binding import EngineContext, State, TimerGroup
+from tests.oracles.python_engine.binding import EngineContext, TimerGroup
 from tests.oracles.python_engine.deadman import Deadman, commander
 from tests.oracles.python_engine.freshness import Freshness
 from tests.oracles.python_engine.pacing import Pacer

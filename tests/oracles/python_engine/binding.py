@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import FunctionType
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
+from router.carrier.state import State
 from router.compiler.metrics import Counters, Report
 from router.compiler.namespace import MAPPING_FAILURES
 from router.compiler.program import Handler, Program, TargetPlan
@@ -32,35 +33,6 @@ T = TypeVar("T")
 
 Handle = Callable[..., None]
 """A generated function; its arguments are described in compiler.handlers."""
-
-
-class State:
-    """What the handlers of a program keep from one message to the next, by key; survives a reload.
-
-    A program's state takes over from that of the `previous` program what has the same key: then both programs use the
-    same object, whichever of them runs. A key therefore has to contain everything that its object depends on.
-    """
-
-    def __init__(self, previous: State | None = None) -> None:
-        self._previous: dict[Hashable, object] = previous._kept if previous else {}
-        self._kept: dict[Hashable, object] = {}
-
-    def keep(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the object with this key, of this program or the previous one; make it if there is none."""
-        if key not in self._kept:
-            self._kept[key] = self._previous[key] if key in self._previous else make()
-        return cast("T", self._kept[key])
-
-    def added(self) -> Iterator[object]:
-        """The objects that the previous program does not have."""
-        return (value for key, value in self._kept.items() if key not in self._previous)
-
-    def left(self) -> Iterator[object]:
-        """The objects that only the previous program has; none after `forget_previous`."""
-        return (value for key, value in self._previous.items() if key not in self._kept)
-
-    def forget_previous(self) -> None:
-        self._previous = {}
 
 
 class Flag(Protocol):
