@@ -187,7 +187,7 @@ def _is_comparable(earlier: Program, later: Program) -> bool:
 
 
 def _targets(program: Program) -> dict[tuple[str, str | None, str], TargetPlan]:
-    return {(each.route, each.topic, target.label): target for each in program.handlers for target in each.targets}
+    return {(each.route, each.topic, target.label): target for each in program.routes for target in each.targets}
 
 
 def _without_detail(event: Event) -> Event:

@@ -9,7 +9,7 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import HISTOGRAM_CELLS
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from tests.envelopes import rover_envelope
 from tests.tables import PROTOS
 
@@ -91,16 +91,16 @@ class Ledger:
 
     def imbalances(self) -> Iterator[str]:
         """Expects that no frame is open, and nothing is held back for later."""
-        inbound = [handler for handlers in self._program.inbound.values() for handler in handlers]
-        outbound = [handler for handlers in self._program.outbound.values() for handler in handlers]
+        inbound = [plan for plans in self._program.inbound.values() for plan in plans]
+        outbound = [plan for plans in self._program.outbound.values() for plan in plans]
         received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
-        accepted = sum(self.total("messages_received", handler.route) for handler in inbound)
+        accepted = sum(self.total("messages_received", plan.route) for plan in inbound)
         if received != accepted + rejected:
             yield f"received {received}, but accepted {accepted} and rejected {rejected}"
-        for handler in inbound:
-            yield from self._time_of_route(handler.route)
-        for handler in (*inbound, *outbound):
-            yield from self._fates(handler)
+        for plan in inbound:
+            yield from self._time_of_route(plan.route)
+        for plan in (*inbound, *outbound):
+            yield from self._fates(plan)
 
     def _time_of_route(self, route: str) -> Iterator[str]:
         accepted = self.total("messages_received", route)
@@ -108,9 +108,9 @@ class Ledger:
         if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_CELLS - 1])):
             yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
 
-    def _fates(self, handler: Handler) -> Iterator[str]:
-        route, accepted = handler.route, self.total("messages_received", handler.route)
-        for target in handler.targets:
+    def _fates(self, plan: RoutePlan) -> Iterator[str]:
+        route, accepted = plan.route, self.total("messages_received", plan.route)
+        for target in plan.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected", "messages_waiting")
             fates = [self.total(metric, route, target.label) for metric in metrics]

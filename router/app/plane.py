@@ -36,7 +36,7 @@ from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
 from router.clock import boottime_ns
-from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
+from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
 from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener
@@ -349,11 +349,11 @@ def _change_of_destinations(built: Built) -> c.TimerChange:
     return timer_change([each for each in built.adopted if not each.is_topic], ended)
 
 
-def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
+def _limit(state: State, plan: RoutePlan, target: TargetPlan) -> c.Limit:
     """The limit of a target with `max_rate`, which lives as long as programs have the target."""
     rate = target.max_rate
     assert rate is not None  # noqa: S101 - asked for by the caller
-    return state.keep(("limit", handler.route, handler.topic, target), lambda: open_limit(rate))
+    return state.keep(("limit", plan.route, plan.topic, target), lambda: open_limit(rate))
 
 
 def log_start(route: str, sent_to: Sequence[str]) -> None:

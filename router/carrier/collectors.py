@@ -9,7 +9,7 @@ from router import declared as c
 from router.carrier.lowered import Programs
 from router.carrier.state import State
 from router.compiler.lowering import LoweredCollect
-from router.compiler.program import Handler
+from router.compiler.program import RoutePlan
 
 
 class NativeCollector:
@@ -26,11 +26,11 @@ class NativeCollector:
         self._library.collector_close(self.address)
 
 
-def kept_collector(library: ctypes.CDLL, state: State, handler: Handler) -> NativeCollector:
+def kept_collector(library: ctypes.CDLL, state: State, plan: RoutePlan) -> NativeCollector:
     """The collector of a route, which lives as long as programs have it, with these topics and this payload."""
-    timeout, targets = handler.collect_timeout, tuple(target for target in handler.targets if target.is_topic)
+    timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
     assert timeout is not None  # noqa: S101 - asked for by the caller
-    key = "collect", handler.route, timeout, handler.case.message_class, targets
+    key = "collect", plan.route, timeout, plan.case.message_class, targets
     return state.keep(key, lambda: NativeCollector(library, timeout))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from router import declared as c
 from router.carrier.limits import period
 from router.carrier.state import State
-from router.compiler.program import Handler, TargetPlan
+from router.compiler.program import RoutePlan, TargetPlan
 from router.table.model import OnLimit
 
 
@@ -68,14 +68,14 @@ class Deferrals:
         key = "pacer", endpoint, bandwidth, self.senders[endpoint]
         return self.state.keep(key, lambda: NativePacer(self.library, bandwidth))
 
-    def deferral(self, handler: Handler, target: TargetPlan) -> NativeDeferral | None:
+    def deferral(self, plan: RoutePlan, target: TargetPlan) -> NativeDeferral | None:
         """The deferral of a target, if it needs one."""
         is_paced = not target.is_topic and target.label in self.bandwidths
         pacer = self._pacer(target.label) if is_paced else None
         if pacer is None and not held_period(target):
             return None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
-        key = "deferral", handler.route, handler.topic, target.label, destination
+        key = "deferral", plan.route, plan.topic, target.label, destination
         return self.state.keep(key, lambda: NativeDeferral(self.library, pacer, is_topic=target.is_topic))
 
 

@@ -18,7 +18,7 @@ from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.targets import TargetWriter
 from router.compiler.lowering import LoweredElements, LoweredFeed
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from router.declared import NONE
 from router.threads import StuckError
 
@@ -64,8 +64,8 @@ def native_from_ros(program: Program, generation: int, outlets: Outlets) -> Nati
     made = NativeFromRos()
     writer = TargetWriter(program, outlets, generation, made.arrays)
     for topic, feeds in program.lowered.from_ros.items():
-        handlers = {handler.route: handler for handler in program.outbound[topic]}
-        routes = [_route(writer, handlers[feed.route], feed) for feed in feeds]
+        plans = {plan.route: plan for plan in program.outbound[topic]}
+        routes = [_route(writer, plans[feed.route], feed) for feed in feeds]
         made.topics[topic] = (c.RosRoute * len(routes))(*routes)
         if any(feed.is_urgent for feed in feeds):
             made.urgent.add(topic)
@@ -73,10 +73,10 @@ def native_from_ros(program: Program, generation: int, outlets: Outlets) -> Nati
     return made
 
 
-def _route(writer: TargetWriter, handler: Handler, feed: LoweredFeed) -> c.RosRoute:
-    assert handler.topic is not None  # noqa: S101 - of a route from ROS
+def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
+    assert plan.topic is not None  # noqa: S101 - of a route from ROS
     counters, programs = writer.program.counters, Programs(feed.layout, writer.arrays)
-    targets = writer.targets(handler, handler.targets, feed.targets, programs)
+    targets = writer.targets(plan, plan.targets, feed.targets, programs)
     for_each = native_for_each(feed.for_each, programs)
     targets.layout = programs.layout()
     seconds, nanoseconds = feed.stamp or (NONE, NONE)
@@ -85,9 +85,9 @@ def _route(writer: TargetWriter, handler: Handler, feed: LoweredFeed) -> c.RosRo
         for_each=for_each,
         seconds=seconds,
         nanoseconds=nanoseconds,
-        received=counters.index("messages_received", handler.route, handler.topic),
-        last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
-        duration=counters.index("route_duration_seconds", handler.route),
+        received=counters.index("messages_received", plan.route, plan.topic),
+        last_message=counters.index("route_last_message_timestamp_seconds", plan.route),
+        duration=counters.index("route_duration_seconds", plan.route),
     )
 
 

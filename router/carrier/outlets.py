@@ -11,7 +11,7 @@ from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.collectors import NativeCollector
 from router.carrier.deferrals import NativeDeferral
-from router.compiler.program import Handler, TargetPlan
+from router.compiler.program import RoutePlan, TargetPlan
 from router.net.udp import Listener
 
 
@@ -47,8 +47,8 @@ class Outlets:
     """What is open for a program. Pointers are addresses of C structures.
 
     `senders` are by endpoint, `publications` by topic. `feeds(route, names)` returns the deadmen that a command feeds
-    (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`, `deferral(handler,
-    target)` what may hold its messages back, `collector(handler)` what makes frames for its topics. Without `boards`,
+    (False) or disarms (True), `limit(plan, target)` the limit of a target with `max_rate`, `deferral(plan,
+    target)` what may hold its messages back, `collector(plan)` what makes frames for its topics. Without `boards`,
     endpoints that are boards get everything.
     """
 
@@ -56,8 +56,8 @@ class Outlets:
     senders: Mapping[str, int]
     publications: Mapping[str, Publication]
     feeds: Callable[[str, Sequence[str]], Sequence[tuple[int, bool]]]
-    limit: Callable[[Handler, TargetPlan], c.Limit]
-    deferral: Callable[[Handler, TargetPlan], NativeDeferral | None]
-    collector: Callable[[Handler], NativeCollector]
+    limit: Callable[[RoutePlan, TargetPlan], c.Limit]
+    deferral: Callable[[RoutePlan, TargetPlan], NativeDeferral | None]
+    collector: Callable[[RoutePlan], NativeCollector]
     names: Names
     boards: NativeBoards | None = None

@@ -19,7 +19,7 @@ from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetWriter
 from router.compiler.metrics import UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
-from router.compiler.program import STRANGER, Handler, Program, source_label
+from router.compiler.program import STRANGER, Program, RoutePlan, source_label
 from router.table.model import Framing
 
 
@@ -36,10 +36,10 @@ class NativeProgram:
 def native_program(program: Program, generation: int, outlets: Outlets) -> NativeProgram:
     """Make the arrays of a program; `generation` numbers the programs of the process."""
     schema = wire_schema(program.envelope, program.inbound.keys())
-    handlers = [handler for several in program.inbound.values() for handler in several]
+    plans = [plan for several in program.inbound.values() for plan in several]
     made = NativeProgram(generation, arrays=[schema])
     targets = TargetWriter(program, outlets, generation, made.arrays)
-    numbers = {handler.route: number for number, handler in enumerate(handlers)}
+    numbers = {plan.route: number for number, plan in enumerate(plans)}
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
     writer = _Writer(program, made, outlets, targets, numbers, columns)
     made.structure = c.Program(
@@ -50,7 +50,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         schema=ctypes.pointer(schema.schema),
         listeners=writer.array(c.Listener, writer.listeners()),
         cases=writer.array(c.PayloadCase, writer.cases()),
-        routes=writer.array(c.Route, [writer.route(handler) for handler in handlers]),
+        routes=writer.array(c.Route, [writer.route(plan) for plan in plans]),
     )
     made.adopted = targets.adopted
     return made
@@ -128,33 +128,33 @@ class _Writer:
 
     def _entries(self) -> Iterator[c.Entry]:
         """Row by row, as in `cases`: a column for each endpoint, and the last one for strangers."""
-        for handlers in self.program.inbound.values():
-            by_source = {source: handler for handler in handlers for source in handler.sources}
+        for plans in self.program.inbound.values():
+            by_source = {source: plan for plan in plans for source in plan.sources}
             stranger = self._entry(by_source.get(STRANGER), STRANGER)
             for name in self.columns:
                 found = by_source.get(name)
                 yield self._entry(found, name) if found else stranger
             yield stranger
 
-    def _entry(self, handler: Handler | None, source: str | None) -> c.Entry:
-        if handler is None:
+    def _entry(self, plan: RoutePlan | None, source: str | None) -> c.Entry:
+        if plan is None:
             return c.Entry(route=-1)
-        received = self.counters.index("messages_received", handler.route, source_label(source))
-        return c.Entry(route=self.numbers[handler.route], received=received)
+        received = self.counters.index("messages_received", plan.route, source_label(source))
+        return c.Entry(route=self.numbers[plan.route], received=received)
 
     # routes
 
-    def route(self, handler: Handler) -> c.Route:
+    def route(self, plan: RoutePlan) -> c.Route:
         lowered, of_datagrams = self.program.lowered, self.targets.of_datagrams
-        topics = [target for target in handler.targets if target.is_topic]
-        destinations = [target for target in handler.targets if not target.is_topic]
+        topics = [target for target in plan.targets if target.is_topic]
+        destinations = [target for target in plan.targets if not target.is_topic]
         made = c.Route(
-            sends=of_datagrams(handler, destinations, lowered.conditions.get(handler.route)),
-            last_message=self.counters.index("route_last_message_timestamp_seconds", handler.route),
-            duration=self.counters.index("route_duration_seconds", handler.route),
+            sends=of_datagrams(plan, destinations, lowered.conditions.get(plan.route)),
+            last_message=self.counters.index("route_last_message_timestamp_seconds", plan.route),
+            duration=self.counters.index("route_duration_seconds", plan.route),
         )
         if topics:
-            made.publishes = of_datagrams(handler, topics, lowered.topics[handler.route])
+            made.publishes = of_datagrams(plan, topics, lowered.topics[plan.route])
         return made
 
 

@@ -22,7 +22,7 @@ from router.carrier.outlets import Names, Outlets
 from router.carrier.program import NativeProgram, native_program
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.state import State
-from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
+from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
 from router.declared import RecordKind
 from router.table.model import Endpoint
 
@@ -170,9 +170,9 @@ class Stage:
         def feeds(route: str, names: Sequence[str]) -> Sequence[tuple[int, bool]]:
             return [(deadmen[name].address, name != route) for name in names]
 
-        def limit(handler: Handler, target: TargetPlan) -> c.Limit:
+        def limit(plan: RoutePlan, target: TargetPlan) -> c.Limit:
             assert target.max_rate is not None  # noqa: S101 - asked for by the caller
-            return state.keep(("limit", handler.route, handler.topic, target), partial(open_limit, target.max_rate))
+            return state.keep(("limit", plan.route, plan.topic, target), partial(open_limit, target.max_rate))
 
         publications = {
             plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)

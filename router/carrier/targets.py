@@ -13,7 +13,7 @@ from router.carrier.lowered import Programs, native_values
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredRoute, LoweredTarget
-from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
+from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
 
 
 @dataclass(slots=True)
@@ -29,14 +29,14 @@ class TargetWriter:
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
 
-    def of_datagrams(self, handler: Handler, plans: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
+    def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
         """Targets that get datagrams; `lowered` are the programs of those that have some."""
         if lowered is None:
-            return self.targets(handler, plans, {}, None)
+            return self.targets(plan, targets, {}, None)
         programs = Programs(lowered.layout, self.arrays)
-        made = self.targets(handler, plans, lowered.targets, programs)
+        made = self.targets(plan, targets, lowered.targets, programs)
         if lowered.collect is not None:
-            collector = self.outlets.collector(handler)
+            collector = self.outlets.collector(plan)
             made.collect = ctypes.pointer(native_collect(lowered.collect, programs, collector, self._ids_of_senders()))
             self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
         made.layout, made.sources = programs.layout(), self._names_of_senders()
@@ -44,82 +44,82 @@ class TargetWriter:
 
     def targets(
         self,
-        handler: Handler,
-        plans: Sequence[TargetPlan],
+        plan: RoutePlan,
+        targets: Sequence[TargetPlan],
         lowered: Mapping[str, LoweredTarget],
         programs: Programs | None,
     ) -> c.Targets:
         """The targets, without their layout."""
-        targets = []
-        for plan in plans:
-            target = self._topic_target(plan) if plan.is_topic else self._destination(handler, plan)
-            if programs is not None and plan.label in lowered:
-                target.condition = programs.code(lowered[plan.label].condition)
-                target.message = programs.code(lowered[plan.label].message)
-            self._complete(target, handler, plan)
-            targets.append(target)
+        made = []
+        for target in targets:
+            native = self._topic_target(target) if target.is_topic else self._destination(plan, target)
+            if programs is not None and target.label in lowered:
+                native.condition = programs.code(lowered[target.label].condition)
+                native.message = programs.code(lowered[target.label].message)
+            self._complete(native, plan, target)
+            made.append(native)
         number = self.outlets.names.number
-        array = (c.Target * len(targets))(*targets)
-        made = c.Targets(
-            ttl=handler.ttl or 0,
+        array = (c.Target * len(made))(*made)
+        together = c.Targets(
+            ttl=plan.ttl or 0,
             targets=array,
-            count=len(targets),
-            route=number(handler.route),
-            topic=c.NO_NAME if handler.topic is None else number(handler.topic),
+            count=len(made),
+            route=number(plan.route),
+            topic=c.NO_NAME if plan.topic is None else number(plan.topic),
             generation=self.generation,
         )
-        for target, plan in zip(array, plans, strict=True):
-            if target.deferral:
-                to = ctypes.addressof(made), ctypes.addressof(target)
-                self.adopted.append(Adoption(target.deferral, plan.is_topic, *to))
-        self.arrays.append(made)
-        return made
+        for native, target in zip(array, targets, strict=True):
+            if native.deferral:
+                to = ctypes.addressof(together), ctypes.addressof(native)
+                self.adopted.append(Adoption(native.deferral, target.is_topic, *to))
+        self.arrays.append(together)
+        return together
 
-    def _complete(self, made: c.Target, handler: Handler, plan: TargetPlan) -> None:
+    def _complete(self, made: c.Target, plan: RoutePlan, target: TargetPlan) -> None:
         """Add what all targets have."""
-        counters, place = self.program.counters, (handler.route, plan.label)
-        made.id = self.outlets.names.number(plan.label)
+        counters, place = self.program.counters, (plan.route, target.label)
+        made.id = self.outlets.names.number(target.label)
         made.waiting = counters.index("messages_waiting", *place)
         made.filtered = counters.index("messages_filtered", *place)
-        if plan.is_topic and handler.collect_timeout is not None:
+        if target.is_topic and plan.collect_timeout is not None:
             made.collected = counters.index("messages_collected", *place)
-        made.delivered = counters.index("messages_published" if plan.is_topic else "datagrams_sent", *place)
+        made.delivered = counters.index("messages_published" if target.is_topic else "datagrams_sent", *place)
         made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in LOSSES]
-        if not plan.is_topic:
+        if not target.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
-        made.period, made.priority = held_period(plan), c.Priority[plan.priority.name]
-        if (deferral := self.outlets.deferral(handler, plan)) is not None:
+        made.period, made.priority = held_period(target), c.Priority[target.priority.name]
+        if (deferral := self.outlets.deferral(plan, target)) is not None:
             made.deferral = deferral.address
             self.arrays.append(deferral)
-        if plan.max_rate is not None and not made.period:
-            limit = self.outlets.limit(handler, plan)
+        if target.max_rate is not None and not made.period:
+            limit = self.outlets.limit(plan, target)
             made.limit = ctypes.pointer(limit)
             self.arrays.append(limit)
 
-    def _destination(self, handler: Handler, plan: TargetPlan) -> c.Target:
+    def _destination(self, plan: RoutePlan, target: TargetPlan) -> c.Target:
         made = c.Target(
-            sender=self.outlets.senders[plan.label],
-            trims=self.program.table.endpoints[plan.label].trim_trailing_zeros,
+            sender=self.outlets.senders[target.label],
+            trims=self.program.table.endpoints[target.label].trim_trailing_zeros,
         )
         if self.outlets.boards is not None:
-            made.board = self.outlets.boards.pointer(plan.label)
+            made.board = self.outlets.boards.pointer(target.label)
             self.arrays.append(self.outlets.boards)
-        if plan.deadmen:
+        if target.deadmen:
             feeds = [
                 c.Feed(deadman=deadman, disarms=disarms)
-                for deadman, disarms in self.outlets.feeds(handler.route, plan.deadmen)
+                for deadman, disarms in self.outlets.feeds(plan.route, target.deadmen)
             ]
             made.feeds, made.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
         return made
 
-    def _topic_target(self, plan: TargetPlan) -> c.Target:
-        if plan.label not in self._topics:
-            publication = self.outlets.publications[plan.label]
-            self._topics[plan.label] = c.Topic(
+    def _topic_target(self, target: TargetPlan) -> c.Target:
+        if target.label not in self._topics:
+            publication = self.outlets.publications[target.label]
+            self._topics[target.label] = c.Topic(
                 publisher=publication.address, wanted=ctypes.addressof(publication.wanted)
             )
             self.arrays.append(publication)
-        return c.Target(topic=ctypes.pointer(self._topics[plan.label]))
+        return c.Target(topic=ctypes.pointer(self._topics[target.label]))
 
     def _ids_of_senders(self) -> list[int]:
         """By column."""

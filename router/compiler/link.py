@@ -1,4 +1,4 @@
-"""Assemble the program: handlers, what must be opened for them, and the counters.
+"""Assemble the program: routes, what must be opened for them, and the counters.
 
 Expects a table without errors: nothing here is checked.
 """
@@ -16,8 +16,8 @@ from router.compiler.program import (
     STRANGER,
     DeadmanPlan,
     GatewayPlan,
-    Handler,
     Program,
+    RoutePlan,
     TargetPlan,
     TopicPlan,
 )
@@ -48,17 +48,17 @@ def link(
     """
     counters = counters or Counters()
     served = [checked for checked in routes if not checked.route.ignore]
-    handlers = [handler for checked in served for handler in _handlers(checked, table, counters)]
-    inbound: dict[int, tuple[Handler, ...]] = {}
-    outbound: dict[str, tuple[Handler, ...]] = {}
-    for handler in handlers:
-        if handler.topic is None:
-            number = handler.case.number
-            inbound[number] = (*inbound.get(number, ()), handler)
+    plans = [plan for checked in served for plan in _route_plans(checked, table, counters)]
+    inbound: dict[int, tuple[RoutePlan, ...]] = {}
+    outbound: dict[str, tuple[RoutePlan, ...]] = {}
+    for plan in plans:
+        if plan.topic is None:
+            number = plan.case.number
+            inbound[number] = (*inbound.get(number, ()), plan)
         else:
-            outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
+            outbound[plan.topic] = (*outbound.get(plan.topic, ()), plan)
     deadmen = tuple(_route_deadman(checked.route.name, checked.deadman, table) for checked in served if checked.deadman)
-    open_series(counters, table, envelope, handlers, deadmen, gateways)
+    open_series(counters, table, envelope, plans, deadmen, gateways)
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
@@ -106,12 +106,12 @@ def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
     return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
 
 
-def _handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
-    """A route from UDP has one handler, a route from ROS one for each of its topics."""
+def _route_plans(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[RoutePlan]:
+    """A route from UDP has one plan, a route from ROS one for each of its topics."""
     if not checked.route.is_outbound:
-        yield _handler(checked, None, _sources(checked.route, table), counters)
+        yield _route_plan(checked, None, _sources(checked.route, table), counters)
     for feed in checked.subscriptions:
-        yield _handler(checked, feed, frozenset(), counters)
+        yield _route_plan(checked, feed, frozenset(), counters)
 
 
 def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:
@@ -119,13 +119,13 @@ def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:
     return frozenset([*table.endpoints, STRANGER]) if ANY in sources else sources
 
 
-def _handler(
+def _route_plan(
     checked: CheckedRoute, feed: CheckedSubscription | None, sources: frozenset[str | None], counters: Counters
-) -> Handler:
-    """The handler of `feed`, or of a route from UDP."""
+) -> RoutePlan:
+    """The plan of `feed`, or of a route from UDP."""
     route = checked.route
     targets = feed.targets if feed else checked.targets
-    return Handler(
+    return RoutePlan(
         route=route.name,
         case=checked.case,
         targets=tuple(map(_target_plan, targets)),

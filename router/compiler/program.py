@@ -110,8 +110,8 @@ class GatewayPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Handler:
-    """What is known of a route, or of one of the topics of a route from ROS.
+class RoutePlan:
+    """A route from UDP, or a route from ROS as one of its topics feeds it.
 
     `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS has none.
     `ttl` and `collect_timeout` in ns, None for none.
@@ -130,7 +130,7 @@ class Handler:
 class Program:
     """A compiled table. `senders` are the endpoints that something is sent to, `lowered` is what the carrier runs.
 
-    `inbound` has the handlers by envelope field number: several where a case has several routes, which differ in their
+    `inbound` has the routes by envelope field number: several where a case has several routes, which differ in their
     sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores, `boards` what each
     endpoint that is a board can take, by name.
     """
@@ -141,8 +141,8 @@ class Program:
     senders: tuple[Endpoint, ...]
     publishers: tuple[TopicPlan, ...]
     subscriptions: tuple[TopicPlan, ...]
-    inbound: Mapping[int, tuple[Handler, ...]]
-    outbound: Mapping[str, tuple[Handler, ...]]
+    inbound: Mapping[int, tuple[RoutePlan, ...]]
+    outbound: Mapping[str, tuple[RoutePlan, ...]]
     deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
     protos: ProtoSchema
@@ -155,7 +155,7 @@ class Program:
         return tuple(self.table.listeners.values())
 
     @property
-    def handlers(self) -> Iterator[Handler]:
+    def routes(self) -> Iterator[RoutePlan]:
         return chain.from_iterable((*self.inbound.values(), *self.outbound.values()))
 
     @property

@@ -19,7 +19,7 @@ from router.compiler.metrics import (
     UNKNOWN_CASE,
     Counters,
 )
-from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Handler, source_label
+from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, RoutePlan, source_label
 from router.table.model import ROS, RouteTable
 from router.types.protobuf import Envelope
 
@@ -28,15 +28,15 @@ def open_series(
     counters: Counters,
     table: RouteTable,
     envelope: Envelope,
-    handlers: Iterable[Handler],
+    routes: Iterable[RoutePlan],
     deadmen: Iterable[DeadmanPlan],
     gateways: Iterable[GatewayPlan],
 ) -> None:
     """Open the series of a program with these parts."""
     _open_listeners(counters, table, envelope)
     _open_own(counters, table)
-    for handler in handlers:
-        _open_handler(counters, table, handler)
+    for plan in routes:
+        _open_route(counters, table, plan)
     for deadman in deadmen:
         _open_deadman(counters, deadman)
     for gateway in gateways:
@@ -75,24 +75,24 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
         _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
 
 
-def _open_handler(counters: Counters, table: RouteTable, handler: Handler) -> None:
+def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
     """The series of a route, or of one of the topics that a route from ROS takes messages from."""
-    route = handler.route
+    route = plan.route
     _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route)
-    published = [target.label for target in handler.targets if target.is_topic]
-    for topic in published if handler.topic is None else [handler.topic]:
+    published = [target.label for target in plan.targets if target.is_topic]
+    for topic in published if plan.topic is None else [plan.topic]:
         _open_each(counters, "qos_incompatible", route, topic, last=QOS_POLICIES)
-    if handler.topic is None:
-        sources = [source for source in (*table.endpoints, STRANGER) if source in handler.sources]
+    if plan.topic is None:
+        sources = [source for source in (*table.endpoints, STRANGER) if source in plan.sources]
         _open_each(counters, "messages_received", route, last=map(source_label, sources))
     else:
-        counters.index("messages_received", route, handler.topic)
-    for target in handler.targets:
+        counters.index("messages_received", route, plan.topic)
+    for target in plan.targets:
         _open_each(counters, "messages_dropped", route, target.label, last=DROP_REASONS)
         _open(counters, ("messages_filtered", "messages_waiting"), route, target.label)
         delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
         _open(counters, delivered, route, target.label)
-        if target.is_topic and handler.collect_timeout is not None:
+        if target.is_topic and plan.collect_timeout is not None:
             counters.index("messages_collected", route, target.label)
 
 

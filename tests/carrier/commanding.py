@@ -25,7 +25,7 @@ from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
-from router.compiler.program import Handler, Program, TargetPlan
+from router.compiler.program import Program, RoutePlan, TargetPlan
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 16
@@ -168,9 +168,9 @@ class Commanding:
         self.thread = FromRosThread(library, self.deadmen.address, self.counters, self.events, take, reset)
         stack.callback(self.thread.stop)
 
-    def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
+    def _limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
         assert target.max_rate is not None
-        return self._limits.setdefault((handler.route, handler.topic, target), open_limit(target.max_rate))
+        return self._limits.setdefault((plan.route, plan.topic, target), open_limit(target.max_rate))
 
     def serve(self, subscriptions: Mapping[str, Subscription] | None = None) -> None:
         self.thread.serve(self.messages, subscriptions or self.subscriptions)

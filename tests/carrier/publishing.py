@@ -24,7 +24,7 @@ from router.carrier.program import NativeProgram, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.carrier.state import State
-from router.compiler.program import Handler, Program, TargetPlan
+from router.compiler.program import Program, RoutePlan, TargetPlan
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 12
@@ -161,9 +161,9 @@ class Publishing:
         )
         return native_program(program, generation, outlets)
 
-    def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
+    def _limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
         assert target.max_rate is not None
-        return self._limits.setdefault((handler.route, target), open_limit(target.max_rate))
+        return self._limits.setdefault((plan.route, target), open_limit(target.max_rate))
 
 
 def wait_until(condition: Callable[[], object]) -> None:

@@ -158,9 +158,9 @@ def compare(commanding: Commanding, messages: Messages) -> None:
     losses = [(route, target) for route, target, *_ in commanding.losses()]
     assert losses == [(report.place, report.target) for report in rig.reports]
     topics_of: dict[str, set[str]] = {}
-    for topic, handlers in commanding.program.outbound.items():
-        for handler in handlers:
-            topics_of.setdefault(handler.route, set()).add(topic)
+    for topic, plans in commanding.program.outbound.items():
+        for plan in plans:
+            topics_of.setdefault(plan.route, set()).add(topic)
     for route, topics in topics_of.items():
         timed = sum(
             commanding.thread.counters(1 << 16)[

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
@@ -63,11 +63,11 @@ def test_topics_of_tables_get_the_same_messages(delivering: CDLL, program: Progr
             if handler.route in program.lowered.topics:
                 _assert_same(delivering, program, number, handler)
                 carried += len(program.lowered.topics[handler.route].targets)
-    assert carried == sum(target.is_topic for handler in program.handlers for target in handler.targets)
+    assert carried == sum(target.is_topic for handler in program.routes for target in handler.targets)
     assert carried > 0
 
 
-def _assert_same(library: CDLL, program: Program, number: int, handler: Handler) -> None:
+def _assert_same(library: CDLL, program: Program, number: int, handler: RoutePlan) -> None:
     serve = Published(program, handler)
     carrier = Delivering(library, program.lowered.topics[handler.route], RECEIVED_AT, SOURCE)
     parse = handler.case.message_class.FromString

@@ -22,7 +22,7 @@ from router.compiler.expressions.tree import Each as Computed
 from router.compiler.expressions.tree import Listed, Node, Variable
 from router.compiler.mapping import build
 from router.compiler.plan import Each, Items, Leaf, Record
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
@@ -158,7 +158,7 @@ DATAGRAM = b"\x18\x01"
 class Published:
     """A handler of a program, whose targets are those of a rig: `reports` has its losses, `sent` what it sends."""
 
-    def __init__(self, program: Program, handler: Handler) -> None:
+    def __init__(self, program: Program, handler: RoutePlan) -> None:
         rig = Rig(program)
         self.topics = {target.label for target in handler.targets if target.is_topic}
         self.reports, self.sent, self._published = rig.reports, rig.sent, rig.published

@@ -50,9 +50,9 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
             assert Series("datagrams_rejected", (listener.name, reason)) in series
     for case in (*rover_program.envelope.cases, UNKNOWN_CASE):
         assert Series("unhandled", (case,)) in series
-    for [handler] in rover_program.inbound.values():
-        route = handler.case.name
-        for target in handler.targets:
+    for [plan] in rover_program.inbound.values():
+        route = plan.case.name
+        for target in plan.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             assert Series(delivered, (route, target.label)) in series
             assert Series("messages_filtered", (route, target.label)) in series

@@ -25,7 +25,7 @@ def generated(checked: Checked) -> list[Source]:
     """The code of all routes of a table."""
     assert checked.program is not None
     remember(checked)
-    return [handlers.generated(checked.program, handler).source for handler in checked.program.handlers]
+    return [handlers.generated(checked.program, handler).source for handler in checked.program.routes]
 
 
 @pytest.mark.parametrize("table", ["rover", "sim", "legacy"])

@@ -76,7 +76,7 @@ class EngineRehearsal:
             self._timers.remove(timer)
         for timer in [each for each in left if not isinstance(each, Deadman)]:
             timer.end(self.now)
-        places = {(each.route, target.label) for each in program.handlers for target in each.targets}
+        places = {(each.route, target.label) for each in program.routes for target in each.targets}
         for pacer in pacers.values():
             pacer.keep_only(self.now, places)
         for deadman in [each for each in left if isinstance(each, Deadman)]:  # after the commands that waited

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 from router.carrier.state import State
 from router.compiler.metrics import Counters, Report
 from router.compiler.namespace import MAPPING_FAILURES
-from router.compiler.program import Handler, Program, TargetPlan
+from router.compiler.program import Program, RoutePlan, TargetPlan
 from router.table.model import OnLimit
 from router.types.board_limits import BoardLimits
 from tests.oracles.python_engine.collecting import Collector
@@ -78,7 +78,7 @@ class EngineContext:
     state: State = field(default_factory=State)
 
 
-def bind(program: Program, handler: Handler, context: EngineContext, freshness: Freshness) -> FunctionType:
+def bind(program: Program, handler: RoutePlan, context: EngineContext, freshness: Freshness) -> FunctionType:
     """Execute the handler's code in a namespace of its own, and return the function that it defines."""
     made, counters = generated(program, handler), program.counters
     namespace: dict[str, Any] = {
@@ -103,7 +103,7 @@ def unbind(handle: FunctionType) -> None:
 
 
 def _target_names(
-    name: str, target: TargetPlan, handler: Handler, counters: Counters, context: EngineContext
+    name: str, target: TargetPlan, handler: RoutePlan, counters: Counters, context: EngineContext
 ) -> dict[str, Any]:
     route = handler.route
     place = route, handler.topic, target
@@ -127,7 +127,7 @@ def _target_names(
 
 
 def _collect(
-    handler: Handler, timeout: int, counters: Counters, context: EngineContext
+    handler: RoutePlan, timeout: int, counters: Counters, context: EngineContext
 ) -> Callable[..., list[object] | None]:
     counts = context.collecting.counts
     targets = tuple(target for target in handler.targets if target.is_topic)

@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from router.compiler import STRANGER, source_label
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS, Report
 from router.compiler.network import recognisers
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.types.wire import LEN
@@ -150,7 +150,7 @@ class InboundEngine:
         inbound = self._program.inbound
         return {number: self._case(handlers, listener, addresses) for number, handlers in inbound.items()}
 
-    def _case(self, handlers: Sequence[Handler], listener: str, addresses: _Addresses) -> _Case:
+    def _case(self, handlers: Sequence[RoutePlan], listener: str, addresses: _Addresses) -> _Case:
         by_source = {
             source: self._route(handler, source, listener) for handler in handlers for source in handler.sources
         }
@@ -161,7 +161,7 @@ class InboundEngine:
             stranger=by_source.get(STRANGER),
         )
 
-    def _route(self, handler: Handler, source: str | None, listener: str) -> _Route:
+    def _route(self, handler: RoutePlan, source: str | None, listener: str) -> _Route:
         counters, label = self._program.counters, source_label(source)
         handle = self._handles[handler.route]
         return _Route(
@@ -251,7 +251,7 @@ class OutboundEngine:
 
         return take
 
-    def _route(self, handler: Handler) -> _OutboundRoute:
+    def _route(self, handler: RoutePlan) -> _OutboundRoute:
         counters = self._program.counters
         self._handles.append(handle := bind(self._program, handler, self._context, self._freshness))
         return _OutboundRoute(

@@ -24,7 +24,7 @@ from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
 from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import expressions
-from router.compiler.program import Handler, Program
+from router.compiler.program import Program, RoutePlan
 from router.compiler.python import NO_VALUES, Values, render
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
@@ -69,7 +69,7 @@ class Generated:
         return {**NAMESPACE, **self.source.constants}
 
 
-def generated(program: Program, handler: Handler) -> Generated:
+def generated(program: Program, handler: RoutePlan) -> Generated:
     """The function that serves all targets of a handler."""
     checked = next(each for each in _routes(program) if each.route.name == handler.route)
     feed = next((each for each in checked.subscriptions if each.topic.topic.value == handler.topic), None)
@@ -94,7 +94,7 @@ def _routes(program: Program) -> Sequence[CheckedRoute]:
     return _checked[key]
 
 
-def identifiers(handler: Handler) -> list[str]:
+def identifiers(handler: RoutePlan) -> list[str]:
     """A Python name for each target, which no other one has: `a/b` and `a_b` are different topics."""
     made: list[str] = []
     for target in handler.targets:
