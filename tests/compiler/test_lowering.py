@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.compiler import lowering as compiler_lowering
 from router.compiler.expressions import check
 from router.compiler.lookup import Definitions
-from router.compiler.lowering import operations
+from router.compiler.lowering import LoweredTarget, operations, sources
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.layout import ReadOperation
 from router.compiler.lowering.names import TooLargeError
@@ -291,7 +290,7 @@ def of_many(when: str, *, is_bounded: bool = True) -> Code:
     case = envelope.cases["many"]
     source = Datagram(case, envelope)
     node = check(written(when), scope_of(case.type))
-    return source.condition(source.lowering(), [node], is_bounded=is_bounded).code
+    return source.condition(source.lowering(), [node], is_bounded=is_bounded)[0]
 
 
 def test_lists_in_lists_are_bounded() -> None:
@@ -386,13 +385,13 @@ def test_targets_are_lowered_by_what_feeds_them(check_text: CheckText) -> None:
 
 def test_each_target_is_lowered_once(definitions: Definitions, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
-    kind = compiler_lowering.LoweredTarget
+    kind = LoweredTarget
 
-    def counted(label: str, condition: Code, message: Code, places: tuple[str, ...]) -> compiler_lowering.LoweredTarget:
+    def counted(label: str, condition: Code, message: Code, places: tuple[str, ...]) -> LoweredTarget:
         made.append(places[-1])
         return kind(label, condition, message, places)
 
-    monkeypatch.setattr(compiler_lowering, "LoweredTarget", counted)
+    monkeypatch.setattr(sources, "LoweredTarget", counted)
     program = check_table(ROUTES / "rover.yaml", {}, definitions).program
     assert program is not None
     assert made

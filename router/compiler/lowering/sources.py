@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from google.protobuf.descriptor import Descriptor
 
-from router.compiler.checked import CheckedCollect
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, MESSAGE, RECEIVED_AT, SOURCE, Read
-from router.compiler.expressions.tree import Node as Tree
+from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.expressions import tree
+from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
@@ -18,12 +17,21 @@ from router.compiler.lowering.layout import Layout, protobuf_layout
 from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
 from router.compiler.lowering.nodes import Node
+from router.compiler.lowering.numbers import signs
 from router.compiler.lowering.operations import Code, Operation, Slot, chained, depths, most_executed, nesting
+from router.compiler.lowering.programs import (
+    LoweredCollect,
+    LoweredElements,
+    LoweredFeed,
+    LoweredRoute,
+    LoweredTarget,
+)
 from router.compiler.lowering.protobuf import protobuf_message
-from router.compiler.lowering.steps import TooManyListsError, cdr_layout
+from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
-from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_NODES_DEEP, MOST_OPEN, MOST_STACKED, NONE, Op, Scalar
+from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_NODES_DEEP, MOST_OPEN, MOST_STACKED, NONE, Op
 from router.errors import SourceSpan
+from router.table.model import Route
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
@@ -31,20 +39,6 @@ MOST_CONDITION_OPERATIONS = 1 << 18
 """Operations that a destination's `when` may execute for a datagram, about a millisecond of the receive thread."""
 
 _MOST_SLOTS = NONE
-
-
-class Condition(NamedTuple):
-    """`when` as operations, and where the table says so; both empty where there is none."""
-
-    code: Code
-    place: str
-
-
-class Message(NamedTuple):
-    """The operations that write a message, and the place of each."""
-
-    code: Code
-    places: tuple[str, ...]
 
 
 @dataclass
@@ -58,21 +52,26 @@ class _Source:
     variables: dict[str, Meaning] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        given = Slot(0, RECEIVED_AT), Slot(self.topic.encode(), SOURCE)
-        self.temporaries += given
-        self.variables |= {MESSAGE: self.root, RECEIVED_AT: given[0], SOURCE: given[1]}
+        received_at, source = Slot(0, tree.RECEIVED_AT), Slot(self.topic.encode(), tree.SOURCE)
+        self.variables[tree.MESSAGE] = self.root
+        self.add(received_at, source)
+
+    def add(self, *slots: Slot) -> None:
+        """Let expressions read these slots by their names."""
+        self.temporaries += slots
+        self.variables |= {slot.name: slot for slot in slots}
 
     def lowering(self) -> Lowering:
         """Return the lowering of one target, which can have variables of its own."""
         return Lowering(Names(dict(self.variables), self.temporaries, self.elements))
 
     def condition(
-        self, lowering: Lowering, conditions: Sequence[Tree | None], *, is_bounded: bool = False
-    ) -> Condition:
-        """Lower the conjunction of conditions. One that the receive thread evaluates `is_bounded`."""
+        self, lowering: Lowering, conditions: Sequence[tree.Node | None], *, is_bounded: bool = False
+    ) -> tuple[Code, str]:
+        """Lower the conjunction of conditions, with its place. One that the receive thread evaluates `is_bounded`."""
         given = [each for each in conditions if each is not None]
         if not given:
-            return Condition((), "")
+            return (), ""
         code = chained(Op.AND, [lowering.value(each) for each in given])
         _want_small([(operation, given[-1].span) for operation in code])
         if is_bounded and (most := most_executed(code)) > MOST_CONDITION_OPERATIONS:
@@ -80,7 +79,7 @@ class _Source:
             message = f"this could take {most:,} operations on the longest datagram, {limit}"
             hint = f"a list counts with {MAX_DATAGRAM:,} elements: look into fewer lists, or fewer times"
             raise TooLargeError(given[-1].span, message, hint)
-        return Condition(code, ", or ".join(f"{each.span}: when" for each in given))
+        return code, ", or ".join(f"{each.span}: when" for each in given)
 
 
 class Datagram(_Source):
@@ -92,22 +91,37 @@ class Datagram(_Source):
         super().__init__(Node(case.type, descriptor))
         self._case, self._envelope = case.name, around
 
-    def collect(self, checked: CheckedCollect) -> Collected:
-        """Lower what makes frames of datagrams. Expressions can use `items` and `count` from now on."""
-        by, count, order = map(self._number, (checked.by, checked.count, checked.order))
-        items, counted = Slot(None, ITEMS), Slot(0, COUNT)
-        self.temporaries += items, counted
-        self.variables |= {ITEMS: items, COUNT: counted}
-        return Collected(by, count, order, items, counted)
+    def lowered(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute:
+        """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
+        collect = checked.collect if targets[0].topic else None
+        if collect is None:
+            made = {target.label: self._target(target, "") for target in targets}
+            return LoweredRoute(made, self.layout(checked.route.span))
+        by, count, order = map(self._number, (collect.by, collect.count, collect.order))
+        frame = Slot(None, tree.ITEMS), Slot(0, tree.COUNT)
+        self.add(*frame)
+        made = {target.label: self._target(target, f"{collect.span}: collect") for target in targets}
+        layout = self.layout(checked.route.span)
+        is_text = isinstance(collect.by.kind, StringKind)
+        signed = signs(UINT32, collect.count.kind, collect.order.kind)
+        lowered = LoweredCollect(by, count, order, is_text, signed, *_used(frame, made.values()))
+        return LoweredRoute(made, layout, lowered)
 
-    def _number(self, node: Tree) -> Code:
+    def _target(self, target: CheckedTarget, place: str) -> LoweredTarget:
+        """A topic, or a destination, which gets the datagram as it was received."""
+        lowering = self.lowering()
+        condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
+        message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
+        return LoweredTarget(target.label, condition, message, ("", when, place, *places))
+
+    def _number(self, node: tree.Node) -> Code:
         code = self.lowering().value(node)
         _want_small([(operation, node.span) for operation in code])
         return code
 
-    def published(self, lowering: Lowering, plan: Record) -> Message:
-        """Lower the ROS message of a topic."""
-        return _message(cdr_message(lowering, plan))
+    def published(self, lowering: Lowering, plan: Record) -> tuple[Code, tuple[str, ...]]:
+        """Lower the ROS message of a topic, with the place of each operation."""
+        return _with_places(cdr_message(lowering, plan))
 
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all programs that have been made. Raises TooLargeError."""
@@ -115,9 +129,7 @@ class Datagram(_Source):
             if (depth := node.depth()) >= MOST_NODES_DEEP:
                 message = f"this reads a field {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are possible"
                 raise TooLargeError(span, message, "read fields that are less deep")
-        made = protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements)
-        _want_room(made, span)
-        return made
+        return _small(protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements), span)
 
 
 class RosMessage(_Source):
@@ -126,65 +138,80 @@ class RosMessage(_Source):
     def __init__(self, declared: MessageType, topic: str) -> None:
         super().__init__(Node(declared, None), topic)
 
-    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> Message:
-        """Lower the envelope for a destination."""
-        return _message(protobuf_message(lowering, plan, case))
+    def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
+        """Lower what a route makes of the messages. Raises TooLargeError."""
+        elements = self._for_each(feed.for_each) if feed.for_each is not None else None
+        stamp = self._stamp(feed.stamp) if feed.stamp is not None else None
+        place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""
+        targets = {}
+        for target in feed.targets:
+            lowering = self.lowering()
+            condition, when = self.condition(lowering, [feed.when, target.when])
+            assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
+            message, places = self.sent(lowering, target.plan, checked.case)
+            all_places = f"{feed.topic.span}: a malformed message", when, place, *places
+            targets[target.label] = LoweredTarget(target.label, condition, message, all_places)
+        layout = self.layout(feed.topic.span)
+        return LoweredFeed(
+            checked.route.name,
+            is_urgent(checked.route, feed),
+            targets,
+            layout,
+            (stamp[0].index, stamp[1].index) if stamp else None,
+            self._elements(elements, targets.values()) if elements else None,
+        )
 
-    def stamp(self, node: Tree) -> tuple[Slot, Slot]:
+    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> tuple[Code, tuple[str, ...]]:
+        """Lower the envelope for a destination, with the place of each operation."""
+        return _with_places(protobuf_message(lowering, plan, case))
+
+    def _stamp(self, node: tree.Node) -> tuple[Slot, Slot]:
         """Return the slots of the seconds and nanoseconds of a field with a time."""
-        assert isinstance(node, Read)  # noqa: S101 - it is a field of the message
+        assert isinstance(node, tree.Read)  # noqa: S101 - it is a field of the message
         _, moment = self.lowering().message(node)
         seconds, nanoseconds = moment.type.fields
         return moment.value(seconds), moment.value(nanoseconds)
 
-    def for_each(self, node: Tree) -> Elements:
+    def _for_each(self, node: tree.Node) -> lists.Stored:
         """Lower the list of `for_each`. Expressions can use `item`, `index` and `count` from now on."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
         _want_small([(operation, node.span) for operation in of.code])
-        item: Meaning = Slot(0, ITEM) if of.message is None else lowering.names.element(of.message)
-        index, count = Slot(0, INDEX), Slot(0, COUNT)
-        if isinstance(item, Node):
-            item.path = f"{ITEM}."
-        self.temporaries += [each for each in (item, index, count) if isinstance(each, Slot)]
-        self.variables |= {ITEM: item, INDEX: index, COUNT: count}
-        return Elements(of.code, of.scalar, item, index, count)
+        if of.message is None:
+            self.add(Slot(0, tree.ITEM))
+        else:
+            item = lowering.names.element(of.message)
+            item.path = f"{tree.ITEM}."
+            self.variables[tree.ITEM] = item
+        self.add(Slot(0, tree.INDEX), Slot(0, tree.COUNT))
+        return of
+
+    def _elements(self, of: lists.Stored, targets: Iterable[LoweredTarget]) -> LoweredElements:
+        item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
+        node = item.index if isinstance(item, Node) and item.wanted else NONE
+        return LoweredElements(of.code, of.scalar, node, *_used((item, *counts), targets))
 
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all programs that have been made. Raises TooLargeError."""
-        try:
-            made = cdr_layout(self.temporaries, self.root, self.elements)
-        except TooManyListsError as error:
-            raise TooLargeError(span, str(error), "take another type of message") from None
-        _want_room(made, span)
-        return made
+        return _small(cdr_layout(self.temporaries, self.root, self.elements, span), span)
 
 
-@dataclass(frozen=True)
-class Elements:
-    """A list that `code` puts on the stack, stored as `scalar` says, and where each element goes."""
-
-    code: Code
-    scalar: Scalar
-    item: Meaning
-    index: Slot
-    count: Slot
+def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
+    """Whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
+    return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
-@dataclass(frozen=True)
-class Collected:
-    """Programs that name the frame of a datagram, its size and the place in it, and where a complete frame goes."""
-
-    by: Code
-    count: Code
-    order: Code
-    items: Slot
-    counted: Slot
+def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Iterator[int]:
+    """The numbers of variables in slots that operations of the targets use, NONE for all others."""
+    slots = [operation.slot for each in targets for operation in (*each.condition, *each.message)]
+    for variable in variables:
+        is_used = isinstance(variable, Slot) and any(variable is slot for slot in slots)
+        yield variable.index if is_used else NONE
 
 
-def _message(placed: Sequence[Placed]) -> Message:
+def _with_places(placed: Sequence[Placed]) -> tuple[Code, tuple[str, ...]]:
     _want_small([(operation, place.span) for operation, place in placed])
-    return Message(tuple(operation for operation, _ in placed), tuple(str(place) for _, place in placed))
+    return tuple(operation for operation, _ in placed), tuple(str(place) for _, place in placed)
 
 
 # ---- limits
@@ -205,8 +232,10 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
                 raise TooLargeError(span, f"more than {most} {what}", hint)
 
 
-def _want_room(layout: Layout, span: SourceSpan) -> None:
+def _small(layout: Layout, span: SourceSpan) -> Layout:
+    """The layout. Raises TooLargeError if its slots or nodes cannot be numbered."""
     most = max(len(layout.defaults), len(layout.nodes))
     if most > _MOST_SLOTS:
         message = f"these mappings use {most} values, and at most {_MOST_SLOTS} are possible"
         raise TooLargeError(span, message, "make several routes of it, or map less")
+    return layout

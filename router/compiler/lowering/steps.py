@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from router.compiler.lowering.layout import Layout, Numbering, PlacedNode, ReadOperation
+from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.nodes import Node, Wanted, scalar_of, size_of
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Slot
 from router.declared import MOST_LOOPS, ReadKind
+from router.errors import SourceSpan
 from router.types.model import List, MessageType, String, Type
 
 
-class TooManyListsError(Exception):
-    """A ROS message nests more lists of messages than a program can read."""
+def cdr_layout(slots: Sequence[Slot], message: Node, elements: Sequence[Node], span: SourceSpan) -> Layout:
+    """Number `slots`, from 0, then those of the message, and those of elements of lists.
 
-
-def cdr_layout(slots: Sequence[Slot], message: Node, elements: Sequence[Node]) -> Layout:
-    """Number `slots`, from 0, then those of the message, and those of elements of lists. Raises TooManyListsError."""
+    Raises TooLargeError at `span` if the message nests more lists of messages than a program can read.
+    """
     maker = Numbering(slots)
     maker.number_nodes([message, *elements])
     for index, root in enumerate((message, *elements)):
         first = len(maker.defaults)
-        steps = _Steps(maker, Offset(HIGHEST) if root is message else Offset())
+        steps = _Steps(maker, span, Offset(HIGHEST) if root is message else Offset())
         steps.message(root.type, root)
         maker.nodes[index] = PlacedNode(steps.up_to_the_last_wanted(), first, len(maker.defaults) - first)
     return maker.made(is_cdr=True)
@@ -35,8 +36,9 @@ _MOST_UNROLLED = 64
 class _Steps:
     """Collects the steps through a message. What is skipped becomes one stretch of bytes where its padding is known."""
 
-    def __init__(self, layout: Numbering, offset: Offset, loops: int = 0) -> None:
+    def __init__(self, layout: Numbering, span: SourceSpan, offset: Offset, loops: int = 0) -> None:
         self.layout = layout
+        self.span = span
         self.made: list[ReadOperation] = []
         self.offset = offset
         self.loops = loops
@@ -113,9 +115,9 @@ class _Steps:
     def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
         if self.loops == MOST_LOOPS:
             message = f"this type nests more than {MOST_LOOPS} lists of messages"
-            raise TooManyListsError(message)
+            raise TooLargeError(self.span, message, "take another type of message")
         self._add(each, slot)
-        inside = _Steps(self.layout, Offset(), self.loops + 1)
+        inside = _Steps(self.layout, self.span, Offset(), self.loops + 1)
         body(inside)
         inside._flush()
         self.made += inside.made
