@@ -15,12 +15,11 @@ from pathlib import Path
 from threading import Thread
 
 from router.assets import asset
-from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import is_coloured, print_findings
+from router.cli import OK, Subparsers, add_verb
+from router.cli.findings import is_coloured
 from router.cli.init import FIRST_TABLE
 from router.cli.run import route
-from router.cli.tool_options import say
-from router.compiler import check_table
+from router.cli.tool_options import good_table, say
 from router.compiler.program import Program
 from router.datagrams import Wire
 from router.log import configure_log
@@ -41,14 +40,11 @@ def run(args: argparse.Namespace) -> int:
     os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, where the table is
     configure_log(coloured=is_coloured(sys.stderr))
     table = _table()
-    checked = check_table(table)
-    print_findings(checked.diagnostics, sys.stderr)
-    if checked.program is None:
-        return BAD_TABLE
+    _, program = good_table(table)
     if sys.stderr.isatty():
         say(f"in another terminal: router top -t {shlex.quote(str(table))}; Ctrl-C ends this")
-    with _simulated(checked.program):
-        route(checked.program, [], os.environ)
+    with _simulated(program):
+        route(program, [], os.environ)
     return OK
 
 

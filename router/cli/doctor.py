@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import is_coloured
+from router.cli.findings import GREEN, RED, YELLOW, Paint, is_coloured
 from router.cli.tool_options import add_table, table_path
 from router.errors import plural
 from router.tools.doctor_checks import CheckResult, Grade
@@ -20,8 +20,7 @@ _DESCRIPTION = f"""Look at the table, ROS, ports, buffers, clock, endpoints and 
 Exit code: {OK} nothing keeps it from working, {SICK} something does, {BAD_TABLE} the table cannot be read. What works
 less well is a warning only."""
 
-_STYLES = {Grade.FINE: "\x1b[32m", Grade.WARNING: "\x1b[33m", Grade.PROBLEM: "\x1b[31m"}
-_RESET = "\x1b[0m"
+_STYLES = {Grade.FINE: GREEN, Grade.WARNING: YELLOW, Grade.PROBLEM: RED}
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -52,17 +51,13 @@ def run(args: argparse.Namespace) -> int:
 
 def shown(result: CheckResult, *, coloured: bool) -> str:
     """One line, and a second one with the remedy."""
-    grade = f"{result.grade.value:8}"
-    if coloured:
-        grade = f"{_STYLES[result.grade]}{grade}{_RESET}"
+    grade = Paint(coloured)(_STYLES[result.grade], f"{result.grade.value:8}")
     text = f"{grade} {result.about:10} {result.text}"
     return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text
 
 
 def _json(result: CheckResult) -> str:
-    return json.dumps(
-        {"grade": result.grade.value, "about": result.about, "text": result.text, "remedy": result.remedy}
-    )
+    return json.dumps(result._asdict() | {"grade": result.grade.value})
 
 
 def _summary(grades: Counter[Grade]) -> str:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import print_findings
-from router.cli.tool_options import add_table, seconds, table_path
-from router.compiler import Checked, check_table
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import add_for, add_table, good_table, table_path
 from router.compiler.checked import CheckedRoute
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 from router.tools.listing import listed_route
@@ -42,8 +38,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
     parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
-    about = f"look for them for so long, as 5s (default: {_LIVE:g}s)"
-    parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
+    add_for(parser, f"look for them for so long, as 5s (default: {_LIVE:g}s)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,11 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _explain(args: argparse.Namespace) -> int:
     path = table_path(args)
-    checked = check_table(path)
-    print_findings(checked.diagnostics, sys.stderr)
-    program = checked.program
-    if program is None:
-        return BAD_TABLE
+    checked, program = good_table(path)
     routes: dict[str, list[CheckedRoute]] = {}
     for route in checked.routes:
         routes.setdefault(route.case.name, []).append(route)
@@ -73,7 +64,8 @@ def _explain(args: argparse.Namespace) -> int:
     topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            _print_route(route, checked, program, with_code=args.code)
+            code = listed_route(route, program) if args.code else ()
+            print(*explained_route(route, checked), *code, sep="\n", end="\n\n")
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
@@ -83,17 +75,7 @@ def _explain(args: argparse.Namespace) -> int:
 
 def _diff(old: Path, new: Path) -> int:
     definitions = Definitions()
-    before, after = (check_table(path, definitions=definitions) for path in (old, new))
-    findings = dict.fromkeys((*before.diagnostics, *after.diagnostics))
-    print_findings(list(findings), sys.stderr)
-    if before.has_errors or after.has_errors:
-        return BAD_TABLE
+    (before, _), (after, _) = (good_table(path, definitions=definitions) for path in (old, new))
     lines = list(diff(before, after))
     print(*([f"--- {old}", f"+++ {new}", *lines] if lines else [f"{new} does what {old} does"]), sep="\n")
     return OK
-
-
-def _print_route(route: CheckedRoute, checked: Checked, program: Program, *, with_code: bool) -> None:
-    code = listed_route(route, program) if with_code else ()
-    print(*explained_route(route, checked), *code, sep="\n")
-    print()

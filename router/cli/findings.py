@@ -15,7 +15,8 @@ from router.errors import Diagnostic, Severity, SourceSpan, plural
 
 FORMATS = ("text", "json", "github")
 
-_RESET, _BOLD, _RED, _YELLOW, _CYAN = "\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[33m", "\x1b[36m"
+BOLD, RED, GREEN, YELLOW, CYAN = "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[33m", "\x1b[36m"
+_RESET = "\x1b[0m"
 _INVISIBLE = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")
 _LONGEST_LINE = 160
 
@@ -23,15 +24,13 @@ _LONGEST_LINE = 160
 def print_findings(findings: Sequence[Diagnostic], out: TextIO, style: str = "text", *, strict: bool = False) -> None:
     """Write all findings in one of FORMATS; `strict` shows warnings as errors."""
     if style == "json":
-        json.dump([as_data(finding, strict=strict) for finding in findings], out, indent=2)
-        out.write("\n")
+        print(json.dumps([as_data(finding, strict=strict) for finding in findings], indent=2), file=out)
         return
     coloured = is_coloured(out)
     for finding in findings:
-        if style == "github":
-            out.write(as_github(finding, strict=strict) + "\n")
-        else:
-            out.write(as_text(finding, coloured=coloured, strict=strict) + "\n")
+        is_github = style == "github"
+        text = as_github(finding, strict=strict) if is_github else as_text(finding, coloured=coloured, strict=strict)
+        out.write(f"{text}\n")
 
 
 def severity(finding: Diagnostic, *, strict: bool) -> Severity:
@@ -48,13 +47,8 @@ def count_line(findings: Sequence[Diagnostic], tables: int, *, strict: bool) -> 
 
 
 def as_data(finding: Diagnostic, *, strict: bool) -> dict[str, str | int]:
-    """Lines and columns count from 1, `end_column` is exclusive."""
-    span = finding.span
     return {
-        "file": span.file,
-        "line": span.line,
-        "column": span.column,
-        "end_column": span.end_column,
+        **place(finding.span),
         "severity": severity(finding, strict=strict).value,
         "code": finding.code.value,
         "message": finding.message,
@@ -63,32 +57,40 @@ def as_data(finding: Diagnostic, *, strict: bool) -> dict[str, str | int]:
 
 
 def as_github(finding: Diagnostic, *, strict: bool) -> str:
-    """A workflow command, which shows the finding beside the line in a pull request."""
-    span = finding.span
     text = finding.message + (f"; {finding.hint}" if finding.hint else "")
-    properties = {
-        "file": span.file,
-        "line": span.line,
-        "col": span.column,
-        "endColumn": span.end_column,
-        "title": finding.code.value,
-    }
-    listed = ",".join(f"{name}={github_escaped(str(value), ':,')}" for name, value in properties.items())
-    return f"::{severity(finding, strict=strict).value} {listed}::{github_escaped(text, '')}"
+    return annotation(severity(finding, strict=strict), finding.span, finding.code.value, text)
 
 
 def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
     """What is wrong, then the source line with a caret where the file still has it, then what to do about it."""
     level = severity(finding, strict=strict)
-    colour, bold, cyan, reset = (_colour(level), _BOLD, _CYAN, _RESET) if coloured else ("", "", "", "")
-    head = f"{bold}{visible(str(finding.span))}: {colour}{level.value}[{finding.code.value}]{reset}"
-    first = f"{head}{bold}: {visible(finding.message)}{reset}"
-    remedy = [f"{bold}{cyan}help:{reset} {visible(finding.hint)}"] if finding.hint else []
-    return "\n".join((first, *excerpt(finding.span, colour), *remedy))
+    paint, colour = Paint(coloured), RED if level is Severity.ERROR else YELLOW
+    head = paint(BOLD, f"{visible(str(finding.span))}: ") + paint(BOLD + colour, f"{level.value}[{finding.code.value}]")
+    remedy = [f"{paint(BOLD + CYAN, 'help:')} {visible(finding.hint)}"] if finding.hint else []
+    first = head + paint(BOLD, f": {visible(finding.message)}")
+    return "\n".join((first, *excerpt(finding.span, paint, colour), *remedy))
 
 
-def _colour(level: Severity) -> str:
-    return _RED if level is Severity.ERROR else _YELLOW
+def annotation(level: Severity, span: SourceSpan, title: str, text: str) -> str:
+    """A workflow command, with which GitHub shows a text beside a line in a pull request."""
+    properties = {"file": span.file, "line": span.line, "col": span.column, "endColumn": span.end_column}
+    listed = ",".join(f"{name}={_escaped(str(value), ':,')}" for name, value in (properties | {"title": title}).items())
+    return f"::{level.value} {listed}::{_escaped(text)}"
+
+
+def place(span: SourceSpan) -> dict[str, str | int]:
+    """A span as JSON. Lines and columns count from 1, `end_column` is exclusive."""
+    return {"file": span.file, "line": span.line, "column": span.column, "end_column": span.end_column}
+
+
+class Paint:
+    """Puts text between the ANSI sequences of a style, where it is to be `coloured`."""
+
+    def __init__(self, coloured: bool) -> None:
+        self._coloured = coloured
+
+    def __call__(self, style: str, text: str) -> str:
+        return f"{style}{text}{_RESET}" if self._coloured else text
 
 
 def is_coloured(out: TextIO) -> bool:
@@ -100,7 +102,7 @@ def visible(text: str) -> str:
     return _INVISIBLE.sub(lambda match: repr(match[0])[1:-1], text)
 
 
-def excerpt(span: SourceSpan, colour: str) -> list[str]:
+def excerpt(span: SourceSpan, paint: Paint, style: str) -> list[str]:
     """The source line with carets below what is blamed; none where the file does not have it."""
     lines = _lines(span.file)
     text = lines[span.line - 1] if span.line <= len(lines) else ""
@@ -110,9 +112,7 @@ def excerpt(span: SourceSpan, colour: str) -> list[str]:
     before = text[: span.column - 1 - start]
     marked = text[len(before) : span.end_column - 1 - start]
     gap = "".join("\t" if character == "\t" else " " * _width(character) for character in before)
-    carets = "^" * max(sum(map(_width, marked)), 1)
-    if colour:
-        carets = f"{colour}{carets}{_RESET}"
+    carets = paint(style, "^" * max(sum(map(_width, marked)), 1))
     return [f"{span.line:5d} | {visible(text)}", f"      | {gap}{carets}"]
 
 
@@ -150,7 +150,7 @@ def _read_lines(path: Path, changed_at: int) -> tuple[str, ...]:
     return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))
 
 
-def github_escaped(text: str, more: str) -> str:
+def _escaped(text: str, more: str = "") -> str:
     for character in "%\r\n" + more:
         text = text.replace(character, f"%{ord(character):02X}")
     return text

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import print_findings
-from router.cli.tool_options import add_table, say, table_path
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import add_table, good_table, say, table_path
 from router.errors import UsageError, plural
-
-if TYPE_CHECKING:
-    from router.table.model import RouteTable
 
 SUFFIXES = (".svg", ".mmd", ".dot")
 _DESCRIPTION = """Draw who sends which payload cases, and where each goes, with a legend: text for Mermaid (.mmd) or
@@ -37,22 +31,13 @@ def _output(text: str) -> Path:
 
 
 def run(args: argparse.Namespace) -> int:
-    from router.compiler import check_table
-
-    checked = check_table(table_path(args))
-    print_findings(checked.diagnostics, sys.stderr)
-    if checked.has_errors or checked.table is None:
-        return BAD_TABLE
-    try:
-        args.output.write_text(_drawn(checked.table, args.output.suffix), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{args.output} cannot be written: {error.strerror}") from error
-    say(f"{args.output}: {plural(len(checked.table.routes), 'route')}")
-    return OK
-
-
-def _drawn(table: RouteTable, suffix: str) -> str:
     from router.tools.graph import dot, mermaid, svg
 
-    draw = {".svg": svg, ".mmd": mermaid, ".dot": dot}[suffix]
-    return draw(table, table.path.name)
+    table = good_table(table_path(args))[1].table
+    draw = {".svg": svg, ".mmd": mermaid, ".dot": dot}[args.output.suffix]
+    try:
+        args.output.write_text(draw(table, table.path.name), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{args.output} cannot be written: {error.strerror}") from error
+    say(f"{args.output}: {plural(len(table.routes), 'route')}")
+    return OK

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb, with_help
-from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path, until_interrupted
-from router.errors import TableError, UsageError
+from router.cli.tool_options import add_table, good_table, progress, speed, table_if_any, table_path, until_interrupted
+from router.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
-    from router.compiler import Checked
-    from router.compiler.lookup import Definitions
     from router.recording.reader import Recording
     from router.tools.recordings import Resent
 
@@ -95,9 +93,9 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     from router.rehearsal.against import Against, Report
 
     definitions = Definitions()
-    old, new = (_checked(path, definitions) for path in (table_path(args), args.against))
-    assert old.program is not None and new.program is not None  # noqa: S101, PT018 - they have no errors
-    against = Against(old.program, new.program)
+    old, before = good_table(table_path(args), definitions=definitions)
+    new, after = good_table(args.against, definitions=definitions)
+    against = Against(before, after)
     with _progress(recording, "comparing") as update:
         for found in recording.datagrams():
             against.take(found)
@@ -105,16 +103,6 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     for line in Report(old, new).lines(against):
         print(line)
     return DIFFERENT if against.differs else OK
-
-
-def _checked(path: Path, definitions: Definitions) -> Checked:
-    """Raises TableError."""
-    from router.compiler import check_table
-
-    checked = check_table(path, definitions=definitions)
-    if checked.program is None:
-        raise TableError(checked.diagnostics)
-    return checked
 
 
 def _progress(recording: Recording, doing: str) -> AbstractContextManager[Callable[..., None]]:

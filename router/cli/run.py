@@ -18,9 +18,8 @@ import yaml
 from router.app import Router, tune_interpreter
 from router.app.process import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
-from router.cli.findings import is_coloured, print_findings
-from router.cli.tool_options import add_table, table_path
-from router.compiler import check_table
+from router.cli.findings import is_coloured
+from router.cli.tool_options import add_table, good_table, table_path
 from router.compiler.program import Program
 from router.errors import StartError, UsageError
 from router.log import LEVELS as LOG_LEVELS
@@ -59,12 +58,7 @@ def run(args: argparse.Namespace) -> int:
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
     environ = {**os.environ, **table_variables(parameters)}
-    checked = check_table(_table(args, parameters.get(_ROUTES_PATH)), environ)
-    print_findings(checked.diagnostics, sys.stderr)
-    if checked.program is None:
-        return BAD_TABLE
-    program = checked.program
-    del checked  # so that a reload can free it
+    program = good_table(_table(args, parameters.get(_ROUTES_PATH)), environ)[1]  # a reload can free the rest
     route(program, args.ros_args, environ)
     return OK
 

@@ -9,8 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb
-from router.cli.tool_options import add_for, add_table, factor, integer, table_path
-from router.errors import TableError
+from router.cli.tool_options import add_for, add_table, factor, good_table, integer, table_path
 
 if TYPE_CHECKING:
     from router.tools.sim_view import SimView
@@ -53,16 +52,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from router.compiler import check_table
     from router.datagrams import Wire
     from router.tools.sim_view import SimView
     from router.tools.simulator import Simulator, parse_silence
 
     silences = [parse_silence(text) for text in args.silent]
-    checked = check_table(table_path(args))
-    if checked.program is None:
-        raise TableError(checked.diagnostics)
-    wire, program = Wire(checked.program.envelope), checked.program
+    _, program = good_table(table_path(args))
+    wire = Wire(program.envelope)
     simulator = Simulator(wire, program.table, args.seed, args.speed, deadmen=program.deadmen, silences=silences)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: simulator.stop())

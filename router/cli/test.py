@@ -11,12 +11,24 @@ from pathlib import Path
 from typing import TextIO
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
-from router.cli.findings import as_data as finding_data
-from router.cli.findings import excerpt, github_escaped, is_coloured, print_findings, visible
+from router.cli.findings import (
+    BOLD,
+    CYAN,
+    RED,
+    YELLOW,
+    Paint,
+    annotation,
+    as_data,
+    excerpt,
+    is_coloured,
+    place,
+    print_findings,
+    visible,
+)
 from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.errors import Diagnostic, SourceSpan, TableError, UsageError, plural, shown_path
+from router.errors import Diagnostic, Severity, TableError, UsageError, plural, shown_path
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.reading import ENDINGS, find_test_files, read_test_file
 from router.rehearsal.running import Result, run_tests
@@ -105,13 +117,12 @@ def _print_results(
 ) -> None:
     """Print in one of FORMATS. Only JSON has the `findings`, which are what is wrong with test files and tables."""
     if style == "json":
-        wrong = {"findings": [finding_data(finding, strict=False) for finding in findings]}
-        json.dump(_as_data(results, coverages) | wrong, out, indent=2)
-        out.write("\n")
+        wrong = {"findings": [as_data(finding, strict=False) for finding in findings]}
+        print(json.dumps(_as_data(results, coverages) | wrong, indent=2), file=out)
     elif style == "github":
         out.writelines(line + "\n" for line in _annotations(results, coverages))
     else:
-        out.writelines(line + "\n" for line in _text(results, coverages, _Paint(is_coloured(out))))
+        out.writelines(line + "\n" for line in _text(results, coverages, Paint(is_coloured(out))))
 
 
 def _summary(results: Sequence[Result], files: int) -> str:
@@ -123,35 +134,22 @@ def _summary(results: Sequence[Result], files: int) -> str:
 
 # for people
 
-_RESET, _BOLD, _RED, _CYAN, _YELLOW = "\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[36m", "\x1b[33m"
 
-
-class _Paint:
-    def __init__(self, coloured: bool) -> None:
-        self.coloured = coloured
-
-    def __call__(self, colour: str, text: str) -> str:
-        return f"{colour}{text}{_RESET}" if self.coloured else text
-
-    def excerpt(self, span: SourceSpan, colour: str) -> list[str]:
-        return excerpt(span, colour if self.coloured else "")
-
-
-def _text(results: Sequence[Result], coverages: Collection[Coverage], paint: _Paint) -> Iterator[str]:
+def _text(results: Sequence[Result], coverages: Collection[Coverage], paint: Paint) -> Iterator[str]:
     for result in results:
         if result.failures:
-            yield f"{paint(_BOLD, str(result.test.span))}: {paint(_RED, 'failed')}: {visible(result.test.name)}"
+            yield f"{paint(BOLD, str(result.test.span))}: {paint(RED, 'failed')}: {visible(result.test.name)}"
         for failure in result.failures:
-            yield f"{failure.span}: {paint(_BOLD, visible(failure.message))}"
-            yield from paint.excerpt(failure.span, _RED)
+            yield f"{failure.span}: {paint(BOLD, visible(failure.message))}"
+            yield from excerpt(failure.span, paint, RED)
             if failure.table is not None:
-                yield f"{failure.table.span}: {paint(_CYAN, failure.table.note)}"
-                yield from paint.excerpt(failure.table.span, _CYAN)
+                yield f"{failure.table.span}: {paint(CYAN, failure.table.note)}"
+                yield from excerpt(failure.table.span, paint, CYAN)
             yield ""
     for coverage in coverages:
         for item in coverage.gaps():
-            yield f"{item.span}: {paint(_YELLOW, 'not covered')}: {item.gap}"
-            yield from paint.excerpt(item.span, _YELLOW)
+            yield f"{item.span}: {paint(YELLOW, 'not covered')}: {item.gap}"
+            yield from excerpt(item.span, paint, YELLOW)
         counts = [f"{touched} of {plural(there, kind)}" for kind, (touched, there) in coverage.counts().items()]
         yield f"{shown_path(coverage.path)}: covered {', '.join(counts)}"
 
@@ -160,14 +158,13 @@ def _text(results: Sequence[Result], coverages: Collection[Coverage], paint: _Pa
 
 
 def _as_data(results: Sequence[Result], coverages: Collection[Coverage]) -> dict[str, object]:
-    """Lines and columns count from 1, `end_column` is exclusive."""
     return {
         "tests": [_result_data(result) for result in results],
         "coverage": [
             {
                 "table": shown_path(coverage.path),
                 **{f"{kind}s": {"touched": one, "all": all_} for kind, (one, all_) in coverage.counts().items()},
-                "gaps": [{"kind": item.kind, "message": item.gap, **_place(item.span)} for item in coverage.gaps()],
+                "gaps": [{"kind": item.kind, "message": item.gap, **place(item.span)} for item in coverage.gaps()],
             }
             for coverage in coverages
         ],
@@ -178,30 +175,19 @@ def _result_data(result: Result) -> dict[str, object]:
     failures = [
         {
             "message": failure.message,
-            **_place(failure.span),
-            "table": {"note": failure.table.note, **_place(failure.table.span)} if failure.table else None,
+            **place(failure.span),
+            "table": {"note": failure.table.note, **place(failure.table.span)} if failure.table else None,
         }
         for failure in result.failures
     ]
-    return {"name": result.test.name, "passed": result.passed, **_place(result.test.span), "failures": failures}
-
-
-def _place(span: SourceSpan) -> dict[str, str | int]:
-    return {"file": span.file, "line": span.line, "column": span.column, "end_column": span.end_column}
+    return {"name": result.test.name, "passed": result.passed, **place(result.test.span), "failures": failures}
 
 
 def _annotations(results: Sequence[Result], coverages: Collection[Coverage]) -> Iterator[str]:
-    """Workflow commands, which GitHub shows beside the lines of a pull request."""
     for result in results:
         for failure in result.failures:
             table = f" ({failure.table.span}: {failure.table.note})" if failure.table else ""
-            yield _annotation("error", failure.span, result.test.name, failure.message + table)
+            yield annotation(Severity.ERROR, failure.span, result.test.name, failure.message + table)
     for coverage in coverages:
         for item in coverage.gaps():
-            yield _annotation("warning", item.span, "not covered by a test", item.gap)
-
-
-def _annotation(level: str, span: SourceSpan, title: str, text: str) -> str:
-    properties = {"file": span.file, "line": span.line, "col": span.column, "endColumn": span.end_column}
-    listed = ",".join(f"{name}={github_escaped(str(value), ':,')}" for name, value in properties.items())
-    return f"::{level} {listed},title={github_escaped(title, ':,')}::{github_escaped(text, '')}"
+            yield annotation(Severity.WARNING, item.span, "not covered by a test", item.gap)

@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,9 @@ from router.errors import TableError, UsageError
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
+    from router.compiler import Checked
+    from router.compiler.lookup import Definitions
+    from router.compiler.program import Program
     from router.datagrams import Wire
     from router.table.model import RouteTable
     from router.tools.tap import TappedDatagram, TappedMessage
@@ -60,6 +63,20 @@ def named_table(args: argparse.Namespace) -> Path | None:
 def table_if_any(args: argparse.Namespace) -> Path | None:
     """The table that is named, or the default one if it is there."""
     return named_table(args) or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
+
+
+def good_table(
+    path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
+) -> tuple[Checked, Program]:
+    """Check a table and print its warnings. Raises TableError where it has errors."""
+    from router.cli.findings import print_findings
+    from router.compiler import check_table
+
+    checked = check_table(path, environ, definitions)
+    if checked.program is None:
+        raise TableError(checked.diagnostics)
+    print_findings(checked.diagnostics, sys.stderr)
+    return checked, checked.program
 
 
 def add_tables(parser: argparse.ArgumentParser, about: str) -> None:

@@ -9,7 +9,7 @@ import termios
 import time
 import tty
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -17,8 +17,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from router.tools.top import Order, View, unwanted
-from router.tools.top_table import Column, RouteTable
-from router.tools.top_words import latency_text, reasons_text
+from router.tools.top_table import RouteTable, reasons_text
 from router.values import age_text, rate_text, shortened
 
 _ENDPOINT_LINES = 4
@@ -94,7 +93,7 @@ class Screen:
 
     def table(self, width: int) -> RouteTable:
         room = self.height - len(self._head(width)) - 2
-        return RouteTable(self.view, self.order, room, TIMES, self.first)
+        return RouteTable(self.view, self.order, room, self.first)
 
     def _head(self, width: int) -> list[Text]:
         return _summary(self.view, width, min(_ENDPOINT_LINES, max(self.height // 6, 1)))
@@ -115,7 +114,7 @@ class Page:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from _summary(self.view, options.max_width, len(self.view.silence))
-        yield RouteTable(self.view, self.order, len(self.view.routes) + 1, TIMES)
+        yield RouteTable(self.view, self.order, len(self.view.routes) + 1)
 
 
 def _foot(table: RouteTable) -> Text:
@@ -143,19 +142,18 @@ def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:
-    """The endpoints beside each other, in as many lines as they need; what has no room is counted."""
-    title = "last heard  "
+    """The endpoints below each other, in as many lines as they need; what has no room is counted."""
+    title, gap = "last heard  ", "  "
     items = [_heard(name, age, name in view.silent) for name, age in view.silence.items()]
-    lines = _packed(items, width - len(title))
-    texts = [Text("  ").join(line) for line in lines[:most]]
-    if hidden := len(items) - sum(map(len, lines[:most])):
-        last = lines[most - 1]
-        while last and len(texts[-1]) + len(more := f"  and {hidden} more") > width - len(title):
-            last, hidden = last[:-1], hidden + 1
-            texts[-1] = Text("  ").join(last)
-        texts[-1].append(more, style="dim")
-    heads = [Text(title, style="bold"), *(Text(" " * len(title)) for _ in texts[1:])][: len(texts)]
-    return [Text.assemble(*both, no_wrap=True, overflow="ellipsis") for both in zip(heads, texts, strict=True)]
+    longest = max(map(len, items), default=0)
+    columns = max((width - len(title) + len(gap)) // (longest + len(gap)), 1)
+    if (hidden := len(items) - columns * most) > 0:
+        items[columns * most - 1 :] = [Text(f"and {hidden + 1} more", style="dim")]
+    for item in items:
+        item.pad_right(longest - len(item))
+    lines = [Text(gap).join(items[start : start + columns]) for start in range(0, len(items), columns)]
+    heads = [Text(title if index == 0 else " " * len(title), style="bold") for index in range(len(lines))]
+    return [Text.assemble(*both, no_wrap=True, overflow="ellipsis") for both in zip(heads, lines, strict=True)]
 
 
 def _heard(name: str, age: float | None, is_silent: bool) -> Text:
@@ -163,24 +161,7 @@ def _heard(name: str, age: float | None, is_silent: bool) -> Text:
     text = Text(f"{shortened(name, _LETTERS)} ")
     if is_silent:
         text = Text(f"!{text.plain}", style="bold red")
-    return text.append(f"{age_text(age):>6}", style="dim" if age is None else "cyan" if not is_silent else "")
-
-
-def _packed(items: Sequence[Text], width: int) -> list[list[Text]]:
-    lines: list[list[Text]] = []
-    room = 0
-    for item in items:
-        if not lines or room < len(item):
-            lines.append([])
-            room = width
-        lines[-1].append(item)
-        room -= len(item) + 2
-    return lines
-
-
-def summary_line(view: View) -> str:
-    """The whole router in one line."""
-    return ", ".join(_summary_parts(view))
+    return text.append(f"{age_text(age):>5}", style="dim" if age is None else "cyan" if not is_silent else "")
 
 
 def _summary_parts(view: View) -> tuple[str, str]:
@@ -198,11 +179,3 @@ def _summary_parts(view: View) -> tuple[str, str]:
         f"in {view.received} ({rate_text(view.rate)}/s), delivered {delivered} ({rate_text(rate)}/s)",
         f"lost {reasons_text(lost) or 'none'}{'; as the table wants ' if wanted else ''}{reasons_text(wanted)}",
     )
-
-
-TIMES: Sequence[Column] = (
-    Column("p50", lambda row: Text(latency_text(row.median)), is_optional=True),
-    Column("p99", lambda row: Text(latency_text(row.slowest)), is_optional=True),
-    Column("age", lambda row: Text(age_text(row.age), style="dim" if row.age is None else "")),
-)
-"""What `router top` shows of a route besides its rates; the latencies where there is room."""
