@@ -96,7 +96,7 @@ class Plane:
         self._counters = counts
         self._names = Names()
         self._generations = count(1)
-        self._is_running = self._has_stopped = False
+        self._is_running = self.has_stopped = False
         braking, guarding, publishing, receiving, *from_ros = (ThreadCounts.fixed() for _ in range(6))
         braked, guarded, published, received, *taken = (Ring(library, _EVENTS) for _ in range(6))
         self._deadmen = Deadmen(library, braking, braked, self._names)
@@ -312,7 +312,7 @@ class Plane:
         self._carrier.stop_receiving()
         self._is_running = False
         have_ended = [self._publishing.stop(), *(thread.stop() for thread in self._from_ros)]
-        self._has_stopped = True
+        self.has_stopped = True
         return all(have_ended)
 
     def close(self) -> bool:
@@ -324,7 +324,7 @@ class Plane:
         has_ended = self._client_deadmen.stop()
         if not has_ended:
             logger.error("a thread is stuck, and the router ends without it", threads=["client deadmen"])
-        if self._has_stopped:  # else `stop` is stuck, and its threads use what would be freed
+        if self.has_stopped:  # else `stop` is stuck, and its threads use what would be freed
             self._events.close()
             self._carrier.close()
         return has_ended

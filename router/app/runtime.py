@@ -102,7 +102,7 @@ class Runtime:
 
     def close_with(self, closing: ExitStack) -> None:
         """Have `closing` close sockets and ROS, after the services that use them."""
-        closing.callback(self.sockets.close_listeners)
+        closing.callback(self._close_listeners)
         closing.callback(self.sockets.close_senders)
         closing.callback(self._close_ros)
 
@@ -269,6 +269,10 @@ class Runtime:
     def _close_plane(self) -> None:
         if not self.plane.close() and self._ros is not None:
             self._ros.leave_open()
+
+    def _close_listeners(self) -> None:
+        if self.plane.has_stopped:  # else `stop` is stuck, and a thread receives from their descriptors
+            self.sockets.close_listeners()
 
     def _close_ros(self) -> None:
         if self._ros is not None:

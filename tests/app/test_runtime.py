@@ -385,20 +385,27 @@ def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
 def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
     site: Site, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    never = threading.Event()
+    goes_on, has_ended = threading.Event(), threading.Event()
+    stop = getattr(Runtime, place)
 
-    def stuck(_: Runtime) -> None:
-        never.wait()
+    def stuck(runtime: Runtime) -> None:
+        goes_on.wait()
+        stop(runtime)
+        has_ended.set()
 
     monkeypatch.setattr(threads, "STEP_S", 0.1)
     monkeypatch.setattr(Runtime, place, stuck)
-    monkeypatch.setattr(HttpServer, "close", stuck)
+    monkeypatch.setattr(HttpServer, "close", lambda _: goes_on.wait())
     more = f"http: {{address: 127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}}}\n"
     with capture_logs() as logs:
-        with Router(site.program(ROUTE + TURNS.replace("20ms", "20s"), more)):
+        with Router(site.program(ROUTE + TURNS.replace("20ms", "20s"), more)) as router:
             assert site.basestation.recv(1000) == BRAKE  # of the start
             site.send(DRIVE)
             assert site.basestation.recv(1000) == DRIVE
         assert site.basestation.recv(1000) == BRAKE
-    never.set()
     assert len([each for each in logs if each["event"] == "a step of the stop is stuck, and is left"]) == 2
+    # What is opened next must not get the descriptor of a thread that still receives.
+    assert (router.listeners["rover"].socket.fileno() >= 0) == (place == "_stop_plane")
+    goes_on.set()
+    assert has_ended.wait(10)
+    router.listeners["rover"].close()
