@@ -1,10 +1,8 @@
-"""What becomes of a datagram, as Python and as the carrier decide it."""
+"""What the carrier decides about a datagram, over schemas with fields of every kind."""
 
 from __future__ import annotations
 
 import ctypes
-import re
-from dataclasses import dataclass
 from pathlib import Path
 
 from router.carrier.build import build, is_current
@@ -13,12 +11,11 @@ from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope
-from tests.oracles.python_engine.rig import Rig
+from tests.oracles.envelopes import Decision
 from tests.small_tables import program
 from tests.tables import PROTOS
 
 TESTS = Path(__file__).parents[1]
-SENDER = ("192.168.0.30", 8)
 
 HEAD = """version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
@@ -53,50 +50,6 @@ def table(schema: str, folder: Path) -> Program:
     own = folder / schema
     own.mkdir(exist_ok=True)
     return program(own, routes, HEAD, protos)
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What becomes of a datagram before senders are looked at.
-
-    `reason` is None for the payload case `number`, which may have no route. For `unknown_case` and `malformed` it is
-    the number of the field to blame, or 0. `is_repaired`: counted as padded.
-    """
-
-    reason: str | None
-    number: int
-    is_repaired: bool
-
-
-class PythonSide:
-    """An engine, asked by its counters and reports."""
-
-    def __init__(self, made: Program) -> None:
-        self._rig = Rig(made)
-        index = made.counters.index
-        self._numbers = {case.name: case.number for case in made.envelope.cases.values()}
-        self._received = {
-            number: index("messages_received", handler.route, "board") for number, (handler,) in made.inbound.items()
-        }
-        self._padded = {name: index("datagrams_padded", name) for name in ("trimmed", "exact")}
-
-    def decide(self, data: bytes, repairs: bool) -> Decision:
-        listener = "trimmed" if repairs else "exact"
-        rig, counts = self._rig, self._rig.counts
-        rig.reports.clear()
-        rig.sent.clear()
-        padded = counts[self._padded[listener]]
-        received = {number: counts[index] for number, index in self._received.items()}
-        rig.receive(data, SENDER, listener)
-        is_repaired = counts[self._padded[listener]] != padded
-        if not rig.reports:
-            (number,) = [number for number, index in self._received.items() if counts[index] != received[number]]
-            return Decision(None, number, is_repaired)
-        (report,) = rig.reports
-        if report.reason == "unhandled":
-            return Decision(None, self._numbers[report.detail.rpartition(" ")[2]], is_repaired)
-        field = re.search(r": field (\d+)", report.detail)
-        return Decision(report.reason, int(field[1]) if field else 0, is_repaired)
 
 
 class CarrierSide:

@@ -1,4 +1,4 @@
-"""The carrier decides about datagrams as Python does: against the engine, over schemas with fields of every kind."""
+"""The carrier decides about datagrams as protobuf does, over schemas with fields of every kind."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM
 from router.errors import Code
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
-from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
+from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, table
 from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint
+from tests.oracles.envelopes import Decision, decide
 from tests.small_tables import program
 
-Sides = tuple[Program, PythonSide, CarrierSide]
+Sides = tuple[Program, CarrierSide]
 
 
 @pytest.fixture(scope="module")
 def sides(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Sides]:
-    """By schema: the table, and both who decide."""
+    """By schema: the table, and the carrier."""
     folder = tmp_path_factory.mktemp("envelope")
     tables = {schema: table(schema, folder) for schema in SCHEMAS}
-    return {schema: (made, PythonSide(made), CarrierSide(library, made)) for schema, made in tables.items()}
+    return {schema: (made, CarrierSide(library, made)) for schema, made in tables.items()}
 
 
 def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
-    """The decision of both, which has to be the same; what the carrier says of the payload is checked too."""
-    made, python, carrier = sides
+    """The decision of the carrier, which has to be the oracle's; what it says of the payload is checked too."""
+    made, carrier = sides
     decision = carrier.decide(data, repairs)
-    assert decision == python.decide(data, repairs)
+    assert decision == decide(made.envelope, made.inbound, data, MAX_DATAGRAM, repairs)
     payload = carrier.payload()
     if payload is not None:
         case = next(case for case in made.envelope.cases.values() if case.number == decision.number)
