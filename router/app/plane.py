@@ -169,7 +169,7 @@ class Plane:
             thread.open(messages)
         topics = RosTopics(messages, opened.subscriptions)
         pacers = [Adoption(pacer.address) for pacer in deferrals.pacers()]
-        adopted = [*pacers, *native.adopted, *messages.adopted]
+        adopted = [*pacers, *native.states.adopted, *messages.states.adopted]
         clients = self._deadmen_of_clients(program, opened)
         return Built(program, opened.state, native, topics, adopted, deadmen, clients)
 

@@ -34,14 +34,11 @@ def kept_collector(library: ctypes.CDLL, state: State, plan: RoutePlan) -> Nativ
     return state.keep(key, lambda: NativeCollector(library, timeout))
 
 
-def native_collect(
-    lowered: LoweredCollect, programs: Programs, collector: NativeCollector, senders: Sequence[int]
-) -> c.Collect:
-    """`senders` are numbers of names, by column. The programs are those of the route."""
+def native_collect(lowered: LoweredCollect, programs: Programs, senders: Sequence[int]) -> c.Collect:
+    """Without a collector. `senders` are numbers of names, by column. The programs are those of the route."""
     numbers = (ctypes.c_uint32 * len(senders))(*senders)
-    programs.arrays += [collector, numbers]
+    programs.arrays.append(numbers)
     return c.Collect(
-        collector=collector.address,
         by=programs.code(lowered.by),
         count=programs.code(lowered.count),
         order=programs.code(lowered.order),

@@ -12,11 +12,10 @@ from time import sleep
 from typing import Protocol
 
 from router import declared as c
-from router.carrier.deferrals import Adoption
 from router.carrier.lowered import Programs
 from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
-from router.carrier.targets import TargetWriter
+from router.carrier.targets import TargetStates, TargetWriter
 from router.compiler.lowering import LoweredElements, LoweredFeed
 from router.compiler.program import Program, RoutePlan
 from router.declared import NONE
@@ -50,8 +49,7 @@ class NativeFromRos:
     topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)
     urgent: set[str] = field(default_factory=set)
     arrays: list[object] = field(default_factory=list)
-    adopted: Sequence[Adoption] = ()
-    """The deferrals of its targets."""
+    states: TargetStates = field(default_factory=TargetStates)
 
     def only(self, *, urgent: bool) -> NativeFromRos:
         """Those for the thread of urgent messages, or those for the other one."""
@@ -62,14 +60,14 @@ class NativeFromRos:
 def native_from_ros(program: Program, generation: int, outlets: Outlets) -> NativeFromRos:
     """Make the arrays of all topics that the carrier takes. `outlets` serve the targets of routes from ROS, too."""
     made = NativeFromRos()
-    writer = TargetWriter(program, outlets, generation, made.arrays)
+    made.arrays.append(made.states)
+    writer = TargetWriter(program, outlets, generation, made.arrays, made.states)
     for topic, feeds in program.lowered.from_ros.items():
         plans = {plan.route: plan for plan in program.outbound[topic]}
         routes = [_route(writer, plans[feed.route], feed) for feed in feeds]
         made.topics[topic] = (c.RosRoute * len(routes))(*routes)
         if any(feed.is_urgent for feed in feeds):
             made.urgent.add(topic)
-    made.adopted = writer.adopted
     return made
 
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
-from router.carrier.deferrals import Adoption
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
-from router.carrier.targets import TargetWriter
+from router.carrier.targets import TargetStates, TargetWriter
 from router.compiler.metrics import UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Program, RoutePlan, source_label
@@ -25,10 +24,10 @@ from router.table.model import Framing
 
 @dataclass(slots=True)
 class NativeProgram:
-    """`struct program` with all that it refers to. `adopted` are the deferrals and collectors of its targets."""
+    """`struct program` with all that it refers to."""
 
     generation: int
-    adopted: Sequence[Adoption] = ()
+    states: TargetStates = field(default_factory=TargetStates)
     arrays: list[object] = field(default_factory=list)
     structure: c.Program = field(default_factory=c.Program)
 
@@ -37,8 +36,9 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
     """Make the arrays of a program; `generation` numbers the programs of the process."""
     schema = wire_schema(program.envelope, program.inbound.keys())
     plans = [plan for several in program.inbound.values() for plan in several]
-    made = NativeProgram(generation, arrays=[schema])
-    targets = TargetWriter(program, outlets, generation, made.arrays)
+    made = NativeProgram(generation)
+    made.arrays += [schema, made.states]
+    targets = TargetWriter(program, outlets, generation, made.arrays, made.states)
     numbers = {plan.route: number for number, plan in enumerate(plans)}
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
     writer = _Writer(program, made, outlets, targets, numbers, columns)
@@ -52,7 +52,6 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         cases=writer.array(c.PayloadCase, writer.cases()),
         routes=writer.array(c.Route, [writer.route(plan) for plan in plans]),
     )
-    made.adopted = targets.adopted
     return made
 
 

@@ -66,7 +66,6 @@ class Stage:
         self._library = library
         self._names = Names()
         self._opened = _Opened(library, now)
-        self._address = self._opened.address
         self._reader = EventReader(self._names, self._why_rejected, self._where_refused)
         self._generation = 0
         # It keeps what is open out of the garbage, which would be freed in any order.
@@ -80,7 +79,23 @@ class Stage:
         """Go on with a program, which takes over what has the same key, as at a reload. Raises MemoryError."""
         earlier, state = self._opened.running, State(self._opened.state)
         self._generation += 1
-        running = self._opened_for(program, state)
+        running = self._built(program, state)
+        self._serve(running, earlier)
+        self._opened.state, self._opened.running = state, running
+        state.forget_previous()
+
+    def restart(self, now: int) -> None:
+        """Begin anew with the program in use, as a router that has just started. Raises MemoryError."""
+        running, state = self._in_use, State(self._opened.state)
+        fixed = self._fixed(running.program, state, running.fixed.boards)
+        state.forget_previous()
+        self._opened.reopen(now)
+        self.now = now
+        running.bind(self._bound(running.program, state, fixed))
+        self._serve(running, None)
+        self._opened.state, self._opened.running = state, running
+
+    def _serve(self, running: _Running, earlier: _Running | None) -> None:
         before = earlier.deadmen if earlier else {}
         replaced = [(each, before[route]) for route, each in running.deadmen.items() if route in before]
         replaced = [(each, replaces) for each, replaces in replaced if replaces is not each]
@@ -95,38 +110,37 @@ class Stage:
             replaced_count=len(replaced),
         )
         of_topics = running.timer_change(earlier, (), of_topics=True)
-        self._library.rehearsal_adopt(self._address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
-        self._opened.state, self._opened.running = state, running
-        state.forget_previous()
+        address = self._opened.address
+        self._library.rehearsal_adopt(address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
         """Receive a datagram. `arrived_at` is of the wall clock. Raises KeyError for no listener."""
         host, port = peer
         number = self._in_use.listeners[listener]
-        self._library.rehearsal_datagram(self._address, number, _number(host), port, data, len(data), arrived_at)
+        self._library.rehearsal_datagram(self._opened.address, number, _number(host), port, data, len(data), arrived_at)
 
     def message(self, topic: str, data: bytes, sent_at: int) -> None:
         """Take a message from ROS. `sent_at` is of the wall clock. Raises KeyError for a topic without a route."""
         number = self._in_use.topic_numbers[topic]
-        self._library.rehearsal_message(self._address, number, data, len(data), sent_at)
+        self._library.rehearsal_message(self._opened.address, number, data, len(data), sent_at)
 
     def advance(self, to: int) -> None:
         """Let time pass, and serve what is due until then. Never goes back."""
-        self._library.rehearsal_advance(self._address, to)
+        self._library.rehearsal_advance(self._opened.address, to)
         self.now = max(self.now, to)
 
     def set_clock(self, ahead: int) -> None:
         """Set the wall clock."""
-        self._library.rehearsal_set_clock(self._address, ahead)
+        self._library.rehearsal_set_clock(self._opened.address, ahead)
 
     def end(self) -> None:
         """Stop as the router does."""
-        self._library.rehearsal_end(self._address)
+        self._library.rehearsal_end(self._opened.address)
 
     def records(self) -> Iterator[Record]:
         """What became of it since the last call. Raises MemoryError."""
         size = ctypes.c_size_t()
-        address = self._library.rehearsal_records(self._address, ctypes.byref(size))
+        address = self._library.rehearsal_records(self._opened.address, ctypes.byref(size))
         if size.value and not address:
             raise MemoryError("there is no room for what becomes of messages")
         records = memoryview(bytearray(ctypes.string_at(address, size.value) if address else b""))
@@ -163,9 +177,22 @@ class Stage:
 
     # programs
 
-    def _opened_for(self, program: Program, state: State) -> _Running:
-        senders = {each.name: self._sender(each, state) for each in program.senders}
-        deadmen = {plan.route: self._deadman(plan, program, senders, state) for plan in program.deadmen}
+    def _built(self, program: Program, state: State) -> _Running:
+        fixed = self._fixed(program, state, NativeBoards(program.boards))
+        bound = self._bound(program, state, fixed)
+        native = native_program(program, self._generation, bound.outlets)
+        return _Running(program, fixed, bound, native, native_from_ros(program, self._generation, bound.outlets))
+
+    def _fixed(self, program: Program, state: State, boards: NativeBoards) -> _Fixed:
+        publications = {
+            plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
+            for plan in program.publishers
+        }
+        return _Fixed({each.name: self._sender(each, state) for each in program.senders}, publications, boards)
+
+    def _bound(self, program: Program, state: State, fixed: _Fixed) -> _Bound:
+        """Open what messages change, unless `state` has it."""
+        deadmen = {plan.route: self._deadman(plan, program, fixed.senders, state) for plan in program.deadmen}
 
         def feeds(route: str, names: Sequence[str]) -> Sequence[tuple[int, bool]]:
             return [(deadmen[name].address, name != route) for name in names]
@@ -174,29 +201,20 @@ class Stage:
             assert target.max_rate is not None  # noqa: S101 - asked for by the caller
             return state.keep(("limit", plan.route, plan.topic, target), partial(open_limit, target.max_rate))
 
-        publications = {
-            plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
-            for plan in program.publishers
-        }
         bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
-        deferrals = Deferrals(self._library, state, senders, publications, bandwidths)
-        pacers = deferrals.pacers()
+        deferrals = Deferrals(self._library, state, fixed.senders, fixed.publications, bandwidths)
         outlets = Outlets(
             listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
-            senders={name: sender.address for name, sender in senders.items()},
-            publications=publications,
+            senders={name: sender.address for name, sender in fixed.senders.items()},
+            publications=fixed.publications,
             feeds=feeds,
             limit=limit,
             deferral=deferrals.deferral,
             collector=partial(kept_collector, self._library, state),
             names=self._names,
-            boards=NativeBoards(program.boards),
+            boards=fixed.boards,
         )
-        native = native_program(program, self._generation, outlets)
-        from_ros = native_from_ros(program, self._generation, outlets)
-        native.arrays += [senders, deadmen, outlets, pacers]
-        adopted = [*(Adoption(pacer.address) for pacer in pacers), *native.adopted, *from_ros.adopted]
-        return _Running(program, native, from_ros, deadmen, adopted)
+        return _Bound(outlets, deadmen, [Adoption(pacer.address) for pacer in deferrals.pacers()])
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
         return state.keep(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
@@ -222,16 +240,29 @@ class _Opened:
         self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
         self.running: _Running | None = None
         self.state = State()
-        self.address: int = library.rehearsal_open(self.counters, now)
+        self._open(now)
+
+    def _open(self, now: int) -> None:
+        self.address: int = self.library.rehearsal_open(self.counters, now) or 0
         if not self.address:
             raise MemoryError("the stage cannot be opened")
-        self.timers: int = library.rehearsal_timers(self.address)
+        self.timers: int = self.library.rehearsal_timers(self.address)
+
+    def reopen(self, now: int) -> None:
+        self.close()
+        ctypes.memset(self.counters, 0, ctypes.sizeof(self.counters))
+        self._open(now)
 
     def close(self) -> None:
         """End all timers, and free them before the stage."""
+        if not self.address:
+            return
         self.library.rehearsal_end(self.address)
+        if self.running is not None:
+            self.running.release()
         self.running, self.state = None, State()
         self.library.rehearsal_close(self.address)
+        self.address = 0
 
 
 class _Sender:
@@ -263,23 +294,56 @@ class _Publication:
         self.wanted = (ctypes.c_uint8 * 1)(1)
 
 
+class _Fixed(NamedTuple):
+    """What is open for a program, and no message changes: `senders` by endpoint, `publications` by topic."""
+
+    senders: Mapping[str, _Sender]
+    publications: Mapping[str, _Publication]
+    boards: NativeBoards
+
+
+class _Bound(NamedTuple):
+    """What is open for a program, and messages change; `deadmen` are by route."""
+
+    outlets: Outlets
+    deadmen: Mapping[str, NativeDeadman]
+    pacers: Sequence[Adoption]
+
+
 class _Running:
     """A program as the stage executes it. Listeners and topics have numbers, which are indexes of its arrays."""
 
     def __init__(
-        self,
-        program: Program,
-        native: NativeProgram,
-        from_ros: NativeFromRos,
-        deadmen: Mapping[str, NativeDeadman],
-        adopted: Sequence[Adoption],
+        self, program: Program, fixed: _Fixed, bound: _Bound, native: NativeProgram, from_ros: NativeFromRos
     ) -> None:
-        self.program, self.native, self.deadmen, self.adopted = program, native, deadmen, adopted
+        self.program, self.fixed, self.native = program, fixed, native
         self.listeners = {plan.name: number for number, plan in enumerate(program.listeners)}
         self.topic_numbers = {topic: number for number, topic in enumerate(from_ros.topics)}
         routes = from_ros.topics.values()
         self.topics = (c.RosTopic * len(routes))(*(c.RosTopic(routes=each, route_count=len(each)) for each in routes))
         self._from_ros = from_ros
+        self._bound: _Bound | None = bound
+
+    @property
+    def deadmen(self) -> Mapping[str, NativeDeadman]:
+        return self._bound.deadmen if self._bound else {}
+
+    @property
+    def adopted(self) -> Sequence[Adoption]:
+        pacers = self._bound.pacers if self._bound else ()
+        return [*pacers, *self.native.states.adopted, *self._from_ros.states.adopted]
+
+    def bind(self, bound: _Bound) -> None:
+        """Have the arrays refer to other state."""
+        self._bound = bound
+        for states in (self.native.states, self._from_ros.states):
+            states.bind(bound.outlets)
+
+    def release(self) -> None:
+        """Let go of the state, before the stage is closed."""
+        self._bound = None
+        for states in (self.native.states, self._from_ros.states):
+            states.release()
 
     def timer_change(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
         """What timers are to do that hold messages back, for topics or for endpoints; `ended` end as well."""

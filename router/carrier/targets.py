@@ -17,6 +17,64 @@ from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, so
 
 
 @dataclass(slots=True)
+class TargetStates:
+    """What targets refer to and messages change: limits, deferrals, deadmen, collectors.
+
+    `adopted` are the deferrals and collectors, for a `struct timer_change`.
+    """
+
+    adopted: list[Adoption] = field(default_factory=list)
+    _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan]]] = field(default_factory=list)
+    _collects: list[tuple[c.Targets, c.Collect, RoutePlan]] = field(default_factory=list)
+    _kept: list[object] = field(default_factory=list)
+
+    def add(self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan]) -> None:
+        self._targets.append((made, plan, targets))
+        self._bind(outlets, made, plan, targets)
+
+    def add_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
+        self._collects.append((made, collect, plan))
+        self._bind_collector(outlets, made, collect, plan)
+
+    def release(self) -> None:
+        """Let go of the state. No message may come before `bind`."""
+        self.adopted.clear()
+        self._kept.clear()
+
+    def bind(self, outlets: Outlets) -> None:
+        """Have all targets refer to other state, that of `outlets`."""
+        self.release()
+        for targets in self._targets:
+            self._bind(outlets, *targets)
+        for collects in self._collects:
+            self._bind_collector(outlets, *collects)
+
+    def _bind(self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan]) -> None:
+        for native, target in zip(made.targets[: made.count], targets, strict=True):
+            if (deferral := outlets.deferral(plan, target)) is not None:
+                native.deferral = deferral.address
+                self._kept.append(deferral)
+                to = ctypes.addressof(made), ctypes.addressof(native)
+                self.adopted.append(Adoption(deferral.address, target.is_topic, *to))
+            if target.max_rate is not None and not native.period:
+                limit = outlets.limit(plan, target)
+                native.limit = ctypes.pointer(limit)
+                self._kept.append(limit)
+            if target.deadmen:
+                feeds = [
+                    c.Feed(deadman=deadman, disarms=disarms)
+                    for deadman, disarms in outlets.feeds(plan.route, target.deadmen)
+                ]
+                native.feeds, native.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
+
+    def _bind_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
+        collector = outlets.collector(plan)
+        collect.collector = collector.address
+        self._kept.append(collector)
+        self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
+
+
+@dataclass(slots=True)
 class TargetWriter:
     """Makes the targets of one program. `arrays` gets what has to live as long as they do."""
 
@@ -24,8 +82,7 @@ class TargetWriter:
     outlets: Outlets
     generation: int
     arrays: list[object]
-    adopted: list[Adoption] = field(default_factory=list)
-    """Deferrals and collectors, for a `struct timer_change`."""
+    states: TargetStates
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
 
@@ -36,9 +93,9 @@ class TargetWriter:
         programs = Programs(lowered.layout, self.arrays)
         made = self.targets(plan, targets, lowered.targets, programs)
         if lowered.collect is not None:
-            collector = self.outlets.collector(plan)
-            made.collect = ctypes.pointer(native_collect(lowered.collect, programs, collector, self._ids_of_senders()))
-            self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
+            collect = native_collect(lowered.collect, programs, self._ids_of_senders())
+            made.collect = ctypes.pointer(collect)
+            self.states.add_collector(self.outlets, made, collect, plan)
         made.layout, made.sources = programs.layout(), self._names_of_senders()
         return made
 
@@ -52,26 +109,22 @@ class TargetWriter:
         """The targets, without their layout."""
         made = []
         for target in targets:
-            native = self._topic_target(target) if target.is_topic else self._destination(plan, target)
+            native = self._topic_target(target) if target.is_topic else self._destination(target)
             if programs is not None and target.label in lowered:
                 native.condition = programs.code(lowered[target.label].condition)
                 native.message = programs.code(lowered[target.label].message)
             self._complete(native, plan, target)
             made.append(native)
         number = self.outlets.names.number
-        array = (c.Target * len(made))(*made)
         together = c.Targets(
             ttl=plan.ttl or 0,
-            targets=array,
+            targets=(c.Target * len(made))(*made),
             count=len(made),
             route=number(plan.route),
             topic=c.NO_NAME if plan.topic is None else number(plan.topic),
             generation=self.generation,
         )
-        for native, target in zip(array, targets, strict=True):
-            if native.deferral:
-                to = ctypes.addressof(together), ctypes.addressof(native)
-                self.adopted.append(Adoption(native.deferral, target.is_topic, *to))
+        self.states.add(self.outlets, together, plan, targets)
         self.arrays.append(together)
         return together
 
@@ -88,15 +141,8 @@ class TargetWriter:
         if not target.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
         made.period, made.priority = held_period(target), c.Priority[target.priority.name]
-        if (deferral := self.outlets.deferral(plan, target)) is not None:
-            made.deferral = deferral.address
-            self.arrays.append(deferral)
-        if target.max_rate is not None and not made.period:
-            limit = self.outlets.limit(plan, target)
-            made.limit = ctypes.pointer(limit)
-            self.arrays.append(limit)
 
-    def _destination(self, plan: RoutePlan, target: TargetPlan) -> c.Target:
+    def _destination(self, target: TargetPlan) -> c.Target:
         made = c.Target(
             sender=self.outlets.senders[target.label],
             trims=self.program.table.endpoints[target.label].trim_trailing_zeros,
@@ -104,12 +150,6 @@ class TargetWriter:
         if self.outlets.boards is not None:
             made.board = self.outlets.boards.pointer(target.label)
             self.arrays.append(self.outlets.boards)
-        if target.deadmen:
-            feeds = [
-                c.Feed(deadman=deadman, disarms=disarms)
-                for deadman, disarms in self.outlets.feeds(plan.route, target.deadmen)
-            ]
-            made.feeds, made.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
         return made
 
     def _topic_target(self, target: TargetPlan) -> c.Target:

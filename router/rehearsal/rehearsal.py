@@ -128,7 +128,7 @@ class Rehearsal:
         """Raises StartError without a library."""
         self.events: list[Event] = []
         self._stage = Stage(library(), start_ns)
-        self._at = start_ns
+        self._start = self._at = start_ns
         self.ahead = 0
         self._data = b""
         self._stage.adopt(program)
@@ -167,6 +167,12 @@ class Rehearsal:
         self._stage.adopt(program)
         self._series |= _series(program)
         self._read()
+
+    def restart(self) -> None:
+        """Begin again with the present program, as a router that has just started."""
+        self._stage.restart(self._start)
+        self._at, self.ahead, self._data = self._start, 0, b""
+        self.events.clear()
 
     def close(self) -> None:
         """Stop as the router does: end frames, send what waits, and let armed deadmen send last."""

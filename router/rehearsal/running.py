@@ -32,12 +32,15 @@ class Result:
 
 def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) -> list[Result]:
     """Run the tests of a file whose name contains `only`, and record in `coverage` what of the table they touch."""
-    comparison = Comparison(file.checked, file.program)
-    return [_run(test, file.program, comparison, coverage) for test in file.tests if only in test.name]
+    comparison, rehearsal = Comparison(file.checked, file.program), Rehearsal(file.program)
+    return [_run(test, file.program, rehearsal, comparison, coverage) for test in file.tests if only in test.name]
 
 
-def _run(test: TableTest, program: Program, comparison: Comparison, coverage: Coverage | None) -> Result:
-    result, rehearsal = Result(test), Rehearsal(program)
+def _run(
+    test: TableTest, program: Program, rehearsal: Rehearsal, comparison: Comparison, coverage: Coverage | None
+) -> Result:
+    result = Result(test)
+    rehearsal.restart()
     for step in test.steps:
         try:
             outcome = _run_step(step, rehearsal, program)

@@ -159,7 +159,7 @@ class Commanding:
         )
         self.messages = native_from_ros(program, 1, outlets)
         pacers = [Adoption(pacer.address) for pacer in self._deferrals.pacers()]
-        timers = timer_change([*pacers, *self.messages.adopted], ())
+        timers = timer_change([*pacers, *self.messages.states.adopted], ())
         library.timers_change(self.deadmen.address, ctypes.byref(timers))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)

@@ -112,7 +112,8 @@ class Delivering:
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
             collector = NativeCollector(functions, timeout)
             self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
-            collect = native_collect(lowered.collect, programs, collector, range(1 + len(others)))
+            collect = native_collect(lowered.collect, programs, range(1 + len(others)))
+            collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
         self._targets.layout = programs.layout()
         if self._route is not None:

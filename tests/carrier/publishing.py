@@ -106,7 +106,7 @@ class Publishing:
     def _change_topics(self) -> None:
         kinds = NativeCollector, NativeDeferral
         made, left = self._programs[-1], [each for each in self._state.left() if isinstance(each, kinds)]
-        timers = timer_change(made.adopted, [each.address for each in left])
+        timers = timer_change(made.states.adopted, [each.address for each in left])
         made.arrays.append(left)
         self._changes.append(c.PublishChange(timers=timers, generation=made.generation))
         self.thread.change(self._changes[-1])
