@@ -139,23 +139,3 @@ def test_who_does_not_read_its_help_is_no_reason_to_complain(verb: str | None, c
         ["/bin/bash", "-c", script], env=environment, capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stderr) in {(OK, ""), (BROKEN_PIPE, "")}
-
-
-def test_the_first_table_is_good_and_has_passing_tests(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["init", "robot"]) == OK
-    assert "  cd robot\n  router validate && router test\n  router run " in capsys.readouterr().out
-    os.chdir("robot")
-    try:
-        assert main(["validate", "--strict"]) == OK
-        assert main(["test", "--coverage"]) == OK
-        assert main(["schema", "lock"]) == OK
-        assert "0 new numbers" in capsys.readouterr().out
-    finally:
-        os.chdir("..")
-    assert main(["init", "robot"]) == BAD_USAGE
-    assert "robot/routes is there already; nothing was written" in capsys.readouterr().err
-
-
-def test_a_folder_that_cannot_be_made_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["init", "/proc/robot"]) == BAD_USAGE
-    assert capsys.readouterr().err == "router init: /proc/robot cannot be written: No such file or directory\n"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from router.cli import OK, main
 from tests.tables import ROUTES
 
 ROVER = ROUTES / "rover.yaml"
@@ -30,33 +30,3 @@ def test_the_suffix_chooses_what_is_written(
     assert main(["graph", str(ROVER), "-o", str(output)]) == OK
     assert output.read_text(encoding="utf-8").startswith(beginning)
     assert re.fullmatch(rf"{output}: [0-9]+ routes\n", capsys.readouterr().err)
-
-
-def test_without_graphviz_a_picture_is_refused_and_text_is_not(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["graph", str(ROVER), "-o", str(tmp_path / "x.svg")]) == BAD_USAGE
-    assert "an .svg is drawn by Graphviz, which is not installed" in capsys.readouterr().err
-    assert not (tmp_path / "x.svg").exists()
-    assert main(["graph", str(ROVER), "-o", str(tmp_path / "x.dot")]) == OK
-
-
-def test_another_suffix_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["graph", str(ROVER), "-o", "routes.png"])
-    assert ended.value.code == BAD_USAGE
-    assert "'routes.png' does not end in .svg, .mmd, .dot" in capsys.readouterr().err
-
-
-def test_a_wrong_table_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = tmp_path / "table.yaml"
-    table.write_text("version: 2\n")
-    assert main(["graph", str(table), "-o", str(tmp_path / "x.svg")]) == BAD_TABLE
-    assert "error[" in capsys.readouterr().err
-    assert not (tmp_path / "x.svg").exists()
-
-
-def test_a_file_that_cannot_be_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["graph", str(ROVER), "-o", str(tmp_path / "no" / "x.mmd")]) == BAD_USAGE
-    assert "No such file or directory" in capsys.readouterr().err

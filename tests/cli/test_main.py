@@ -47,44 +47,6 @@ def test_every_verb_has_its_module_and_help(verb: str, capsys: pytest.CaptureFix
     assert capsys.readouterr().out.startswith(f"usage: router {verb}")
 
 
-@pytest.mark.parametrize("arguments", [["validate", "--colour"], ["sim", "--for", "5"]])
-def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == BAD_USAGE
-    assert "usage: router" in capsys.readouterr().err
-
-
-def test_an_option_that_a_verb_does_not_have_shows_those_that_it_has(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["record", "--tabel", "routes/sim.yaml"])
-    said = capsys.readouterr().err
-    assert said.startswith("usage: router record")
-    assert "unrecognized arguments: --tabel routes/sim.yaml\nhelp: did you mean '--table'?" in said
-
-
-def test_an_unknown_verb_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["valdate"]) == BAD_USAGE
-    assert capsys.readouterr().err == "router: there is no verb 'valdate'\nhelp: did you mean 'validate'?\n"
-
-
-def test_swapped_letters_are_likelier_than_another_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["tpo"]) == BAD_USAGE
-    assert "did you mean 'top'?" in capsys.readouterr().err
-
-
-def test_options_before_the_verb_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["-t", "routes/sim.yaml", "validate"]) == BAD_USAGE
-    assert capsys.readouterr().err.endswith("\nhelp: options go after the verb: router VERB ...\n")
-
-
-@pytest.mark.parametrize(("words", "begin"), [(["help"], "usage: router VERB"), (["help", "tap"], "usage: router tap")])
-def test_help_is_a_verb_as_well(words: list[str], begin: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(words)
-    assert capsys.readouterr().out.startswith(begin)
-
-
 @pytest.mark.parametrize("verb", ["doctor", "status", "top", "sim"])
 def test_a_table_as_an_argument_of_a_verb_that_takes_none_names_the_option(
     verb: str, capsys: pytest.CaptureFixture[str]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Sequence
 
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from router.cli import NETWORK_FAULT, OK, main
 from router.cli.status import DEGRADED
 from router.observe.health import Kind, Problem
-from tests.ports import free_port
 from tests.tools.answering import answering
 
 SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, " for 8 s", "Check power and cable.")
@@ -47,16 +45,6 @@ def test_scripts_get_the_kind_of_each_problem_and_where_to_read_on(capsys: pytes
     assert (said["state"], said["received"]) == ("degraded", 7)
     assert (found["kind"], found["level"], found["words"]) == ("EndpointSilent", "warning", "arm_board is silent")
     assert found["page"] == "docs/troubleshooting/alerts.md#endpointsilent"
-
-
-def test_where_none_runs_that_is_the_answer(capsys: pytest.CaptureFixture[str]) -> None:
-    url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
-    assert main(["status", "--url", url]) == NETWORK_FAULT
-    assert capsys.readouterr().out.startswith(f"down: no router answers at {url}: ")
-    assert main(["status", "--url", url, "--json"]) == NETWORK_FAULT
-    told = json.loads(capsys.readouterr().out)
-    assert (told["state"], told["url"], told["received"]) == ("down", url, None)
-    assert told["problems"][0]["kind"] == "RouterDown"
 
 
 def test_something_else_at_the_address_is_no_router(capsys: pytest.CaptureFixture[str]) -> None:

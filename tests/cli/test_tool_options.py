@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 from rich.progress import ProgressColumn, TextColumn
 
-from router.cli import main
-from router.cli.tool_options import add_table, factor, hertz, named_table, progress, seconds, speed, table_path
-from router.errors import UsageError
+from router.cli.tool_options import add_table, hertz, progress, seconds, speed, table_path
 
 
 def parsed(*words: str) -> argparse.Namespace:
@@ -43,15 +41,6 @@ def test_the_table_is_typed_or_of_the_environment_or_the_default(
     assert table_path(parsed(*words)) == Path(table)
 
 
-def test_two_tables_and_none_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("ROUTER_TABLE", raising=False)
-    with pytest.raises(UsageError, match=r"the table is a\.yaml or, by --table, b\.yaml; name one"):
-        named_table(parsed("a.yaml", "-t", "b.yaml"))
-    with pytest.raises(UsageError, match=r"no routes/rover\.yaml here; name a table by -t .* `router init DIR`"):
-        table_path(parsed())
-
-
 @pytest.mark.parametrize(
     ("parse", "text", "value"),
     [
@@ -66,38 +55,6 @@ def test_two_tables_and_none_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_pa
 )
 def test_numbers_have_units(parse: Callable[[str], float], text: str, value: float) -> None:
     assert parse(text) == value
-
-
-@pytest.mark.parametrize(
-    ("parse", "texts"),
-    [(seconds, ("", "10 parsecs")), (hertz, ("20/s",)), (speed, ("x", "2xx", "1e9x", "fast")), (factor, ("max",))],
-)
-def test_other_texts_are_refused(parse: Callable[[str], float], texts: tuple[str, ...]) -> None:
-    for text in texts:
-        with pytest.raises(argparse.ArgumentTypeError):
-            parse(text)
-
-
-@pytest.mark.parametrize(("parse", "meant"), [(seconds, "10s"), (hertz, "10Hz"), (speed, "10x")])
-def test_a_number_without_its_unit_gets_a_suggestion(parse: Callable[[str], float], meant: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match=rf"^'10' has no unit\nhelp: did you mean '{meant}'\?$"):
-        parse("10")
-
-
-@pytest.mark.parametrize(
-    "words", ["tap --for 0s", "tap --for -1s", "send imu_info --to rover --rate -5Hz", "replay it.mcap --speed -1x"]
-)
-def test_what_is_not_above_zero_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(words.split())
-    assert f"'{words.rpartition(' ')[2]}' is not above zero\n" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", ["tap --count x", "sim --seed x", "new Dose --board arm --number x"])
-def test_what_is_counted_is_a_whole_number(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(words.split())
-    assert "'x' is not a whole number\n" in capsys.readouterr().err
 
 
 class Terminal(io.StringIO):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import pty
 import re
-import socket
 import struct
 import subprocess
 import sys
@@ -18,8 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_TABLE, OK, main
-from tests.ports import free_port
+from router.cli import OK, main
 from tests.readable import readable
 from tests.tools.answering import answering
 
@@ -58,27 +55,6 @@ def test_the_address_is_that_of_the_table(
     table.write_text(f"version: 1\nextends: {BASE}\nhttp: {{address: {address}}}\n{more}")
     assert main(["top", "-t", str(table), "--once", "--interval", "10ms"]) == OK
     assert "imu_info" in capsys.readouterr().out
-
-
-def test_where_there_is_no_table_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "-t", str(tmp_path / "gone.yaml")]) == BAD_TABLE
-    assert "gone.yaml:1:1: error[bad-file]" in capsys.readouterr().err
-
-
-def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
-    assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\nhelp: .*\n", capsys.readouterr().err)
-
-
-def test_programs_are_told_that_nobody_is_there_as_by_status(capsys: pytest.CaptureFixture[str]) -> None:
-    url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
-    assert main(["top", "--json", "--url", url]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert (told["state"], told["url"]) == ("down", url)
-    assert told["problems"][0]["words"] == f"no router answers at {url}"
-    assert main(["reload", "--json", "--url", f"{url} "]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert (told["ok"], told["text"]) == (False, f"no router answers at {url}: Connection refused")
 
 
 @pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])

@@ -20,7 +20,7 @@ from router.tools.recordings import TapRecording, on_time
 from tests.ports import free_port
 from tests.recording.recorder_rig import MILLISECOND, START, again, imu, read, recorded, seen, wire
 from tests.recording.recorder_rig import table as rig_table
-from tests.tables import PROTOS, RIG
+from tests.tables import PROTOS
 
 BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
 ELSEWHERE = ("198.51.100.7", 5000)
@@ -193,18 +193,3 @@ def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot write .*: No such file or directory"):
         recording(tmp_path / "nowhere" / "it.mcap")
-
-
-@pytest.mark.parametrize("words", [[], ["--last"]])
-def test_a_router_that_does_not_run_is_told(
-    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(RIG)
-    url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
-    assert main(["record", *words, "--url", url]) == 1
-    assert f"router record: no router answers at {url}" in capsys.readouterr().err
-
-
-def test_the_last_minute_goes_where_the_router_says(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["record", "--last", "-o", "it.mcap"]) == 2
-    assert "--last writes to the directory of the table's 'record'" in capsys.readouterr().err

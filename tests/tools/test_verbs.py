@@ -66,31 +66,6 @@ def test_send_goes_from_endpoint_to_listener_and_says_when_the_router_will_not_t
         assert "the table takes plain from station only\nhelp: add --from station" in capsys.readouterr().err
 
 
-def test_send_notices_that_nobody_listens(
-    receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    nobody = place(receiver)
-    receiver.close()
-    assert main(["send", "plain", "--to", nobody, "--protos", str(protos)]) == 1
-    assert capsys.readouterr().err == f"router send: nobody listens at {nobody}\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (["plian"], "PBEnvelope has no payload case 'plian'\nhelp: did you mean 'plain'?"),
-        (["plain", "valu=1"], "Plain has no field 'valu'\nhelp: did you mean 'value'?"),
-        (["plain", "--pad", "1"], "the datagram has 2 bytes and cannot be padded to 1"),
-        (["plain", "--from", "192.0.2.1"], "--from: cannot bind 192.0.2.1:0: this machine has no such address"),
-    ],
-)
-def test_a_mistake_in_send_is_said_and_ends_with_2(
-    words: list[str], complaint: str, protos: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["send", *words, "--to", "127.0.0.1:9", "--protos", str(protos)]) == 2
-    assert capsys.readouterr().err == f"router send: {complaint}\n"
-
-
 def test_listen_prints_the_envelopes_that_arrive(table_path: Callable[..., Path]) -> None:
     path = table_path()
     station = read_table(path).endpoints["station"].address.value
@@ -148,11 +123,6 @@ def test_listen_that_waits_for_a_topic_ends_with_a_signal(number: signal.Signals
     assert (tap.returncode, out, err) == (0, "", "")
 
 
-def test_listen_waits_for_a_topic_no_longer_than_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["listen", "topic://nobody_publishes_this", "--for", "300ms"]) == 1
-    assert "router listen: topic 'nobody_publishes_this' has no publisher\n" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_send_that_is_ended_by_a_signal_says_what_was_sent(number: signal.Signals, protos: Path) -> None:
     words = ["plain", "--rate", "50Hz", "--protos", str(protos)]
@@ -167,35 +137,6 @@ def test_send_that_is_ended_by_a_signal_says_what_was_sent(number: signal.Signal
             sending.send_signal(number)
             out, _ = sending.communicate(timeout=60)
     assert (sending.returncode, out.startswith(f"sent plain to {to}")) == (0, True)
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (
-            ["ftp://x"],
-            "there are no places ftp://\nhelp: there are udp://, tcp://, ws://, zenoh://, envelope://, topic://",
-        ),
-        (["topic://"], "topic:// names no topic"),
-        (
-            ["topic://t", "--type", "Point"],
-            "'Point' is no message type\nhelp: they are written like std_msgs/msg/String",
-        ),
-        (["topic://t", "--type", "no/msg/Such"], "no/msg/Such is not installed"),
-        (["topic://no topic", "--type", "std_msgs/msg/String"], "topic 'no topic' cannot be listened to: "),
-        (["envelope://5000", "--type", "std_msgs/msg/String"], "--type belongs to topic://"),
-        (["topic://t", "--topic", "/t"], "--topic belongs to udp://, tcp://, ws://, zenoh://"),
-        (
-            ["5000"],
-            "'5000' does not say what it is: udp://5000 is where a gateway sends to, envelope://5000 where a router",
-        ),
-    ],
-)
-def test_a_mistake_in_listen_is_said_and_ends_with_2(
-    words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["listen", *words]) == 2
-    assert f"router listen: {complaint}" in capsys.readouterr().err
 
 
 def test_listening_to_a_topic_without_ros_says_what_is_missing() -> None:
@@ -251,13 +192,3 @@ def test_sim_tells_when_a_board_stops_and_what_it_cannot_read(table_path: Callab
     assert obeyed.endswith(" s: board obeys commands\n")
     assert " s: board no commands for 1." in stopped
     assert "received 1, undecodable 1" in last
-
-
-def test_what_sim_cannot_use_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", "--silent", "basestation"]) == 2
-    complaint = "'basestation' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-"
-    assert capsys.readouterr().err == f"router sim: {complaint}\n"
-    path = tmp_path / "bad.yaml"
-    path.write_text("version: 1\nlisten: 5\n")
-    assert main(["sim", "-t", str(path)]) == 78
-    assert "error[" in capsys.readouterr().err
