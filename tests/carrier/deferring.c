@@ -1,6 +1,7 @@
 /* Deferrals and pacers without threads, sockets and clocks: what would leave is written down. A library of its own, which
  * uses that of the carrier. */
 #include "defer.h"
+#include "earliest.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -81,7 +82,7 @@ struct deferring *seam_open(void) {
     if (!made) abort();
     open_stage(made, &made->offering);
     open_stage(made, &made->sending);
-    made->timers = timers_open_on(&made->sending);
+    made->timers = timers_open_on(&made->sending, false);
     if (!made->timers) abort();
     made->offering.timers = made->sending.timers = made->timers;
     made->to.targets = made->targets;
@@ -128,7 +129,7 @@ void seam_set(struct deferring *of, int64_t now, int error) {
 
 void seam_serve(struct deferring *of, int64_t now) { timers_serve(of->timers, now); }
 
-int64_t seam_next_due(struct deferring *of) { return of->timers->next_due; }
+int64_t seam_next_due(struct deferring *of) { return earliest(of->timers); }
 
 int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which) {
     return of->counters[number * COUNTERS + which];
