@@ -95,6 +95,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
     int64_t period = target->period;
     if (period != deferral->limit.period) {
         release(timers, deferral, timers->stage->now(timers->stage));
+        if (timers->is_left) return;
         deferral->limit = (struct limit){period, period - period / 2, -period};
     }
     deferral->of = (struct route_target){to, target};
@@ -104,6 +105,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deferral *deferral = (struct deferral *)timer;
     release(timers, deferral, now);
+    if (timers->is_left) return;
     deferral->has_ended = true;
     if (deferral->pacer) pacer_release(timers, deferral->pacer, &deferral->of, now);
     timers_remove(timers, timer);

@@ -116,7 +116,7 @@ static void end_all(struct timers *timers, bool are_deadmen, int64_t now) {
 
 void timers_serve(struct timers *timers, int64_t now) {
     pthread_mutex_lock(&timers->lock);
-    for (struct timer *each = timers->first; each; each = each->next)
+    for (struct timer *each = timers->first; each; each = timers->is_left ? NULL : each->next)
         if (each->due <= now) each->kind->serve(timers, each, now);
     if (!timers->is_left) timers_await_next(timers);
     pthread_mutex_unlock(&timers->lock);
