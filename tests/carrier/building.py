@@ -6,7 +6,7 @@ import ctypes
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
-from ctypes import c_int, c_int64, c_void_p
+from ctypes import c_bool, c_int, c_int64, c_void_p
 from pathlib import Path
 
 import pytest
@@ -19,12 +19,13 @@ RACES = "thread"
 
 
 _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+    "seam_hide": (None, (c_void_p, c_bool)),
     "seam_lock": (None, (c_void_p,)),
     "seam_next_due": (c_int64, (c_void_p,)),
     "seam_refuse": (None, (c_void_p, c_int)),
     "seam_timer": (c_int, (c_void_p,)),
-    "seam_timer_set_for": (c_int64, (c_void_p,)),
     "seam_unlock": (None, (c_void_p,)),
+    "seam_wakes_at": (c_int64, (c_void_p,)),
 }
 
 

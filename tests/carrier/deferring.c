@@ -1,10 +1,13 @@
 /* Deferrals and pacers without threads, sockets and clocks: what would leave is written down. A library of its own, which
  * uses that of the carrier. */
 #include "defer.h"
+#include "earliest.h"
 
+#include <malloc.h>
 #include <stdlib.h>
 #include <string.h>
 
+enum { GONE = 0xa5 }; /* bytes of what nothing may use any more */
 enum { MOST_TARGETS = 256, COUNTERS = 32 };
 
 /* What has left, or would have if it had not been refused. The bytes follow. */
@@ -25,6 +28,7 @@ struct deferring {
     struct output notes;
     int64_t now;
     int error; /* that sending returns */
+    bool is_given_up; /* the thread is when it publishes next */
 };
 
 struct deferring *seam_open(void);
@@ -36,6 +40,20 @@ void seam_adopt(struct deferring *of, struct timer *timer, uint32_t number);
 void seam_end(struct deferring *of, struct timer *timer);
 void seam_end_all(struct deferring *of);
 void seam_set(struct deferring *of, int64_t now, int error);
+void seam_give_up(struct deferring *of);
+bool seam_is_untouched(struct deferring *of);
+void seam_give_up(struct deferring *of) { of->is_given_up = true; }
+
+/* Whether nobody has used a deferral since. */
+bool seam_is_untouched(struct deferring *of) {
+    for (uint32_t number = 0; number < of->to.count; number++) {
+        const uint8_t *deferral = (const uint8_t *)of->targets[number].deferral;
+        for (size_t at = 0; at < malloc_usable_size((void *)of->targets[number].deferral); at++)
+            if (deferral[at] != GONE) return false;
+    }
+    return true;
+}
+
 void seam_serve(struct deferring *of, int64_t now);
 int64_t seam_next_due(struct deferring *of);
 int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which);
@@ -64,8 +82,20 @@ static int send_noted(struct stage *stage, const struct target *target, const ui
     return opened->now > expires ? COMMAND_STALE : note(target, data, size);
 }
 
+/* As the thread is given up in the middleware: the owner of what it serves frees that. */
+static void give_up(void) {
+    for (uint32_t number = 0; number < opened->to.count; number++) {
+        struct deferral *deferral = opened->targets[number].deferral;
+        memset(deferral, GONE, malloc_usable_size(deferral));
+    }
+}
+
 static enum publication publish_noted(struct stage *stage, const struct target *target, const char **why) {
     *why = "refused";
+    if (opened->is_given_up) {
+        give_up();
+        return LEFT;
+    }
     return note(target, stage->machine.output.data, stage->machine.output.size) ? PUBLISH_FAILED : PUBLISHED;
 }
 
@@ -81,7 +111,7 @@ struct deferring *seam_open(void) {
     if (!made) abort();
     open_stage(made, &made->offering);
     open_stage(made, &made->sending);
-    made->timers = timers_open_on(&made->sending);
+    made->timers = timers_open_on(&made->sending, false);
     if (!made->timers) abort();
     made->offering.timers = made->sending.timers = made->timers;
     made->to.targets = made->targets;
@@ -128,7 +158,7 @@ void seam_set(struct deferring *of, int64_t now, int error) {
 
 void seam_serve(struct deferring *of, int64_t now) { timers_serve(of->timers, now); }
 
-int64_t seam_next_due(struct deferring *of) { return of->timers->next_due; }
+int64_t seam_next_due(struct deferring *of) { return earliest(of->timers); }
 
 int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which) {
     return of->counters[number * COUNTERS + which];

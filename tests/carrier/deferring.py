@@ -31,6 +31,8 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_end": (None, (c_void_p, c_void_p)),
     "seam_end_all": (None, (c_void_p,)),
     "seam_set": (None, (c_void_p, c_int64, c_int)),
+    "seam_give_up": (None, (c_void_p,)),
+    "seam_is_untouched": (c_bool, (c_void_p,)),
     "seam_serve": (None, (c_void_p, c_int64)),
     "seam_next_due": (c_int64, (c_void_p,)),
     "seam_count": (c_int64, (c_void_p, c_uint32, c_uint32)),
@@ -105,6 +107,17 @@ class Deferring:
         """Have sending return this errno from now on, 0 for none."""
         self._error = error
         self.set(self.now)
+
+    def give_up(self) -> None:
+        """Have the thread be given up when it publishes next: its deferrals are freed then."""
+        self._functions.seam_give_up(self._address)
+
+    @property
+    def is_untouched(self) -> bool:
+        """Whether deferrals that are freed so have not been used since. They are not closed any more."""
+        for deferral in self._deferrals:
+            deferral.address = 0
+        return bool(self._functions.seam_is_untouched(self._address))
 
     def serve(self) -> None:
         self._functions.seam_serve(self._address, self.now)

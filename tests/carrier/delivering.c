@@ -2,8 +2,8 @@
  * own, which uses that of the carrier. */
 #define deliver_to_all note_all
 #include "collect.h"
+#include "earliest.h"
 #include "route_ros.c"
-#include "timers.h"
 #undef deliver_to_all
 
 enum { DELIVERED = -1, FILTERED_OUT = -2 };
@@ -89,7 +89,7 @@ struct delivering *seam_open(counter *counters) {
     struct delivering *made = calloc(1, sizeof *made);
     if (!made) return NULL;
     struct stage *stage = &made->routing.stage;
-    struct timers *timers = timers_open_on(stage);
+    struct timers *timers = timers_open_on(stage, false);
     if (!timers || !stage_open(stage, counters, ring_open(1 << 16), timers)) abort();
     stage->now = now_of;
     stage->send = note_sent;
@@ -174,7 +174,7 @@ int64_t seam_serve(struct delivering *of, int64_t now) {
     of->now = now;
     timers_serve(of->routing.stage.timers, now);
     keep_losses(of);
-    return of->routing.stage.timers->next_due;
+    return earliest(of->routing.stage.timers);
 }
 
 /* Serve a message from ROS, likewise. */

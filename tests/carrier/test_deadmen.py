@@ -162,8 +162,8 @@ class NativeSide:
         return int(self._seams.seam_next_due(self.deadmen.address))
 
     @property
-    def timer_set_for(self) -> int:
-        return int(self._seams.seam_timer_set_for(self.deadmen.address))
+    def wakes_at(self) -> int:
+        return int(self._seams.seam_wakes_at(self.deadmen.address))
 
     def taken(self) -> list[tuple[str, bytes]]:
         """What was sent since the last call, by endpoint."""
@@ -232,7 +232,7 @@ class Comparison:
         assert self._native.taken() == sorted(sent, key=lambda each: [*PAYLOADS].index(each[0]))
         assert self._native.events() == events
         assert self._native.next_due == (NEVER if self._plain.next_due is None else self._plain.next_due)
-        assert self._native.timer_set_for <= self._native.next_due
+        assert self._native.wakes_at <= self._native.next_due
         for (metric, *labels), count in self._plain.counts.items():
             index = self._counters.index(f"deadman_{metric}", *labels)
             assert self._native.counts[index] == count
@@ -416,12 +416,12 @@ def test_commands_leave_the_timer_alone_and_it_wakes_whoever_waits(
 ) -> None:
     command = side.commander(outlet, [(side.add(open_plan(20 * MS)), False)])
     command(b"drive", None)
-    set_for = side.timer_set_for
+    wakes_at = side.wakes_at
     for _ in range(100):
         command(b"drive", None)
-        assert side.timer_set_for == set_for
+        assert side.wakes_at == wakes_at
     due = side.next_due
-    assert due > set_for
+    assert due > wakes_at
     timer = seams.seam_timer(side.deadmen.address)
     tripped = False
     while not tripped:
@@ -430,7 +430,25 @@ def test_commands_leave_the_timer_alone_and_it_wakes_whoever_waits(
         side.serve(now)
         tripped = ("tripped", "drive", "", 0) in side.events()
         assert tripped == (now >= due)
-    assert side.timer_set_for == side.next_due
+    assert side.wakes_at == side.next_due
+
+
+def test_a_command_costs_the_same_however_many_deadmen_there_are(side: NativeSide, seams: ctypes.CDLL) -> None:
+    """Sending it looks at no other deadman, nor does replacing its deadman and removing the earlier one."""
+    deadmen = [side.add(open_plan(timeout=500 + index)) for index in range(1000)]
+    later = side.add(open_plan(timeout=400))
+    for now, deadman in enumerate(deadmen):
+        side.command(now, [(deadman, False)], b"drive")
+    seams.seam_hide(side.deadmen.address, True)
+    try:
+        side.command(1000, [(deadmen[-1], False), (deadmen[0], True)], b"drive")
+        side.replace(later, deadmen[-1])
+        side.command(1001, [(later, False)], b"drive")
+    finally:
+        seams.seam_hide(side.deadmen.address, False)
+    assert side.wakes_at == 500
+    side.serve(500)
+    assert side.wakes_at == side.next_due == 502
 
 
 def test_the_timer_is_set_for_an_earlier_deadline(side: NativeSide) -> None:
@@ -438,7 +456,7 @@ def test_the_timer_is_set_for_an_earlier_deadline(side: NativeSide) -> None:
     seen = []
     for deadman in (slow, fast, slow):
         side.command(0, [(deadman, False)], b"drive")
-        seen.append(side.timer_set_for)
+        seen.append(side.wakes_at)
     assert seen == [900, 100, 100]
 
 

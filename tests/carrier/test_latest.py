@@ -129,6 +129,30 @@ def test_after_the_end_everything_passes_at_once(held: Held) -> None:
     assert held.deferring.next_due is None
 
 
+@pytest.mark.parametrize("happens", ["is due", "ends", "gets another rate", "all end"])
+def test_a_thread_that_is_given_up_in_the_middleware_uses_no_deferral_any_more(
+    library: ctypes.CDLL, deferring: ctypes.CDLL, happens: str
+) -> None:
+    """Its owner frees them."""
+    group = Deferring(library, deferring)
+    targets = [group.target(10, is_topic=True) for _ in range(3)]
+    for target in targets * 2:
+        group.offer(target, b"", is_written=True)
+    group.give_up()
+    group.set(NS)
+    match happens:
+        case "is due":
+            group.serve()
+        case "ends":
+            group.end(targets[1])
+        case "gets another rate":
+            group.change(targets[1], 5)
+        case _:
+            group.end_all()
+    assert group.is_untouched
+    group.close()
+
+
 def test_what_is_held_goes_along_to_the_next_program(held: Held) -> None:
     held.offer(0, 0)
     held.offer(10 * MS, 1)

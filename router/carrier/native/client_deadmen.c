@@ -131,7 +131,7 @@ struct client_deadmen *client_deadmen_open(counter *counters, struct ring *event
     bool is_open = stage_open(&of->stage, counters, events, NULL);
     of->stage.brake = keep_message;
     of->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-    of->group = is_open && of->wake >= 0 ? timers_open_on(&of->stage) : NULL;
+    of->group = is_open && of->wake >= 0 ? timers_open_on(&of->stage, true) : NULL;
     condition_open(&of->changed);
     if (of->group) return of;
     pthread_cond_destroy(&of->changed);

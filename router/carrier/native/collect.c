@@ -256,7 +256,8 @@ static void close_oldest(struct collector *collector, int64_t now) {
 }
 
 static void set_due(struct collector *collector) {
-    collector->timer.due = collector->open ? collector->order[0]->ends_at : NEVER;
+    int64_t due = collector->open ? collector->order[0]->ends_at : NEVER;
+    timer_set_due(collector->timers, &collector->timer, due);
 }
 
 static void end_what_is_due(struct collector *collector, int64_t now) {
@@ -406,7 +407,6 @@ static struct frame *take(struct timers *timers, struct collector *collector, co
     if (part->count > MOST_PARTS) lose_large(collector, part->count, message->now);
     else complete = offer(collector, part, message->datagram, message->now);
     set_due(collector);
-    timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
     return complete;
 }

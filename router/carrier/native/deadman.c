@@ -16,6 +16,7 @@ static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 5
 struct deadman {
     struct timer timer;      /* not due while it is unarmed, unless it starts again, and once it is replaced */
     struct deadman *acting;  /* the deadman that has replaced it, with no other one between; or itself */
+    struct deadman *fellow;  /* the next one for which the same one acts, in a circle */
     int64_t timeout, repeat; /* ns */
     bool is_armed;           /* or tripped: it sends when it ends */
     bool has_tripped;
@@ -83,24 +84,24 @@ static void release(struct timers *timers, struct deadman *deadman) {
 static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
     struct deadman *deadman = feed->deadman->acting;
     deadman->is_armed = !feed->disarms;
-    deadman->timer.due = feed->disarms ? NEVER : now + deadman->timeout;
+    timer_set_due(timers, &deadman->timer, feed->disarms ? NEVER : now + deadman->timeout);
     release(timers, deadman);
 }
 
 /* A command has left, and the board is said to have refused an earlier one. Nobody knows whether it obeys this one, and the
  * ICMP message may be forged: so the deadman is armed, and nothing is put off. */
-static void arm_one(const struct feed *feed, int64_t now) {
+static void arm_one(struct timers *timers, const struct feed *feed, int64_t now) {
     struct deadman *deadman = feed->deadman->acting;
     if (feed->disarms || deadman->is_armed) return;
     deadman->is_armed = true;
-    deadman->timer.due = now + deadman->timeout;
+    timer_set_due(timers, &deadman->timer, now + deadman->timeout);
 }
 
 /* Send what is sent when the router starts. A network that is not there yet keeps it back: then do so again. */
 static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t now) {
     uint64_t reached = send_all(timers, deadman);
     int64_t again = deadman->is_kept_back ? now + START_AGAIN : NEVER;
-    deadman->timer.due = again < deadman->greets_again ? again : deadman->greets_again;
+    timer_set_due(timers, &deadman->timer, again < deadman->greets_again ? again : deadman->greets_again);
     deadman->greets_again = NEVER;
     return reached;
 }
@@ -111,7 +112,7 @@ static void end(struct timers *timers, struct timer *timer, int64_t now) {
     (void)now;
     bool was_armed = deadman->is_armed;
     deadman->is_armed = false;
-    deadman->timer.due = NEVER;
+    timer_set_due(timers, timer, NEVER);
     deadman->greets_until = 0;
     if (was_armed) send_all(timers, deadman);
 }
@@ -127,7 +128,7 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
         return;
     }
     /* Repetitions that a stalled process has missed are left out. */
-    deadman->timer.due += deadman->repeat * ((now - deadman->timer.due) / deadman->repeat + 1);
+    timer_set_due(timers, timer, timer->due + deadman->repeat * ((now - timer->due) / deadman->repeat + 1));
     if (deadman->has_tripped) {
         send_all(timers, deadman);
         return;
@@ -156,23 +157,29 @@ static void keep_others_than(struct deadman *deadman, const struct deadman *next
     deadman->count = kept;
 }
 
+static void leave_fellows(struct deadman *deadman) {
+    struct deadman *before = deadman;
+    while (before->fellow != deadman) before = before->fellow;
+    before->fellow = deadman->fellow;
+    deadman->fellow = deadman;
+}
+
 /* Let `next` act for `earlier` and for all that this one has replaced. */
-static void redirect(struct timers *timers, struct deadman *next, const struct deadman *earlier) {
-    const struct deadman *acting = earlier->acting;
-    for (struct timer *each = timers->first; each; each = each->next) {
-        struct deadman *deadman = (struct deadman *)each;
-        if (each->kind == &DEADMAN && deadman->acting == acting) deadman->acting = next;
-    }
+static void redirect(struct deadman *next, struct deadman *earlier) {
+    leave_fellows(next);
+    next->fellow = earlier->fellow;
+    earlier->fellow = next;
     next->acting = next;
+    for (struct deadman *each = next->fellow; each != next; each = each->fellow) each->acting = next;
 }
 
 /* Deadline and state pass to `next`, unless a later command has fed it already. */
 static void take_over(struct timers *timers, struct deadman *next, struct deadman *earlier) {
-    redirect(timers, next, earlier);
+    redirect(next, earlier);
     keep_others_than(earlier, next);
     next->greets_until = next->starts ? earlier->greets_until : 0;
     int64_t due = earlier->timer.due;
-    earlier->timer.due = NEVER;
+    timer_set_due(timers, &earlier->timer, NEVER);
     if (due == NEVER) return;
     if (next->is_armed) {
         release(timers, earlier);
@@ -180,13 +187,14 @@ static void take_over(struct timers *timers, struct deadman *next, struct deadma
     }
     if (!earlier->is_armed) {
         if (!next->starts) return;
-        next->timer.due = due;
+        timer_set_due(timers, &next->timer, due);
         next->greets_again = earlier->greets_again;
         return;
     }
     next->is_armed = true;
     next->has_tripped = earlier->has_tripped;
-    next->timer.due = due + (next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout);
+    due += next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout;
+    timer_set_due(timers, &next->timer, due);
 }
 
 /* ---- public ---- */
@@ -201,6 +209,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER}, .acting = deadman, .timeout = timeout,
                                 .repeat = repeat, .starts = starts, .active = active, .trips = trips, .id = id,
                                 .count = count, .greets_again = NEVER};
+    deadman->fellow = deadman;
     uint8_t *copy = (uint8_t *)&deadman->destinations[count];
     for (uint32_t index = 0; index < count; index++) {
         deadman->destinations[index] = destinations[index];
@@ -216,6 +225,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
 void deadman_close(struct timers *timers, struct deadman *deadman) {
     pthread_mutex_lock(&timers->lock);
     timers_remove(timers, &deadman->timer);
+    leave_fellows(deadman);
     pthread_mutex_unlock(&timers->lock);
     free(deadman);
 }
@@ -224,7 +234,6 @@ uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t n
     if (!deadman->starts) return 0;
     pthread_mutex_lock(&timers->lock);
     uint64_t reached = start(timers, deadman, now);
-    timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
     return reached;
 }
@@ -239,9 +248,8 @@ bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now) 
     pthread_mutex_lock(&timers->lock);
     bool greets = now < deadman->greets_until && !deadman->is_armed;
     if (greets) {
-        deadman->timer.due = now;
+        timer_set_due(timers, &deadman->timer, now);
         deadman->greets_again = now + GREETING;
-        timers_note_due(timers);
     }
     pthread_mutex_unlock(&timers->lock);
     return greets;
@@ -250,16 +258,14 @@ bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now) 
 void deadman_replace(struct timers *timers, struct deadman *next, struct deadman *earlier) {
     pthread_mutex_lock(&timers->lock);
     take_over(timers, next, earlier);
-    timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 
 void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now) {
     for (uint32_t index = 0; index < count; index++) {
-        if (refused) arm_one(&feeds[index], now);
+        if (refused) arm_one(timers, &feeds[index], now);
         else feed_one(timers, &feeds[index], now);
     }
-    timers_note_due(timers);
 }
 
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
@@ -272,9 +278,8 @@ void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
 void deadman_schedule_end(struct timers *timers, struct timer *timer) {
     struct deadman *deadman = (struct deadman *)timer;
     deadman->is_ending = deadman->is_armed;
-    deadman->timer.due = deadman->is_armed ? 0 : NEVER;
+    timer_set_due(timers, timer, deadman->is_armed ? 0 : NEVER);
     deadman->greets_until = 0;
-    timers_note_due(timers);
 }
 
 void deadman_end_by_thread(struct timers *timers, struct deadman *deadman) {
@@ -297,8 +302,7 @@ void deadman_settle(struct timers *timers, struct timer *timer, const struct dea
     report_error(timers, deadman, to, 0, why);
     deadman = deadman->acting;
     if (deadman->is_armed || now >= deadman->greets_until || deadman->timer.due <= now + START_AGAIN) return;
-    deadman->timer.due = now + START_AGAIN;
-    timers_note_due(timers);
+    timer_set_due(timers, &deadman->timer, now + START_AGAIN);
 }
 
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,

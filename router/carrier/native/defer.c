@@ -35,9 +35,9 @@ static void exchange(struct output *one, struct output *other) {
     *other = kept;
 }
 
-static void forget(struct deferral *deferral) {
+static void forget(struct timers *timers, struct deferral *deferral) {
     deferral->is_held = false;
-    deferral->timer.due = NEVER;
+    timer_set_due(timers, &deferral->timer, NEVER);
 }
 
 /* Keep a message until it may pass. What the machine has written is not copied. */
@@ -52,13 +52,13 @@ static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *
     }
     deferral->is_held = true;
     deferral->expires = expires;
-    deferral->timer.due = deferral->limit.next_pass;
+    timer_set_due(stage->timers, &deferral->timer, deferral->limit.next_pass);
 }
 
 /* Deliver what is held, unless it has expired. */
 static void release(struct timers *timers, struct deferral *deferral, int64_t now) {
     if (!deferral->is_held) return;
-    forget(deferral);
+    forget(timers, deferral);
     if (now > deferral->expires) {
         lose_stale(timers->stage, deferral->of.to, deferral->of.target, now);
         return;
@@ -75,7 +75,7 @@ static void offer(struct stage *stage, struct deferral *deferral, const uint8_t 
                   int64_t now) {
     if (deferral->is_held) stage_count(stage->timers->stage, deferral->of.target->dropped[LOSS_RATE_LIMITED], 1);
     if (limit_passes(&deferral->limit, now)) {
-        forget(deferral);
+        forget(stage->timers, deferral);
         pass_on(stage->timers, deferral, data, size, expires, now);
     } else {
         hold(stage, deferral, data, size, expires);
@@ -95,6 +95,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
     int64_t period = target->period;
     if (period != deferral->limit.period) {
         release(timers, deferral, timers->stage->now(timers->stage));
+        if (timers->is_left) return;
         deferral->limit = (struct limit){period, period - period / 2, -period};
     }
     deferral->of = (struct route_target){to, target};
@@ -104,6 +105,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deferral *deferral = (struct deferral *)timer;
     release(timers, deferral, now);
+    if (timers->is_left) return;
     deferral->has_ended = true;
     if (deferral->pacer) pacer_release(timers, deferral->pacer, &deferral->of, now);
     timers_remove(timers, timer);
@@ -119,7 +121,6 @@ bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, 
     if (deferral->limit.period && !deferral->has_ended) offer(stage, deferral, data, size, expires, now);
     else pass_on(timers, deferral, data, size, expires, now);
     bool goes_on = !timers->is_left;
-    if (goes_on) timers_note_due(timers);
     pthread_mutex_unlock(&timers->lock);
     return goes_on;
 }

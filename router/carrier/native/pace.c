@@ -118,22 +118,22 @@ static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *
     return true;
 }
 
-static void send_affordable(struct timers *timers, struct pacer *pacer, int64_t now) {
-    pacer->timer.due = NEVER;
+/* Send what the budget is enough for. Return when to go on, or NEVER if nothing waits any more. */
+static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64_t now) {
     for (int index = 0; index < PRIORITIES; index++) {
         struct lane *lane = &pacer->lanes[index];
         while (lane->count) {
             const struct waiting_datagram *first = first_of(lane);
             int64_t may_go_at = pacer->paid_at + (index == PRIORITY_COMMAND ? -pacer->overdraft : first->cost);
             if (now < may_go_at && now <= first->expires) {
-                pacer->timer.due = may_go_at + BURST / 2; /* later than necessary: one call then sends several */
+                int64_t due = may_go_at + BURST / 2; /* later than necessary: one call then sends several */
                 /* One that has expired no longer counts in the savings. */
-                if (first->expires != NEVER && first->expires + 1 < pacer->timer.due) pacer->timer.due = first->expires + 1;
-                return;
+                return first->expires != NEVER && first->expires + 1 < due ? first->expires + 1 : due;
             }
             if (!send_first(timers, pacer, lane, now)) limit_savings(pacer, now);
         }
     }
+    return NEVER;
 }
 
 static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
@@ -148,7 +148,7 @@ static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
 static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     struct pacer *pacer = (struct pacer *)timer;
     limit_savings(pacer, now);
-    send_affordable(timers, pacer, now);
+    timer_set_due(timers, timer, send_affordable(timers, pacer, now));
 }
 
 static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
@@ -160,7 +160,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct pacer *pacer = (struct pacer *)timer;
     pacer->has_ended = true;
-    timer->due = NEVER;
+    timer_set_due(timers, timer, NEVER);
     for (int index = 0; index < PRIORITIES; index++)
         while (pacer->lanes[index].count) send_first(timers, pacer, &pacer->lanes[index], now);
     timers_remove(timers, timer);
@@ -181,7 +181,7 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_
     put(&pacer->lanes[of->target->priority], &waiting, data);
     pacer->bytes_left -= (int64_t)size;
     pacer->datagrams_left--;
-    send_affordable(timers, pacer, now);
+    timer_set_due(timers, &pacer->timer, send_affordable(timers, pacer, now));
     while (pacer->bytes_left < 0 || pacer->datagrams_left < 0) drop_one(timers, pacer, now);
 }
 

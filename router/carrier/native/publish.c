@@ -59,7 +59,7 @@ static enum publication publish_unlocked(struct stage *stage, const struct targe
 
 /* For how long to wait for messages, in ns: until the next timer is due, or for ever (-1). */
 static int64_t patience_of(const struct publish_thread *thread) {
-    int64_t due = atomic_load_explicit(&thread->stage.timers->next_due, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return -1;
     int64_t wait = due - boottime_ns();
     return wait > 0 ? wait : 0;
@@ -75,7 +75,7 @@ static size_t take(struct publish_thread *thread, bool waits) {
 }
 
 static void serve_timers(struct publish_thread *thread) {
-    int64_t due = atomic_load_explicit(&thread->stage.timers->next_due, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = thread->stage.now(&thread->stage);
     if (now < due) return;
@@ -166,7 +166,7 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
     condition_open(&thread->changed);
     bool is_open = stage_open(&thread->stage, counters, events, NULL);
     thread->stage.publish = publish_unlocked;
-    thread->stage.timers = timers_open_on(&thread->stage);
+    thread->stage.timers = timers_open_on(&thread->stage, false);
     if (is_open && thread->stage.timers) return thread;
     publish_close(thread);
     return NULL;

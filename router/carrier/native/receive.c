@@ -107,7 +107,7 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
 }
 
 static void serve_due(struct carrier *carrier) {
-    int64_t due = atomic_load_explicit(&carrier->routing.stage.timers->next_due, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&carrier->routing.stage.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = boottime_ns();
     if (due <= now) timers_serve(carrier->routing.stage.timers, now);

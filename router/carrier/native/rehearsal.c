@@ -109,8 +109,8 @@ struct rehearsal *rehearsal_open(counter *counters, int64_t now) {
     rehearsal->now = rehearsal->noted_at = now;
     rehearsal->events = ring_open(1 << 16);
     rehearsal->routing.published = ring_open(1 << 16); /* from which each message is taken at once */
-    rehearsal->timers = timers_open_on(&rehearsal->timing);
-    rehearsal->holding = timers_open_on(&rehearsal->publishing);
+    rehearsal->timers = timers_open_on(&rehearsal->timing, false);
+    rehearsal->holding = timers_open_on(&rehearsal->publishing, false);
     struct stage *stages[] = {&rehearsal->routing.stage, &rehearsal->ros.stage, &rehearsal->timing, &rehearsal->publishing};
     bool is_open = rehearsal->events && rehearsal->routing.published && rehearsal->timers && rehearsal->holding;
     for (size_t index = 0; index < sizeof stages / sizeof *stages; index++)
@@ -180,7 +180,7 @@ void rehearsal_message(struct rehearsal *rehearsal, uint32_t topic, const void *
 /* ---- time ---- */
 
 static int64_t next_due(struct rehearsal *rehearsal) {
-    int64_t one = atomic_load(&rehearsal->timers->next_due), other = atomic_load(&rehearsal->holding->next_due);
+    int64_t one = atomic_load(&rehearsal->timers->wakes_at), other = atomic_load(&rehearsal->holding->wakes_at);
     return one < other ? one : other;
 }
 

@@ -22,7 +22,7 @@ struct targets;
 struct timer;
 struct timers;
 
-/* What a kind of timer does. All functions are called with the lock held, and may change `due`. */
+/* What a kind of timer does. All functions are called with the lock held. */
 struct timer_kind {
     /* Act: it is due at `now` (boot clock, ns). */
     void (*serve)(struct timers *timers, struct timer *timer, int64_t now);
@@ -36,9 +36,9 @@ struct timer_kind {
 /* The first member of each kind of timer. */
 struct timer {
     const struct timer_kind *kind;
-    struct timer *next; /* in the list of its group */
-    int64_t due;        /* boot clock, ns; NEVER if it is not */
-    bool is_listed;     /* the group has it */
+    struct timer *next, *previous; /* in the list of its group */
+    bool is_listed;
+    int64_t due; /* boot clock, ns; NEVER if it is not. Changed by `timer_set_due` */
 };
 
 /* A group. Its stage says how what is due leaves, and where that is counted. */
@@ -47,32 +47,38 @@ struct timers {
     struct stage *stage;
     bool has_own_stage;
     bool is_left; /* publishing returned LEFT: nothing of others may be used any more */
-    int timer;                /* timerfd, readable when a timer is due */
-    int64_t timer_set_for;    /* boot clock, ns; NEVER while it is not set */
-    _Atomic int64_t next_due; /* NEVER if nothing is due; may be read without the lock */
-    struct timer *first;      /* a linked list */
+    int timer;    /* timerfd, readable from `wakes_at` on; -1 if the thread of the group waits for that without it */
+    /* Nothing is due before (boot clock, ns); NEVER while nothing is due at all. May be read without the lock. It is put off
+     * only when timers are served: a command that puts off a deadline costs the same however many timers there are. */
+    _Atomic int64_t wakes_at;
+    struct timer *first, *last; /* a list, the newest first: deferrals are served before the pacer that they pass messages to */
 };
 
 /* Open a group with a stage of its own, that of this computer: it counts in `counters`, and writes to `events`, which may
  * be NULL. Both are written under the lock, and by nobody else. */
 struct timers *timers_open(counter *counters, struct ring *events);
 
-/* Open a group that uses a stage of the caller under the lock. Both return NULL for lack of memory or descriptors. */
-struct timers *timers_open_on(struct stage *stage);
+/* Open a group that uses a stage of the caller under the lock, with a timerfd or without. Both return NULL for lack of memory
+ * or descriptors. */
+struct timers *timers_open_on(struct stage *stage, bool has_timer);
 void timers_close(struct timers *timers); /* when no thread uses it and it has no timer left */
 
-/* Serve the timers that are due, and set the timerfd for the next one. `now` is of the boot clock. */
+/* Serve the timers that are due, and find out when the next one is. `now` is of the boot clock. */
 void timers_serve(struct timers *timers, int64_t now);
 
-/* Serve a timer from now on, or no longer. To be called with the lock held; may be called again. */
+/* ---- with the lock held ---- */
+
+/* Serve a timer from now on, or no longer. May be called again. */
 void timers_add(struct timers *timers, struct timer *timer);
 void timers_remove(struct timers *timers, struct timer *timer);
 
-/* Likewise, once `due` of a timer has changed. */
-void timers_note_due(struct timers *timers);
+/* Have a timer be due then, or no more (NEVER). */
+void timer_set_due(struct timers *timers, struct timer *timer, int64_t due);
 
-/* Set the timerfd for the next timer, once those that are due were served. The lock is held. */
+/* Find out when the next timer is due, once those that are due were served. */
 void timers_await_next(struct timers *timers);
+
+/* ---- without it ---- */
 
 /* What a reload changes in a group, between two messages: what the timers of the next program deliver to, and those that
  * only the earlier one has. Of the first program: what its timers deliver to. */

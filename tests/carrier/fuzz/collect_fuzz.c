@@ -40,7 +40,7 @@ static int64_t clock_now(struct stage *of) {
 
 int LLVMFuzzerInitialize(int *argc, char ***arguments) {
     (void)argc, (void)arguments;
-    struct timers *timers = timers_open_on(&stage);
+    struct timers *timers = timers_open_on(&stage, false);
     demand(timers && stage_open(&stage, counters, ring_open(1 << 12), timers));
     stage.now = clock_now;
     collects.collector = collector_open(TIMEOUT);
@@ -99,7 +99,7 @@ static void check_limits(void) {
     demand(known == offered);
     demand(of->open <= MOST_FRAMES && of->parts <= MOST_PARTS && of->bytes <= MOST_PART_BYTES && of->closed <= MOST_CLOSED);
     demand(of->used <= STORE && of->stored <= of->used);
-    demand(stage.timers->next_due == (of->open ? of->order[0]->ends_at : NEVER));
+    demand(of->timer.due == (of->open ? of->order[0]->ends_at : NEVER));
 }
 
 static void offer_one(uint64_t name, uint64_t size, uint64_t index, uint32_t column, uint32_t more) {

@@ -103,7 +103,7 @@ static void *wait_for_timer(void *unused) {
 static void *look_for_due(void *unused) {
     while (!atomic_load(&is_done)) {
         int64_t now = boottime_ns();
-        if (atomic_load_explicit(&timers->next_due, memory_order_relaxed) <= now) timers_serve(timers, now);
+        if (atomic_load_explicit(&timers->wakes_at, memory_order_relaxed) <= now) timers_serve(timers, now);
         usleep(100);
     }
     return unused;
@@ -182,7 +182,8 @@ int main(int count, char **arguments) {
     deadman_close(timers, atomic_load(&acting));
     timer_end(timers, (struct timer *)takes_over);
     deadman_close(timers, takes_over);
-    check(atomic_load(&timers->next_due) == NEVER, "nothing is due at the end");
+    timers_serve(timers, 0);
+    check(atomic_load(&timers->wakes_at) == NEVER, "nothing is due at the end");
     check(!counters[ERRORS], "all brakes are sent");
     check(arrived > 0 && brakes > 0 && counters[TRIPS] > 0, "commands and brakes arrive");
     timers_close(timers);
