@@ -50,25 +50,16 @@ class Checked:
     @cached_property
     def program(self) -> Program | None:
         """Compiled when first asked for; None while there are errors."""
-        return self.program_in(None)
+        return self.program_in(Counters())
 
-    def program_in(self, counters: Counters | None) -> Program | None:
-        """Compile the program, which counts in `counters` if they are given; None while there are errors."""
+    def program_in(self, counters: Counters) -> Program | None:
+        """Compile the program, which counts in `counters`; None while there are errors.
+
+        One that takes over from another program continues the counters of that one (`Counters.continued`).
+        """
         from router.compiler.link import link
 
-        if self.lowered is None or self.table is None or self.schema is None or self.envelope is None:
-            return None
-        return link(
-            self.table,
-            self.schema,
-            self.envelope,
-            self.routes,
-            self.gateways,
-            self.boards,
-            self.own_topics,
-            self.lowered,
-            counters,
-        )
+        return link(self, counters)
 
 
 def check_table(

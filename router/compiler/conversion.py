@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from router.compiler.expressions import ExpressionError, Scope
+from router.compiler.expressions import ExpressionError, Scope, tree
 from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
 from router.compiler.expressions.kinds import (
     INT32,
@@ -30,10 +30,8 @@ from router.compiler.expressions.kinds import (
     element_of,
     length_of,
 )
-from router.compiler.expressions.lists import fitted
+from router.compiler.expressions.lists import fitted, limited
 from router.compiler.expressions.scope import field_of, want_readable
-from router.compiler.expressions.tree import Binary, Call, Constant, Listed, Node, Operator, Variable, constant_of
-from router.compiler.expressions.tree import Each as Computed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -42,7 +40,7 @@ _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 """Up to this many bits every integer is exactly a float of that width."""
 
 
-def convert(value: Node, target: Type, scope: Scope) -> Plan:
+def convert(value: tree.Node, target: Type, scope: Scope) -> Plan:
     """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
     want_readable(value)
     if isinstance(target, MessageType):
@@ -55,7 +53,7 @@ def convert(value: Node, target: Type, scope: Scope) -> Plan:
     return Leaf(target, converted(value, target), value.span)
 
 
-def same_named(holder: Node, member: Field) -> Node | None:
+def same_named(holder: tree.Node, member: Field) -> tree.Node | None:
     """The field of `holder` with the name of `member`, or None."""
     found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
     return field_of(holder, found, holder.span) if found else None
@@ -69,7 +67,7 @@ def unset(member: Field, span: SourceSpan) -> Unset:
 # messages
 
 
-def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
+def _to_message(value: tree.Node, target: MessageType, scope: Scope) -> Plan:
     if isinstance(value.kind, TimeKind) and target.name in STAMP_TYPES:
         return _to_time(value, target)
     if isinstance(value.kind, MessageKind):
@@ -82,21 +80,23 @@ def _to_message(value: Node, target: MessageType, scope: Scope) -> Plan:
     raise mismatch(value, target, "map its fields one by one")
 
 
-def _to_time(value: Node, target: MessageType) -> Record:
-    def part(member: Field, operator: Operator, kind: IntKind) -> tuple[Field, Plan]:
-        divisor = Constant(IntKind(NS_PER_SECOND, NS_PER_SECOND), value.span, NS_PER_SECOND)
-        made = Binary(kind, value.span, operator, value, divisor)
+def _to_time(value: tree.Node, target: MessageType) -> Record:
+    def part(member: Field, operator: tree.Operator, kind: IntKind) -> tuple[Field, Plan]:
+        made = tree.Binary(kind, value.span, operator, value, tree.whole(NS_PER_SECOND, value.span))
         assert isinstance(member.type, Int)  # noqa: S101 - times are made of integers
-        range_ = _range(member.type)
-        return member, Leaf(member.type, made if range_.holds(kind) else fitted(made, range_), value.span)
+        limits = _range(member.type)
+        return member, Leaf(member.type, made if limits.holds(kind) else fitted(made, limits), value.span)
 
     sec, nanosec = target.fields
     seconds = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
-    members = part(sec, Operator.FLOOR_DIVIDE, seconds), part(nanosec, Operator.MODULO, IntKind(0, NS_PER_SECOND - 1))
+    members = (
+        part(sec, tree.Operator.FLOOR_DIVIDE, seconds),
+        part(nanosec, tree.Operator.MODULO, IntKind(0, NS_PER_SECOND - 1)),
+    )
     return Record(target, members, value.span)
 
 
-def _to_same_named(value: Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
+def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
     members: list[tuple[Field, Plan]] = []
     for member in target.fields:
         given = same_named(value, member)
@@ -113,8 +113,8 @@ def _to_same_named(value: Node, source: MessageType, target: MessageType, scope:
 # lists
 
 
-def _to_list(value: Node, target: List, scope: Scope) -> Plan:
-    if isinstance(value, Listed):
+def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
+    if isinstance(value, tree.Listed):
         _want_length(value, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = element_of(value.kind), length_of(value.kind)
@@ -122,13 +122,13 @@ def _to_list(value: Node, target: List, scope: Scope) -> Plan:
         raise mismatch(value, target, "write a list, [a, b]")
     if length is not None:
         _want_length(value, target, length)
-    if isinstance(value, Computed):
+    if isinstance(value, tree.Each):
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
-    element = Variable(element_kind, value.span, scope.element_variable())
+    element = tree.Variable(element_kind, value.span, scope.element_variable())
     return Each(target, ((element.name, value),), convert(element, target.element, scope), value.span)
 
 
-def _want_length(value: Node, target: List, length: int) -> None:
+def _want_length(value: tree.Node, target: List, length: int) -> None:
     if target.length is not None and length != target.length:
         raise ExpressionError(value.span, Code.TYPE_MISMATCH, f"{target} takes {target.length} elements, not {length}")
     if target.bound is not None and length > target.bound:
@@ -140,7 +140,7 @@ def _want_length(value: Node, target: List, length: int) -> None:
 # scalars
 
 
-def converted(value: Node, target: Type) -> Node:
+def converted(value: tree.Node, target: Type) -> tree.Node:
     """The expression that fills a scalar field. Raises ExpressionError when it does not fit."""
     _want_finite(value, target)
     match target:
@@ -160,9 +160,9 @@ def converted(value: Node, target: Type) -> Node:
             raise AssertionError(f"{target} is no scalar")
 
 
-def _want_finite(value: Node, target: Type) -> None:
+def _want_finite(value: tree.Node, target: Type) -> None:
     """Raise ExpressionError if `nan` or `inf` would fill what is no float."""
-    literal = constant_of(value)
+    literal = tree.constant_of(value)
     if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
         hint = f"text has quotes of its own: \"'{literal}'\"" if isinstance(target, String) else ""
         message = f"{literal} does not fill {target}"
@@ -174,27 +174,27 @@ def _want_finite(value: Node, target: Type) -> None:
 _OF_LIST = "; min(x), max(x), sum(x) and len(x) make a number of a list"
 
 
-def mismatch(value: Node, target: Type, hint: str = "") -> ExpressionError:
+def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
     """The error for a value whose kind cannot fill the type."""
     if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
         hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 
-def _to_bool(value: Node, target: Bool) -> Node:
+def _to_bool(value: tree.Node, target: Bool) -> tree.Node:
     if isinstance(value.kind, BoolKind):
         return value
-    if (literal := constant_of(value)) in (0, 1):
+    if (literal := tree.constant_of(value)) in (0, 1):
         raise mismatch(value, target, f"write {'true' if literal else 'false'}")
     raise mismatch(value, target, "compare it, as in x != 0" if isinstance(value.kind, (IntKind, FloatKind)) else "")
 
 
-def _to_int(value: Node, target: Int) -> Node:
+def _to_int(value: tree.Node, target: Int) -> tree.Node:
     match value.kind:
         case EnumKind():
-            return _saturate(value, target)
+            return _saturate(value, _range(target))
         case IntKind() as kind:
-            return _fit(value, kind, target)
+            return _fit(value, kind, _range(target))
         case FloatKind():
             hint = "say how: round() or trunc()"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a float does not fit {target}", hint)
@@ -206,42 +206,37 @@ def _to_int(value: Node, target: Int) -> Node:
             raise mismatch(value, target)
 
 
-def _saturate(value: Node, target: Int) -> Node:
+def _saturate(value: tree.Node, limits: IntKind) -> tree.Node:
     """An enum limited to an integer's range."""
-    range_, every = _range(target), _range(INT32)
-    if range_.holds(every):
+    if limits.holds(INT32):
         return value
-    kind = IntKind(max(every.low, range_.low), min(every.high, range_.high))
-    literal = constant_of(value)
+    kind = IntKind(max(INT32.low, limits.low), min(INT32.high, limits.high))
+    literal = tree.constant_of(value)
     if isinstance(literal, int):
-        return Constant(kind, value.span, int(clamp(literal, kind.low, kind.high)))
-    return _limited("clamp", value, kind, target.low, target.high)
+        return tree.Constant(kind, value.span, int(clamp(literal, kind.low, kind.high)))
+    return limited("clamp", value, kind, limits.low, limits.high)
 
 
 def _range(target: Int) -> IntKind:
     return IntKind(target.low, target.high)
 
 
-def _fit(value: Node, kind: IntKind, target: Int) -> Node:
-    range_ = _range(target)
-    if range_.holds(kind):
+def _fit(value: tree.Node, kind: IntKind, limits: IntKind) -> tree.Node:
+    if limits.holds(kind):
         return value
-    if kind.high < range_.low or kind.low > range_.high:
-        limits = f"{target.low}..{target.high}"
-        raise ExpressionError(
-            value.span, Code.OUT_OF_RANGE, f"{value.kind} does not fit {target}", f"it holds {limits}"
-        )
+    what = f"{value.kind} does not fit {limits}"
+    if kind.high < limits.low or kind.low > limits.high:
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, what, f"it holds {limits.low}..{limits.high}")
     if kind.is_rounded:
-        return fitted(value, range_)
-    hint = "say how: clamp() or wrap()"
-    raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
+        return fitted(value, limits)
+    raise ExpressionError(value.span, Code.LOSSY_CONVERSION, what, "say how: clamp() or wrap()")
 
 
-def _to_float(value: Node, target: Float) -> Node:
+def _to_float(value: tree.Node, target: Float) -> tree.Node:
     limit = 1 << _EXACT_INTEGER_BITS[target.bits]
     match value.kind:
         case FloatKind(bits):
-            literal = constant_of(value)
+            literal = tree.constant_of(value)
             if target.bits == 32 and isinstance(literal, float) and FLOAT32_END <= abs(literal) < math.inf:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{literal!r} does not fit float32")
             if bits > target.bits:
@@ -261,7 +256,7 @@ def _to_float(value: Node, target: Float) -> Node:
             raise mismatch(value, target)
 
 
-def _to_string(value: Node, target: String) -> Node:
+def _to_string(value: tree.Node, target: String) -> tree.Node:
     if not isinstance(value.kind, StringKind):
         is_float = isinstance(value.kind, FloatKind)
         hint = "str() makes text of it" if isinstance(value.kind, (IntKind, EnumKind, BoolKind)) else ""
@@ -269,16 +264,16 @@ def _to_string(value: Node, target: String) -> Node:
     if target.wide:
         hint = "leave it out, and it keeps its default; or declare it as a string"
         raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions do not fill a wstring", hint)
-    literal = constant_of(value)
+    literal = tree.constant_of(value)
     if isinstance(literal, str):
         _want_text(value, literal, target)
         return value
     if target.bound is None:
         return value
-    return _limited("fit_text", value, StringKind(), target.bound)
+    return limited("fit_text", value, StringKind(), target.bound)
 
 
-def _want_text(value: Node, text: str, target: String) -> None:
+def _want_text(value: tree.Node, text: str, target: String) -> None:
     """Raise ExpressionError if a literal cannot stand in the field."""
     try:
         length = len(text.encode())
@@ -290,34 +285,34 @@ def _want_text(value: Node, text: str, target: String) -> None:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
 
 
-def _to_enum(value: Node, target: Enum) -> Node:
+def _to_enum(value: tree.Node, target: Enum) -> tree.Node:
     match value.kind:
         case EnumKind(enum) if enum == target:
             return value
         case IntKind() as kind:
             return _member(_fit(value, kind, INT32), target)
-        case StringKind() if isinstance(literal := constant_of(value), str):
-            return Constant(EnumKind(target), value.span, _number_of(value, literal, target))
+        case StringKind() if isinstance(literal := tree.constant_of(value), str):
+            return tree.Constant(EnumKind(target), value.span, _number_of(value, literal, target))
         case StringKind():
-            return Call(EnumKind(target), value.span, "named", (value,))
+            return tree.Call(EnumKind(target), value.span, "named", (value,))
         case _:
             raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
 
 
-def _member(value: Node, target: Enum) -> Node:
+def _member(value: tree.Node, target: Enum) -> tree.Node:
     """A number as a value of the enum, refused at run time if a closed one does not have it."""
-    literal = constant_of(value)
+    literal = tree.constant_of(value)
     if not target.is_closed:
         return value
     if literal is None:
-        return Call(EnumKind(target), value.span, "member", (value,))
+        return tree.Call(EnumKind(target), value.span, "member", (value,))
     if literal not in dict(target.values).values():
         hint = f"it is closed: name one of its values, as {target.name}.{target.values[0][0]}"
         raise ExpressionError(value.span, Code.UNKNOWN_ENUM_VALUE, f"'{target}' has no value {literal}", hint)
     return value
 
 
-def _number_of(value: Node, name: str, target: Enum) -> int:
+def _number_of(value: tree.Node, name: str, target: Enum) -> int:
     numbers = dict(target.values)
     if name not in numbers:
         hint = did_you_mean(name, numbers)
@@ -325,7 +320,7 @@ def _number_of(value: Node, name: str, target: Enum) -> int:
     return numbers[name]
 
 
-def _to_bytes(value: Node, target: Bytes) -> Node:
+def _to_bytes(value: tree.Node, target: Bytes) -> tree.Node:
     made = value
     match value.kind:
         case BytesKind():
@@ -333,22 +328,16 @@ def _to_bytes(value: Node, target: Bytes) -> Node:
         case ListKind(element, length) if element is None or _is_octet(element):
             if target.bound is not None and length is not None and length > target.bound:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
-            made = Call(BytesKind(), value.span, "octets", (value,))
+            made = tree.Call(BytesKind(), value.span, "octets", (value,))
         case ListKind():
             raise mismatch(value, target, f"bytes are integers {OCTET.low}..{OCTET.high}")
         case _:
             raise mismatch(value, target)
-    return made if target.bound is None else _limited("fit_text", made, BytesKind(), target.bound)
+    return made if target.bound is None else limited("fit_text", made, BytesKind(), target.bound)
 
 
 def _is_octet(kind: Kind) -> bool:
     """Whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
     if not isinstance(kind, IntKind):
         return False
-    return kind.is_rounded or _range(OCTET).holds(kind)
-
-
-def _limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
-    """The value within limits, which are checked at run time."""
-    bounds = (Constant(IntKind(limit, limit), value.span, limit) for limit in limits)
-    return Call(kind, value.span, function, (value, *bounds))
+    return kind.is_rounded or OCTET.holds(kind)

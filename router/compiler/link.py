@@ -5,78 +5,60 @@ Expects a table without errors: nothing here is checked.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.deadmen import deadman_plan
 from router.compiler.lookup import layout
-from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
-from router.compiler.program import (
-    STRANGER,
-    DeadmanPlan,
-    GatewayPlan,
-    Program,
-    RoutePlan,
-    TargetPlan,
-    TopicPlan,
-)
+from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
 from router.compiler.series import open_series
 from router.compiler.topics import qos_of
 from router.table.model import ANY, Route, RouteTable, Topic
-from router.types.board_limits import BoardLimits
 from router.types.framing import trimmed
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, ProtoSchema
+
+if TYPE_CHECKING:
+    from router.compiler.check import Checked
 
 
-def link(
-    table: RouteTable,
-    schema: ProtoSchema,
-    envelope: Envelope,
-    routes: Sequence[CheckedRoute],
-    gateways: Sequence[GatewayPlan],
-    boards: Mapping[str, BoardLimits],
-    own_topics: Sequence[tuple[Topic, MessageType]],
-    lowered: Lowered,
-    counters: Counters | None,
-) -> Program:
-    """Make the program of a checked table, of which `lowered` is what the carrier runs.
-
-    `own_topics` are published by the router itself, whatever its routes do. A program that takes over from another
-    one counts in `counters`, which continue those of the other (`Counters.continued`).
-    """
-    counters = counters or Counters()
-    served = [checked for checked in routes if not checked.route.ignore]
-    plans = [plan for checked in served for plan in _route_plans(checked, table, counters)]
+def link(checked: Checked, counters: Counters) -> Program | None:
+    """Make the program of a table, which counts in `counters`; None if it has errors."""
+    table, schema, envelope, lowered = checked.table, checked.schema, checked.envelope, checked.lowered
+    if table is None or schema is None or envelope is None or lowered is None:
+        return None
+    served = [each for each in checked.routes if not each.route.ignore]
     inbound: dict[int, tuple[RoutePlan, ...]] = {}
     outbound: dict[str, tuple[RoutePlan, ...]] = {}
-    for plan in plans:
-        if plan.topic is None:
-            number = plan.case.number
-            inbound[number] = (*inbound.get(number, ()), plan)
-        else:
-            outbound[plan.topic] = (*outbound.get(plan.topic, ()), plan)
-    deadmen = tuple(_route_deadman(checked.route.name, checked.deadman, table) for checked in served if checked.deadman)
-    open_series(counters, table, envelope, plans, deadmen, gateways)
-    destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
+    for route in served:
+        if not route.route.is_outbound:
+            number = route.case.number
+            inbound[number] = (*inbound.get(number, ()), _route_plan(route, _sources(route.route, table)))
+        for feed in route.subscriptions:
+            topic = feed.topic.topic.value
+            outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, frozenset(), feed))
+    deadmen = tuple(_route_deadman(each.route.name, each.deadman, table) for each in served if each.deadman)
+    destinations = {to.endpoint.value for each in served for to in each.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
-    return Program(
+    program = Program(
         table=table,
         envelope=envelope,
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
-        publishers=_topics([*_published(served), *own_topics], _published_by_clients(gateways)),
-        subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.subscriptions),
+        publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
+        subscriptions=_topics((feed.topic, feed.type) for each in served for feed in each.subscriptions),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
-        ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
+        ignored=frozenset(each.case.number for each in checked.routes if each.route.ignore),
         protos=schema,
         lowered=lowered,
-        boards=boards,
-        gateways=tuple(gateways),
+        boards=checked.boards,
+        gateways=tuple(checked.gateways),
     )
+    open_series(program)
+    return program
 
 
 def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
@@ -106,21 +88,13 @@ def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
     return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
 
 
-def _route_plans(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[RoutePlan]:
-    """A route from UDP has one plan, a route from ROS one for each of its topics."""
-    if not checked.route.is_outbound:
-        yield _route_plan(checked, None, _sources(checked.route, table), counters)
-    for feed in checked.subscriptions:
-        yield _route_plan(checked, feed, frozenset(), counters)
-
-
 def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:
     sources = frozenset(source.value for source in route.sources)
     return frozenset([*table.endpoints, STRANGER]) if ANY in sources else sources
 
 
 def _route_plan(
-    checked: CheckedRoute, feed: CheckedSubscription | None, sources: frozenset[str | None], counters: Counters
+    checked: CheckedRoute, sources: frozenset[str | None], feed: CheckedSubscription | None = None
 ) -> RoutePlan:
     """The plan of `feed`, or of a route from UDP."""
     route = checked.route

@@ -19,27 +19,21 @@ from router.compiler.metrics import (
     UNKNOWN_CASE,
     Counters,
 )
-from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, RoutePlan, source_label
+from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, source_label
 from router.table.model import ROS, RouteTable
 from router.types.protobuf import Envelope
 
 
-def open_series(
-    counters: Counters,
-    table: RouteTable,
-    envelope: Envelope,
-    routes: Iterable[RoutePlan],
-    deadmen: Iterable[DeadmanPlan],
-    gateways: Iterable[GatewayPlan],
-) -> None:
-    """Open the series of a program with these parts."""
-    _open_listeners(counters, table, envelope)
+def open_series(program: Program) -> None:
+    """Open the series of a program in its counters."""
+    counters, table = program.counters, program.table
+    _open_listeners(counters, table, program.envelope)
     _open_own(counters, table)
-    for plan in routes:
+    for plan in program.routes:
         _open_route(counters, table, plan)
-    for deadman in deadmen:
+    for deadman in program.deadmen:
         _open_deadman(counters, deadman)
-    for gateway in gateways:
+    for gateway in program.gateways:
         _open_gateway(counters, gateway)
 
 

@@ -17,7 +17,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router.errors import plural
 from router.types.boards import OptionsOf, why_unbounded
 from router.types.descriptors import message_of
-from router.types.wire import I32_SIZE, I64, I64_SIZE, LEN, VARINT, wire_fields, wire_type_of
+from router.types.wire import I32_SIZE, I64, I64_SIZE, LEN, VARINT, kind_of, wire_fields
 
 TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 """Those of DROP_REASONS for which a datagram is not sent to a board."""
@@ -122,7 +122,7 @@ def _fits(size: int, bound: int, is_fixed: bool) -> bool:
 
 def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes] | None:
     """The elements that a field brings, as they are encoded; None if it has another wire type than its own."""
-    own = wire_type_of(field.descriptor)
+    own = kind_of(field.descriptor).wire_type
     if wire_type == own:
         return [value]
     if wire_type != LEN or not field.descriptor.is_repeated:

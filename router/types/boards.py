@@ -18,6 +18,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescrip
 
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
 from router.types.descriptors import container, enum_of, message_of
+from router.types.wire import kind_of, varint
 
 _COMMENT = re.compile(r"//.*|#.*|/\*.*?\*/")
 _OPTION = re.compile(r"(?P<key>\w+)\s*:\s*(?P<value>\"[^\"]*\"|[\w.+-]+)\s*[,;]?\s*")
@@ -129,23 +130,6 @@ if TYPE_CHECKING:
 
 OptionsOf = Callable[[FieldDescriptor], BoardOptions]
 
-_FIXED = {
-    FieldDescriptor.TYPE_BOOL: 1,
-    FieldDescriptor.TYPE_DOUBLE: 8,
-    FieldDescriptor.TYPE_FIXED32: 4,
-    FieldDescriptor.TYPE_FIXED64: 8,
-    FieldDescriptor.TYPE_FLOAT: 4,
-    FieldDescriptor.TYPE_INT32: 10,
-    FieldDescriptor.TYPE_INT64: 10,
-    FieldDescriptor.TYPE_SFIXED32: 4,
-    FieldDescriptor.TYPE_SFIXED64: 8,
-    FieldDescriptor.TYPE_SINT32: 5,
-    FieldDescriptor.TYPE_SINT64: 10,
-    FieldDescriptor.TYPE_UINT32: 5,
-    FieldDescriptor.TYPE_UINT64: 10,
-}
-
-
 # Sizes
 
 
@@ -177,7 +161,7 @@ def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
 
 def framed_size(number: int, payload: int) -> int:
     """The encoding of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
-    return _varint_size(number << 3) + _varint_size(payload) + payload
+    return len(varint(number << 3)) + len(varint(payload)) + payload
 
 
 def unbounded_fields(
@@ -227,7 +211,7 @@ def _size_of(fields: Iterable[FieldDescriptor], options_of: OptionsOf) -> int:
 
 def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
     options = options_of(field)
-    size = _varint_size(field.number << 3) + _value_size(field, options, options_of)
+    size = len(varint(field.number << 3)) + _value_size(field, options, options_of)
     if not field.is_repeated or options.max_count is None:
         return size
     # Room for the unpacked form, which every decoder must take; for one element the packed form is longer.
@@ -235,23 +219,18 @@ def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
 
 
 def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: OptionsOf) -> int:
-    if field.type in _FIXED:
-        return _FIXED[field.type]
+    if number := kind_of(field).size:
+        return number
     if field.type == FieldDescriptor.TYPE_ENUM:
-        return max(_varint_size(value.number) for value in enum_of(field).values)
+        return max(len(varint(value.number)) for value in enum_of(field).values)
     if field.type == FieldDescriptor.TYPE_MESSAGE:
         inner = _size_of(message_of(field).fields, options_of)
-        return _varint_size(inner) + inner
+        return len(varint(inner)) + inner
     if field.type == FieldDescriptor.TYPE_STRING:
         size = options.string_size or 1
-        return _varint_size(size) + size - 1  # without its final NUL
+        return len(varint(size)) + size - 1  # without its final NUL
     size = options.max_size or 0
-    return _varint_size(size) + size
-
-
-def _varint_size(value: int) -> int:
-    """Bytes of a varint; a negative one has ten."""
-    return 10 if value < 0 else max(1, (value.bit_length() + 6) // 7)
+    return len(varint(size)) + size
 
 
 def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: SourceSpan) -> list[Diagnostic]:

@@ -29,12 +29,12 @@ from router.types.boards import (
 )
 from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
 from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reached, read_folder
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
 from router.types.undecidable import undecidable
-from router.types.wire import validates_text
+from router.types.wire import kind_of, validates_text
 
 MessageClass = type[Message]
 
@@ -286,23 +286,6 @@ def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
     return PayloadCase(field.name, field.number, schema.messages[message.full_name], GetMessageClass(message), size)
 
 
-_SCALARS: Mapping[int, Type] = {
-    FieldDescriptor.TYPE_BOOL: Bool(),
-    FieldDescriptor.TYPE_FLOAT: Float(32),
-    FieldDescriptor.TYPE_DOUBLE: Float(64),
-    FieldDescriptor.TYPE_INT32: Int(32, signed=True),
-    FieldDescriptor.TYPE_SINT32: Int(32, signed=True),
-    FieldDescriptor.TYPE_SFIXED32: Int(32, signed=True),
-    FieldDescriptor.TYPE_INT64: Int(64, signed=True),
-    FieldDescriptor.TYPE_SINT64: Int(64, signed=True),
-    FieldDescriptor.TYPE_SFIXED64: Int(64, signed=True),
-    FieldDescriptor.TYPE_UINT32: Int(32, signed=False),
-    FieldDescriptor.TYPE_FIXED32: Int(32, signed=False),
-    FieldDescriptor.TYPE_UINT64: Int(64, signed=False),
-    FieldDescriptor.TYPE_FIXED64: Int(64, signed=False),
-}
-
-
 def build_types(
     pool: DescriptorPool,
     file_names: Sequence[str],
@@ -363,8 +346,8 @@ def _type(
 def _element(
     field: FieldDescriptor, options: BoardOptions, messages: Mapping[str, MessageType], enums: Mapping[str, Enum]
 ) -> Type:
-    if field.type in _SCALARS:
-        return _SCALARS[field.type]
+    if number := kind_of(field).type:
+        return number
     if field.type == FieldDescriptor.TYPE_ENUM:
         return enums[enum_of(field).full_name]
     if field.type == FieldDescriptor.TYPE_STRING:

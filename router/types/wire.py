@@ -2,24 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
+from router.declared import FieldType, Op
 from router.types.descriptors import container
+from router.types.model import Bool, Float, Int, Type
 
 VARINT, I64, LEN, GROUP, GROUP_END, I32 = range(6)
 """The wire types. LEN is that of what has a size in front: strings, bytes, messages, packed scalars."""
 
 I64_SIZE, I32_SIZE = 8, 4
 _LONGEST_VARINT = 10
+_ALL_BITS = (1 << 64) - 1
+
+
+class FieldKind(NamedTuple):
+    """How a field of one of protobuf's types is encoded.
+
+    `read` and `write` are the carrier's. `size` is the largest encoding of a number in bytes, `type` its type in the
+    model.
+    """
+
+    wire_type: int
+    read: FieldType
+    write: Op
+    size: int = 0
+    type: Type | None = None
+
+
+_SIGNED_32, _SIGNED_64, _UNSIGNED_32, _UNSIGNED_64 = (
+    Int(bits, signed) for signed in (True, False) for bits in (32, 64)
+)
+_KINDS: Mapping[int, FieldKind] = {
+    FieldDescriptor.TYPE_BOOL: FieldKind(VARINT, FieldType.BOOL, Op.WRITE_VARINT, 1, Bool()),
+    FieldDescriptor.TYPE_ENUM: FieldKind(VARINT, FieldType.INT32, Op.WRITE_VARINT),
+    FieldDescriptor.TYPE_INT32: FieldKind(VARINT, FieldType.INT32, Op.WRITE_VARINT, 10, _SIGNED_32),
+    FieldDescriptor.TYPE_INT64: FieldKind(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _SIGNED_64),
+    FieldDescriptor.TYPE_UINT32: FieldKind(VARINT, FieldType.UINT32, Op.WRITE_VARINT, 5, _UNSIGNED_32),
+    FieldDescriptor.TYPE_UINT64: FieldKind(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _UNSIGNED_64),
+    FieldDescriptor.TYPE_SINT32: FieldKind(VARINT, FieldType.SINT32, Op.WRITE_ZIGZAG, 5, _SIGNED_32),
+    FieldDescriptor.TYPE_SINT64: FieldKind(VARINT, FieldType.SINT64, Op.WRITE_ZIGZAG, 10, _SIGNED_64),
+    FieldDescriptor.TYPE_FIXED32: FieldKind(I32, FieldType.FIXED32, Op.WRITE_FIXED32, 4, _UNSIGNED_32),
+    FieldDescriptor.TYPE_SFIXED32: FieldKind(I32, FieldType.SFIXED32, Op.WRITE_FIXED32, 4, _SIGNED_32),
+    FieldDescriptor.TYPE_FIXED64: FieldKind(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _UNSIGNED_64),
+    FieldDescriptor.TYPE_SFIXED64: FieldKind(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _SIGNED_64),
+    FieldDescriptor.TYPE_FLOAT: FieldKind(I32, FieldType.FLOAT, Op.WRITE_FLOAT, 4, Float(32)),
+    FieldDescriptor.TYPE_DOUBLE: FieldKind(I64, FieldType.DOUBLE, Op.WRITE_DOUBLE, 8, Float(64)),
+    FieldDescriptor.TYPE_STRING: FieldKind(LEN, FieldType.BYTES, Op.WRITE_BYTES),
+    FieldDescriptor.TYPE_BYTES: FieldKind(LEN, FieldType.BYTES, Op.WRITE_BYTES),
+    FieldDescriptor.TYPE_MESSAGE: FieldKind(LEN, FieldType.MESSAGE, Op.OPEN),
+    FieldDescriptor.TYPE_GROUP: FieldKind(GROUP, FieldType.GROUP, Op.OPEN),
+}
+
+
+def kind_of(field: FieldDescriptor) -> FieldKind:
+    """How a field is encoded, of a repeated one an element by itself."""
+    return _KINDS[field.type]
 
 
 def varint(value: int) -> bytes:
-    """Encode an integer as protobuf encodes tags and lengths."""
+    """Encode an integer as protobuf encodes tags and lengths, a negative one as its 64 bits."""
     encoded = bytearray()
+    value &= _ALL_BITS
     while value > 0x7F:
         encoded.append(value & 0x7F | 0x80)
         value >>= 7
@@ -61,20 +110,6 @@ def wire_fields(message: bytes) -> Iterator[tuple[int, int, bytes]]:
             position += I64_SIZE if wire_type == I64 else I32_SIZE
         if not open_groups:
             yield number, wire_type, message[start:position]
-
-
-def wire_type_of(field: FieldDescriptor) -> int:
-    """The wire type of a field, of a repeated one that of an element by itself."""
-    if field.type in _LEN_TYPES:
-        return LEN
-    if field.type in _I64_TYPES:
-        return I64
-    return I32 if field.type in _I32_TYPES else VARINT
-
-
-_LEN_TYPES = (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES, FieldDescriptor.TYPE_MESSAGE)
-_I64_TYPES = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64, FieldDescriptor.TYPE_SFIXED64)
-_I32_TYPES = (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_FIXED32, FieldDescriptor.TYPE_SFIXED32)
 
 
 def delimited(number: int, value: bytes) -> bytes:

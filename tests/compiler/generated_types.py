@@ -11,7 +11,6 @@ from typing import Any
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from router.compiler.expressions.kinds import INT32
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 EACH_TYPE = settings(max_examples=settings().max_examples // 4, suppress_health_check=list(HealthCheck))
@@ -168,7 +167,7 @@ def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
         case String():
             return st.just(String())
         case Enum():
-            return st.sampled_from([target, *_wider(INT32)])
+            return st.sampled_from([target, *_wider(Int(32, signed=True))])
         case Bytes():
             return st.sampled_from([target, List(Int(8, signed=False), 2), List(Int(8, signed=False))])
         case List():

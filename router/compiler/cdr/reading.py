@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from typing import Union
 
 from router.compiler.cdr.primitives import HEADER, decoder, object_class, scalar_format
-from router.compiler.expressions.kinds import OCTET, TIME_TYPES
+from router.compiler.expressions.kinds import TIME_TYPES
 from router.compiler.expressions.tree import Path
 from router.compiler.source import Source, call, load
 from router.errors import SourceSpan
-from router.types.model import List, MessageType, String, Type
+from router.types.model import Int, List, MessageType, String, Type
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class _Walk:
             return
         letter = scalar_format(declared.element)
         size = struct.calcsize(letter)
-        are_bytes = declared.element == OCTET  # which bytes are already
+        are_bytes = declared.element == Int(8, signed=False)  # which bytes are already
         if declared.length is None:
             yield Stretch(size, variable, None if are_bytes else letter)
             return

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, Function, Parameter
-from router.compiler.expressions.kinds import FloatKind, IntKind, is_list
+from router.compiler.expressions.kinds import FloatKind, is_list
 from router.compiler.expressions.lists import as_kind, as_value, elementwise
 from router.compiler.expressions.scope import ExpressionError, Scope
 from router.compiler.expressions.syntax import Parsed
-from router.compiler.expressions.tree import Call, Constant, Node
+from router.compiler.expressions.tree import Call, Node, whole
 from router.errors import Code, SourceSpan, did_you_mean, plural
 from router.types.model import Int, List, Type
 
@@ -82,7 +82,7 @@ def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list
     if not isinstance(expected, Int):
         message = f"{function.name}() needs bounds here, where no integer field is filled"
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
-    return [Constant(IntKind(bound, bound), span, bound) for bound in (expected.low, expected.high)]
+    return [whole(expected.low, span), whole(expected.high, span)]
 
 
 def _want_count(function: Function, count: int, span: SourceSpan) -> None:

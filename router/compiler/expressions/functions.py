@@ -150,7 +150,7 @@ def _rounded(compute: Callable[[float], int]) -> Rule:
         if not isinstance(kind, FloatKind):
             return _integer(nodes)
         if not all(map(math.isfinite, kind.limits)):
-            return IntKind(INT64.low, INT64.high, is_rounded=True)
+            return replace(INT64, is_rounded=True)
         low, high = map(compute, kind.limits)
         if low > INT64.high or high < INT64.low:
             raise ValueError(f"no integer of 64 bits is between {kind.low} and {kind.high}")
@@ -205,8 +205,7 @@ def _sum_of_list(kind: Kind) -> Kind | None:
         return None
     if length is not None:
         return within_64_bits((length * integer.low, length * integer.high), integer.is_rounded)[0]
-    limits = INT64 if integer.low < 0 else UINT64
-    return IntKind(limits.low, limits.high, integer.is_rounded)
+    return replace(INT64 if integer.low < 0 else UINT64, is_rounded=integer.is_rounded)
 
 
 def _clamped(nodes: Sequence[Node]) -> Kind:

@@ -19,15 +19,6 @@ TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/D
 STAMP_TYPES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
 """Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
 
-INT32 = Int(32, signed=True)
-"""The values of an enum."""
-
-OCTET = Int(8, signed=False)
-"""An element of bytes."""
-
-INT64, UINT64 = Int(64, signed=True), Int(64, signed=False)
-"""The integers that a value can be: signed ones if its range begins below zero."""
-
 
 @dataclass(frozen=True, slots=True)
 class BoolKind:
@@ -51,11 +42,20 @@ class IntKind:
         return self.low <= other.low and other.high <= self.high
 
     def __str__(self) -> str:
-        for bits in (8, 16, 32, 64):
-            for signed in (False, True):
-                if (Int(bits, signed).low, Int(bits, signed).high) == (self.low, self.high):
-                    return str(Int(bits, signed))
+        for declared in (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (False, True)):
+            if (declared.low, declared.high) == (self.low, self.high):
+                return str(declared)
         return f"int {self.low}" if self.low == self.high else f"int {self.low}..{self.high}"
+
+
+OCTET, UINT32 = IntKind(0, 0xFF), IntKind(0, 0xFFFF_FFFF)
+"""An element of bytes; and a number of elements, or the index of one."""
+
+INT32 = IntKind(-(1 << 31), (1 << 31) - 1)
+"""The values of an enum."""
+
+INT64, UINT64 = IntKind(-(1 << 63), (1 << 63) - 1), IntKind(0, (1 << 64) - 1)
+"""The integers that a value can be: signed ones if its range begins below zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +121,6 @@ class ListKind:
         return f"list of {self.element}" if self.element else "empty list"
 
 
-UINT32 = IntKind(0, 0xFFFF_FFFF)
-"""A number of elements, and the index of one."""
-
 Kind = Union[BoolKind, IntKind, FloatKind, StringKind, BytesKind, EnumKind, TimeKind, MessageKind, ListKind]
 Number = (IntKind, FloatKind, EnumKind)
 """The kinds that arithmetic takes, for isinstance()."""
@@ -153,14 +150,14 @@ def kind_of(declared: Type) -> Kind:
 def as_int(kind: Kind) -> IntKind | None:
     """The integer that a number of this kind is, an enum being any int32; None for other kinds."""
     if isinstance(kind, EnumKind):
-        return IntKind(INT32.low, INT32.high)
+        return INT32
     return kind if isinstance(kind, IntKind) else None
 
 
 def element_of(kind: Kind) -> Kind | None:
     """The kind of a list's elements, bytes being a list of uint8; None for other kinds, and for an empty literal."""
     if isinstance(kind, BytesKind):
-        return kind_of(OCTET)
+        return OCTET
     return kind.element if isinstance(kind, ListKind) else None
 
 

@@ -17,7 +17,7 @@ from router.compiler.expressions.kinds import (
     length_of,
 )
 from router.compiler.expressions.scope import ExpressionError, Scope
-from router.compiler.expressions.tree import Call, Constant, Each, Element, Listed, Node, Variable, constant_of
+from router.compiler.expressions.tree import Call, Constant, Each, Element, Listed, Node, Variable, constant_of, whole
 from router.errors import Code, SourceSpan
 
 Make = Callable[[Sequence[Node]], Node]
@@ -143,5 +143,9 @@ def _has_to_be_converted(given: Kind | None, wanted: Kind) -> bool:
 
 def fitted(value: Node, kind: IntKind) -> Call:
     """An integer, refused at run time if it is outside of a range."""
-    low, high = (Constant(IntKind(bound, bound), value.span, bound) for bound in (kind.low, kind.high))
-    return Call(kind, value.span, "fit", (value, low, high))
+    return limited("fit", value, kind, kind.low, kind.high)
+
+
+def limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
+    """A value within limits, which the function checks at run time."""
+    return Call(kind, value.span, function, (value, *(whole(limit, value.span) for limit in limits)))

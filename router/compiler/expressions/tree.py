@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum as Enumeration
 from typing import Union
 
-from router.compiler.expressions.kinds import Kind, ListKind
+from router.compiler.expressions.kinds import IntKind, Kind, ListKind
 from router.errors import SourceSpan
 from router.types.model import Field
 
@@ -209,6 +209,11 @@ Node = Union[
 def constant_of(node: Node) -> bool | int | float | str | None:
     """The value of a Constant, None for everything else (there is no None in the language)."""
     return node.value if isinstance(node, Constant) else None
+
+
+def whole(number: int, span: SourceSpan) -> Constant:
+    """An integer."""
+    return Constant(IntKind(number, number), span, number)
 
 
 def path_of(node: Node) -> Path | None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
+from router.compiler.expressions import tree
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import (
     BytesKind,
@@ -20,25 +21,6 @@ from router.compiler.expressions.kinds import (
     MessageKind,
     StringKind,
     TimeKind,
-)
-from router.compiler.expressions.tree import (
-    Binary,
-    Call,
-    Choice,
-    Compare,
-    Constant,
-    Contains,
-    Element,
-    Logic,
-    Operator,
-    Present,
-    Read,
-    Unary,
-    Variable,
-    parts_of,
-)
-from router.compiler.expressions.tree import (
-    Node as Tree,
 )
 from router.compiler.lowering import functions, lists
 from router.compiler.lowering.names import Names
@@ -62,21 +44,21 @@ from router.compiler.lowering.operations import (
 from router.declared import Compared, Op, Scalar
 from router.types.model import Field
 
-_REALS: Mapping[Operator, Op] = {
-    Operator.ADD: Op.REAL_ADD,
-    Operator.SUBTRACT: Op.REAL_SUBTRACT,
-    Operator.MULTIPLY: Op.REAL_MULTIPLY,
-    Operator.DIVIDE: Op.REAL_DIVIDE,
-    Operator.FLOOR_DIVIDE: Op.REAL_FLOOR_DIVIDE,
-    Operator.MODULO: Op.REAL_MODULO,
-    Operator.POWER: Op.REAL_POWER,
+_REALS: Mapping[tree.Operator, Op] = {
+    tree.Operator.ADD: Op.REAL_ADD,
+    tree.Operator.SUBTRACT: Op.REAL_SUBTRACT,
+    tree.Operator.MULTIPLY: Op.REAL_MULTIPLY,
+    tree.Operator.DIVIDE: Op.REAL_DIVIDE,
+    tree.Operator.FLOOR_DIVIDE: Op.REAL_FLOOR_DIVIDE,
+    tree.Operator.MODULO: Op.REAL_MODULO,
+    tree.Operator.POWER: Op.REAL_POWER,
 }
-_INTEGERS: Mapping[Operator, tuple[Op, Op]] = {
-    Operator.ADD: (Op.ADD, Op.CHECKED_ADD),
-    Operator.SUBTRACT: (Op.SUBTRACT, Op.CHECKED_SUBTRACT),
-    Operator.MULTIPLY: (Op.MULTIPLY, Op.CHECKED_MULTIPLY),
-    Operator.FLOOR_DIVIDE: (Op.DIVIDE, Op.DIVIDE),
-    Operator.MODULO: (Op.MODULO, Op.MODULO),
+_INTEGERS: Mapping[tree.Operator, tuple[Op, Op]] = {
+    tree.Operator.ADD: (Op.ADD, Op.CHECKED_ADD),
+    tree.Operator.SUBTRACT: (Op.SUBTRACT, Op.CHECKED_SUBTRACT),
+    tree.Operator.MULTIPLY: (Op.MULTIPLY, Op.CHECKED_MULTIPLY),
+    tree.Operator.FLOOR_DIVIDE: (Op.DIVIDE, Op.DIVIDE),
+    tree.Operator.MODULO: (Op.MODULO, Op.MODULO),
 }
 """Without and with a check of the result."""
 
@@ -87,7 +69,7 @@ class Lowering:
 
     names: Names
 
-    def value(self, node: Tree) -> Code:
+    def value(self, node: tree.Node) -> Code:
         """Return the operations that put the value of a node on the stack.
 
         A value that no turn of a loop changes is computed once, in the first turn that needs it.
@@ -99,7 +81,7 @@ class Lowering:
         self.names.loops += around
         return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
 
-    def _unchanged(self, node: Tree) -> int | None:
+    def _unchanged(self, node: tree.Node) -> int | None:
         """Return the outermost loop that leaves a node unchanged, as do all loops in it; None if there is none."""
         loops = self.names.loops
         if not loops or not _can_be_kept(node):
@@ -109,61 +91,61 @@ class Lowering:
             level -= 1
         return level if level < len(loops) else None
 
-    def _value(self, node: Tree) -> Code:  # noqa: C901, PLR0912 - a case a node
+    def _value(self, node: tree.Node) -> Code:  # noqa: C901, PLR0912 - a case a node
         if isinstance(node.kind, ListKind):
             return lists.stored(self, node).code
         match node:
-            case Constant():
+            case tree.Constant():
                 return _constant(node)
-            case Variable():
+            case tree.Variable():
                 return self._variable(node)
-            case Read():
+            case tree.Read():
                 return self._field(node)
-            case Present():
+            case tree.Present():
                 before, holder = self.message(node.holder)
                 return code(before, load(holder.presence(node.field)))
-            case Element():
+            case tree.Element():
                 return self._element(node)
-            case Unary():
+            case tree.Unary():
                 return self._unary(node)
-            case Binary():
+            case tree.Binary():
                 return self._binary(node)
-            case Compare():
+            case tree.Compare():
                 return self._compare(node)
-            case Contains():
+            case tree.Contains():
                 return lists.contains(self, node)
-            case Logic():
+            case tree.Logic():
                 return chained(Op.AND if node.is_all else Op.OR, list(map(self.value, node.operands)))
-            case Choice():
+            case tree.Choice():
                 branches = (coerced(self.value(each), each.kind, node.kind) for each in (node.body, node.orelse))
                 return choice(self.value(node.test), *branches)
-            case Call():
+            case tree.Call():
                 return functions.called(self, node)
             case _:
                 raise AssertionError(f"{node.kind} is no list")
 
-    def real(self, node: Tree) -> Code:
+    def real(self, node: tree.Node) -> Code:
         """Return those that put a number there as a real one."""
         return to_real(self.value(node), node.kind)
 
     # messages and their fields
 
-    def message(self, node: Tree) -> tuple[Code, Node]:
+    def message(self, node: tree.Node) -> tuple[Code, Node]:
         """Return the node that has the fields of a message, and the operations that read them into it."""
         match node:
-            case Variable():
+            case tree.Variable():
                 meaning = self.names.variables[node.name]
                 assert isinstance(meaning, Node)  # noqa: S101 - it is a message
                 return (), meaning
-            case Read():
+            case tree.Read():
                 before, holder = self.message(node.holder)
                 return before, holder.message(node.field)
-            case Element():
+            case tree.Element():
                 return lists.entered(self, node)
             case _:
                 raise AssertionError(f"no message is computed, as by {type(node).__name__}")
 
-    def _field(self, node: Read) -> Code:
+    def _field(self, node: tree.Read) -> Code:
         if isinstance(node.kind, TimeKind):
             return self.time(*self.message(node))
         before, holder = self.message(node.holder)
@@ -178,41 +160,41 @@ class Lowering:
         whole = code(load(moment.value(seconds)), integer(NS_PER_SECOND), Operation(Op.MULTIPLY))
         return code(before, whole, load(moment.value(nanoseconds)), Operation(Op.ADD))
 
-    def _variable(self, node: Variable) -> Code:
+    def _variable(self, node: tree.Variable) -> Code:
         meaning = self.names.variables[node.name]
         return (load(meaning),) if isinstance(meaning, Slot) else self.time((), meaning)
 
-    def _element(self, node: Element) -> Code:
+    def _element(self, node: tree.Element) -> Code:
         if isinstance(node.kind, TimeKind) and lists.are_messages(node.values):
             return self.time(*lists.entered(self, node))
         return lists.element(self, node)
 
     # operators
 
-    def _unary(self, node: Unary) -> Code:
+    def _unary(self, node: tree.Unary) -> Code:
         operand = self.value(node.operand)
-        if node.operator is Operator.NOT:
+        if node.operator is tree.Operator.NOT:
             return code(operand, Operation(Op.NOT))
         if isinstance(node.kind, FloatKind):
             return code(to_real(operand, node.operand.kind), Operation(Op.REAL_NEGATE))
         negate = Op.CHECKED_NEGATE if node.is_checked else Op.NEGATE
         return code(operand, Operation(negate, flag=signs(node.kind, node.operand.kind)))
 
-    def _binary(self, node: Binary) -> Code:
+    def _binary(self, node: tree.Binary) -> Code:
         if isinstance(node.kind, StringKind):
             self.names.count_text(functions.longest(node), node.span)
             return code(self.value(node.left), self.value(node.right), Operation(Op.JOIN))
         if isinstance(node.kind, FloatKind):
             return code(self.real(node.left), self.real(node.right), Operation(_REALS[node.operator]))
-        if node.operator is Operator.POWER:
+        if node.operator is tree.Operator.POWER:
             return self._power(node)
         operator = _INTEGERS[node.operator][node.is_checked]
         flag = signs(node.kind, node.left.kind, node.right.kind)
         return code(self.value(node.left), self.value(node.right), Operation(operator, flag=flag))
 
-    def _power(self, node: Binary) -> Code:
+    def _power(self, node: tree.Binary) -> Code:
         """A power of an integer, by multiplication. A lower power fits wherever the result does."""
-        assert isinstance(node.right, Constant)  # noqa: S101 - exponents are literals
+        assert isinstance(node.right, tree.Constant)  # noqa: S101 - exponents are literals
         exponent = int(node.right.value)
         base = self.value(node.left)
         if exponent == 0:
@@ -226,7 +208,7 @@ class Lowering:
         last = load(slot), Operation(multiply, flag=signs(node.kind, kind, kind))
         return code(base, keep(slot), again * (exponent - 2), last)
 
-    def _compare(self, node: Compare) -> Code:
+    def _compare(self, node: tree.Compare) -> Code:
         """Each operand is evaluated once, and none behind a comparison that is false."""
         slots = [self.names.temporary() for _ in node.operands[1:-1]]
         values = list(map(self.value, node.operands))
@@ -250,18 +232,20 @@ def _is_costly(made: Code) -> bool:
     return any(each.kind in _COSTLY or (each.kind is Op.COMPARE and each.slot == Compared.TEXTS) for each in made)
 
 
-def _can_be_kept(node: Tree) -> bool:
+def _can_be_kept(node: tree.Node) -> bool:
     """Whether a value can stay in a slot from turn to turn: no list, and no text that the program puts together."""
     if isinstance(node.kind, StringKind):
-        return isinstance(node, Read) or (isinstance(node, Element) and isinstance(node.values, Read))
-    return not isinstance(node, (Constant, Variable)) and not isinstance(node.kind, (ListKind, MessageKind, BytesKind))
+        return isinstance(node, tree.Read) or (isinstance(node, tree.Element) and isinstance(node.values, tree.Read))
+    return not isinstance(node, (tree.Constant, tree.Variable)) and not isinstance(
+        node.kind, (ListKind, MessageKind, BytesKind)
+    )
 
 
-def _variables(node: Tree) -> Iterator[str]:
+def _variables(node: tree.Node) -> Iterator[str]:
     """The names of all variables that a node reads."""
-    if isinstance(node, Variable):
+    if isinstance(node, tree.Variable):
         yield node.name
-    for part in parts_of(node):
+    for part in tree.parts_of(node):
         yield from _variables(part)
 
 
@@ -269,7 +253,7 @@ def _is_unchecked(holder: Node, member: Field, kind: Kind) -> bool:
     return isinstance(kind, StringKind) and holder.is_unchecked(member)
 
 
-def _constant(node: Constant) -> Code:
+def _constant(node: tree.Constant) -> Code:
     value = node.value
     if isinstance(value, str):
         return (text(value.encode()),)

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
+from router.compiler.expressions import tree
 from router.compiler.expressions.functions import NS_PER_MILLISECOND, NS_PER_SECOND
 from router.compiler.expressions.kinds import (
     BoolKind,
@@ -16,8 +17,6 @@ from router.compiler.expressions.kinds import (
     StringKind,
     TimeKind,
 )
-from router.compiler.expressions.tree import Binary, Call, Choice, Constant, Listed
-from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering import lists
 from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
 from router.compiler.lowering.operations import DROP, WANT, Code, Operation, code, integer, keep, load, real, text
@@ -41,7 +40,7 @@ _LONGEST_DECIMAL, _LONGEST_DIGITS = 20, 1 + 309 + 1 + 17
 """Characters of an integer, and of a double with 17 decimals."""
 
 
-def called(lowering: Lowering, node: Call) -> Code:
+def called(lowering: Lowering, node: tree.Call) -> Code:
     """Return the operations that put the result of a call on the stack."""
     name, first = node.function, node.arguments[0]
     if name in EXTREMES:
@@ -63,7 +62,7 @@ def called(lowering: Lowering, node: Call) -> Code:
 # ---- numbers
 
 
-def _extreme(lowering: Lowering, node: Call) -> Code:
+def _extreme(lowering: Lowering, node: tree.Call) -> Code:
     of_integers, of_reals = EXTREMES[node.function]
     if len(node.arguments) == 1:
         return lists.extreme(lowering, node, of_integers, of_reals)
@@ -80,7 +79,7 @@ def _extreme(lowering: Lowering, node: Call) -> Code:
     return made
 
 
-def _between(lowering: Lowering, node: Call) -> Code:
+def _between(lowering: Lowering, node: tree.Call) -> Code:
     """clamp() and wrap()."""
     of_integers, of_reals = _OF_THREE[node.function]
     if isinstance(node.kind, FloatKind):
@@ -90,14 +89,14 @@ def _between(lowering: Lowering, node: Call) -> Code:
     return code(*map(lowering.value, node.arguments), Operation(of_integers, flag=flag))
 
 
-def _fit(lowering: Lowering, node: Call) -> Code:
+def _fit(lowering: Lowering, node: tree.Call) -> Code:
     first, low, high = node.arguments
-    assert isinstance(low, Constant)  # noqa: S101 - as `tree.CHECKS` says
-    assert isinstance(high, Constant)  # noqa: S101
+    assert isinstance(low, tree.Constant)  # noqa: S101 - as `tree.CHECKS` says
+    assert isinstance(high, tree.Constant)  # noqa: S101
     return fitted(lowering.value(first), first.kind, IntKind(int(low.value), int(high.value)))
 
 
-def _time(lowering: Lowering, node: Tree, factor: int) -> Code:
+def _time(lowering: Lowering, node: tree.Node, factor: int) -> Code:
     """A time in nanoseconds. It is refused if it does not fit 64 bits."""
     if isinstance(node.kind, FloatKind):
         return code(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
@@ -105,7 +104,7 @@ def _time(lowering: Lowering, node: Tree, factor: int) -> Code:
     return code(lowering.value(node), integer(factor), Operation(Op.CHECKED_MULTIPLY, flag=flag))
 
 
-def _absolute(lowering: Lowering, node: Call) -> Code:
+def _absolute(lowering: Lowering, node: tree.Call) -> Code:
     (first,) = node.arguments
     made = lowering.value(first)
     if isinstance(node.kind, FloatKind):
@@ -113,14 +112,14 @@ def _absolute(lowering: Lowering, node: Call) -> Code:
     return code(made, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else made
 
 
-def _seconds(lowering: Lowering, node: Call) -> Code:
+def _seconds(lowering: Lowering, node: tree.Call) -> Code:
     return code(lowering.real(node.arguments[0]), real(NS_PER_SECOND), Operation(Op.REAL_DIVIDE))
 
 
 # ---- enums
 
 
-def _named(lowering: Lowering, node: Call) -> Code:
+def _named(lowering: Lowering, node: tree.Call) -> Code:
     """The number of a name. Another text is refused."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
@@ -131,7 +130,7 @@ def _named(lowering: Lowering, node: Call) -> Code:
     return code(lowering.value(node.arguments[0]), keep(slot), DROP, found)
 
 
-def _member(lowering: Lowering, node: Call) -> Code:
+def _member(lowering: Lowering, node: tree.Call) -> Code:
     """A number of a closed enum. Another one is refused."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     numbers = sorted({number for _, number in node.kind.enum.values})
@@ -142,25 +141,25 @@ def _member(lowering: Lowering, node: Call) -> Code:
 # ---- text and bytes
 
 
-def longest(node: Tree) -> int:
+def longest(node: tree.Node) -> int:
     """Return the bytes that a text has at the most. One of a ROS message can be longer: the machine refuses it then."""
     match node:
-        case Constant(value=str(value)):
+        case tree.Constant(value=str(value)):
             return len(value.encode())
-        case Binary():
+        case tree.Binary():
             return longest(node.left) + longest(node.right)
-        case Choice():
+        case tree.Choice():
             return max(longest(node.body), longest(node.orelse))
-        case Call(function="str"):
+        case tree.Call(function="str"):
             is_text = isinstance(node.arguments[0].kind, StringKind)
             return longest(node.arguments[0]) if is_text else _LONGEST_DECIMAL
-        case Call(function="text"):
+        case tree.Call(function="text"):
             return _LONGEST_DIGITS
         case _:
             return MAX_DATAGRAM
 
 
-def _str(lowering: Lowering, node: Call) -> Code:
+def _str(lowering: Lowering, node: tree.Call) -> Code:
     (first,) = node.arguments
     made = lowering.value(first)
     if isinstance(first.kind, StringKind):
@@ -172,39 +171,39 @@ def _str(lowering: Lowering, node: Call) -> Code:
     return code(made, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
 
 
-def _text(lowering: Lowering, node: Call) -> Code:
+def _text(lowering: Lowering, node: tree.Call) -> Code:
     number, digits = node.arguments
-    assert isinstance(digits, Constant)  # noqa: S101 - it is a literal
+    assert isinstance(digits, tree.Constant)  # noqa: S101 - it is a literal
     lowering.names.count_text(_LONGEST_DIGITS, node.span)
     return code(lowering.real(number), Operation(Op.DIGITS, int(digits.value)))
 
 
-def _length(lowering: Lowering, node: Call) -> Code:
+def _length(lowering: Lowering, node: tree.Call) -> Code:
     (first,) = node.arguments
     if isinstance(first.kind, StringKind):
         return code(lowering.value(first), Operation(Op.CHARACTERS))
     return lists.length(lowering, first)
 
 
-def _fit_text(lowering: Lowering, node: Call) -> Code:
+def _fit_text(lowering: Lowering, node: tree.Call) -> Code:
     first, most = node.arguments
-    assert isinstance(most, Constant)  # noqa: S101 - as `tree.CHECKS` says
+    assert isinstance(most, tree.Constant)  # noqa: S101 - as `tree.CHECKS` says
     return code(lowering.value(first), Operation(Op.FIT_SIZE, number=int(most.value)))
 
 
-def _octets(lowering: Lowering, node: Call) -> Code:
+def _octets(lowering: Lowering, node: tree.Call) -> Code:
     (first,) = node.arguments
-    if isinstance(first, Listed) and all(isinstance(item, Constant) for item in first.items):
-        return (text(bytes(int(item.value) for item in first.items if isinstance(item, Constant))),)
+    if isinstance(first, tree.Listed) and all(isinstance(item, tree.Constant) for item in first.items):
+        return (text(bytes(int(item.value) for item in first.items if isinstance(item, tree.Constant))),)
     made = lists.stored(lowering, first)
     return made.code if made.is_octets else code(made.code, Operation(Op.OCTETS, flag=made.scalar))
 
 
-def _same(lowering: Lowering, node: Call) -> Code:
+def _same(lowering: Lowering, node: tree.Call) -> Code:
     return lowering.value(node.arguments[0])
 
 
-_OTHERS: Mapping[str, Callable[[Lowering, Call], Code]] = {
+_OTHERS: Mapping[str, Callable[[Lowering, tree.Call], Code]] = {
     "abs": _absolute,
     "fit": _fit,
     "float64": lambda lowering, node: lowering.real(node.arguments[0]),

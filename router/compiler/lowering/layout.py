@@ -19,27 +19,7 @@ from router.declared import NONE, FieldType, ReadKind, Scalar
 from router.types.descriptors import enum_of
 from router.types.model import Field as Member
 from router.types.model import MessageType
-
-_FIELD_TYPES = {
-    FieldDescriptor.TYPE_BOOL: FieldType.BOOL,
-    FieldDescriptor.TYPE_ENUM: FieldType.INT32,
-    FieldDescriptor.TYPE_INT32: FieldType.INT32,
-    FieldDescriptor.TYPE_INT64: FieldType.INT64,
-    FieldDescriptor.TYPE_UINT32: FieldType.UINT32,
-    FieldDescriptor.TYPE_UINT64: FieldType.INT64,
-    FieldDescriptor.TYPE_SINT32: FieldType.SINT32,
-    FieldDescriptor.TYPE_SINT64: FieldType.SINT64,
-    FieldDescriptor.TYPE_FIXED32: FieldType.FIXED32,
-    FieldDescriptor.TYPE_SFIXED32: FieldType.SFIXED32,
-    FieldDescriptor.TYPE_FIXED64: FieldType.FIXED64,
-    FieldDescriptor.TYPE_SFIXED64: FieldType.FIXED64,
-    FieldDescriptor.TYPE_FLOAT: FieldType.FLOAT,
-    FieldDescriptor.TYPE_DOUBLE: FieldType.DOUBLE,
-    FieldDescriptor.TYPE_STRING: FieldType.BYTES,
-    FieldDescriptor.TYPE_BYTES: FieldType.BYTES,
-    FieldDescriptor.TYPE_MESSAGE: FieldType.MESSAGE,
-    FieldDescriptor.TYPE_GROUP: FieldType.GROUP,
-}
+from router.types.wire import kind_of
 
 
 class NodeField(NamedTuple):
@@ -176,7 +156,7 @@ class _ProtobufNumbering(Numbering):
         closed = self._closed(declared)
         return NodeField(
             declared.number,
-            _FIELD_TYPES[declared.type] if closed == NONE else FieldType.CLOSED_ENUM,
+            kind_of(declared).read if closed == NONE else FieldType.CLOSED_ENUM,
             declared.is_repeated,
             slot,
             presence,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import (
     OCTET,
     BytesKind,
@@ -20,21 +21,7 @@ from router.compiler.expressions.kinds import (
     StringKind,
     TimeKind,
     element_of,
-    kind_of,
 )
-from router.compiler.expressions.tree import (
-    MESSAGE,
-    Call,
-    Choice,
-    Contains,
-    Each,
-    Element,
-    Listed,
-    Read,
-    Relation,
-    Variable,
-)
-from router.compiler.expressions.tree import Node as Tree
 from router.compiler.lowering.names import Loop
 from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs
@@ -83,36 +70,36 @@ class Stored:
         return self.scalar is Scalar.UINT8
 
 
-def stored(lowering: Lowering, node: Tree) -> Stored:
+def stored(lowering: Lowering, node: tree.Node) -> Stored:
     """Lower a list, or bytes."""
     match node:
-        case Read() if isinstance(node.kind, ListKind):
+        case tree.Read() if isinstance(node.kind, ListKind):
             return _read(lowering, node)
-        case Variable():
+        case tree.Variable():
             return _payloads(lowering, node)
-        case Listed():
+        case tree.Listed():
             return _listed(lowering, node)
-        case Each():
+        case tree.Each():
             return _computed(lowering, node)
-        case Choice():
+        case tree.Choice():
             return _chosen(lowering, node)
         case _:
             assert isinstance(node.kind, BytesKind)  # noqa: S101 - nothing else gives a list
-            return Stored(lowering.value(node), Scalar.UINT8, kind_of(OCTET))
+            return Stored(lowering.value(node), Scalar.UINT8, OCTET)
 
 
-def are_messages(node: Tree) -> bool:
+def are_messages(node: tree.Node) -> bool:
     """Whether the elements of a list are messages that have to be read. Times in a field are, computed ones are not."""
     match node:
-        case Read():
+        case tree.Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
-        case Variable() | Listed() | Choice():
+        case tree.Variable() | tree.Listed() | tree.Choice():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, MessageKind)
         case _:
             return False
 
 
-def _read(lowering: Lowering, node: Read) -> Stored:
+def _read(lowering: Lowering, node: tree.Read) -> Stored:
     before, holder = lowering.message(node.holder)
     assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
     element = node.kind.element
@@ -122,9 +109,9 @@ def _read(lowering: Lowering, node: Read) -> Stored:
     return Stored(made, holder.stored(node.field), element, message, is_unchecked)
 
 
-def _payloads(lowering: Lowering, node: Variable) -> Stored:
+def _payloads(lowering: Lowering, node: tree.Variable) -> Stored:
     """`items` of `collect`: the only variable with a list, of messages like the source message."""
-    items, payload = lowering.names.variables[node.name], lowering.names.variables[MESSAGE]
+    items, payload = lowering.names.variables[node.name], lowering.names.variables[tree.MESSAGE]
     assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
     assert isinstance(payload, Node)  # noqa: S101
     assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
@@ -132,7 +119,7 @@ def _payloads(lowering: Lowering, node: Variable) -> Stored:
     return Stored((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
 
-def _listed(lowering: Lowering, node: Listed) -> Stored:
+def _listed(lowering: Lowering, node: tree.Listed) -> Stored:
     element = node.kind.element
     items = [code(lowering.value(item), *_as(item.kind, element)) for item in node.items]
     message: Node | None = None
@@ -154,7 +141,7 @@ def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
     return coerced((), kind, element) if element is not None else ()
 
 
-def _computed(lowering: Lowering, node: Each) -> Stored:
+def _computed(lowering: Lowering, node: tree.Each) -> Stored:
     made = lowering.names.temporary()
 
     def append() -> Code:
@@ -166,7 +153,7 @@ def _computed(lowering: Lowering, node: Each) -> Stored:
     return Stored(filled, Scalar.IN_CELLS, node.kind.element)
 
 
-def _chosen(lowering: Lowering, node: Choice) -> Stored:
+def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
     """Choose between two lists, which are made alike: stored in the same way, with elements of the same kind."""
     body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
@@ -201,7 +188,7 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
 
 
 def looped(
-    lowering: Lowering, lists: Sequence[tuple[str, Tree]], body: Callable[[], Code], *, keeps: bool = False
+    lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Code], *, keeps: bool = False
 ) -> Code:
     """Repeat `body`, which uses the variables of `lists`, for their elements side by side.
 
@@ -216,7 +203,7 @@ Taken = tuple[str, Stored, Slot]
 """A variable, its list, and the slot with the elements that are left."""
 
 
-def gone_through(lowering: Lowering, lists: Sequence[tuple[str, Tree]]) -> tuple[Code, list[Taken]]:
+def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Code, list[Taken]]:
     """Copy lists to slots, and put their number of elements on the stack. Lists of different length are refused."""
     made: Code = ()
     taken: list[Taken] = []
@@ -270,13 +257,13 @@ def _without_a_detour(made: Code) -> Code:
 # ---- elements
 
 
-def element(lowering: Lowering, node: Element) -> Code:
+def element(lowering: Lowering, node: tree.Element) -> Code:
     """Lower an element: a scalar, text or bytes, or a message that becomes an element of another list."""
     of = checked_list(lowering, node.values)
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
 
 
-def entered(lowering: Lowering, node: Element) -> tuple[Code, Node]:
+def entered(lowering: Lowering, node: tree.Element) -> tuple[Code, Node]:
     """Read a message in a list into a node."""
     of = stored(lowering, node.values)
     assert of.message is not None  # noqa: S101 - said by the caller
@@ -284,7 +271,7 @@ def entered(lowering: Lowering, node: Element) -> tuple[Code, Node]:
     return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)), made
 
 
-def checked_list(lowering: Lowering, node: Tree) -> Stored:
+def checked_list(lowering: Lowering, node: tree.Node) -> Stored:
     """Lower a list, and check that all its texts are UTF-8."""
     of = stored(lowering, node)
     if not of.is_unchecked:
@@ -297,31 +284,31 @@ def checked_list(lowering: Lowering, node: Tree) -> Stored:
 # ---- whole lists
 
 
-def length(lowering: Lowering, node: Tree) -> Code:
+def length(lowering: Lowering, node: tree.Node) -> Code:
     """Lower len() of a list. A message of a literal is no value, but it has to be there."""
-    if isinstance(node, Listed) and are_messages(node):
+    if isinstance(node, tree.Listed) and are_messages(node):
         return code(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
     return code(checked_list(lowering, node).code, SIZE)
 
 
-def contains(lowering: Lowering, node: Contains) -> Code:
+def contains(lowering: Lowering, node: tree.Contains) -> Code:
     """Lower `in`. All elements are evaluated."""
     sought = lowering.names.temporary()
     found = code(lowering.value(node.sought), keep(sought), DROP, integer(0))
     again = (load(sought),)
 
     def look(one: Code, kind: Kind) -> Code:
-        is_it = compare(Relation.EQUAL, one, again, kind, node.sought.kind)
+        is_it = compare(tree.Relation.EQUAL, one, again, kind, node.sought.kind)
         return code(is_it, Operation(Op.EITHER))
 
-    if isinstance(node.values, Listed):
+    if isinstance(node.values, tree.Listed):
         found = code(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
     else:
         found = code(found, _folded(lowering, node.values, look))
     return code(found, Operation(Op.NOT)) if node.is_negated else found
 
 
-def total(lowering: Lowering, node: Call) -> Code:
+def total(lowering: Lowering, node: tree.Call) -> Code:
     """Lower sum(). Each partial sum of integers is checked."""
     (values,) = node.arguments
     is_real = isinstance(node.kind, FloatKind)
@@ -334,7 +321,7 @@ def total(lowering: Lowering, node: Call) -> Code:
     return code(real(0.0) if is_real else integer(0), _folded(lowering, values, add))
 
 
-def extreme(lowering: Lowering, node: Call, of_integers: Op, of_reals: Op) -> Code:
+def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Code:
     """Lower min() or max() of a list. It begins with the first element, and is refused if there is none."""
     of = stored(lowering, node.arguments[0])
     kind = of.element
@@ -347,14 +334,14 @@ def extreme(lowering: Lowering, node: Call, of_integers: Op, of_reals: Op) -> Co
     return coerced(code(first, rest), kind, node.kind)
 
 
-def _folded(lowering: Lowering, values: Tree, step: Callable[[Code, Kind], Code]) -> Code:
+def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Code, Kind], Code]) -> Code:
     """Combine each element with the value on the stack. A computed list is not stored for that."""
-    if isinstance(values, Each):
+    if isinstance(values, tree.Each):
         each = values
     else:
         kind = element_of(values.kind)
         assert kind is not None  # noqa: S101 - it is compared or added
         name = f"element {len(lowering.names.temporaries)}"
         listed = values.kind if isinstance(values.kind, ListKind) else ListKind(kind)
-        each = Each(listed, values.span, ((name, values),), Variable(kind, values.span, name))
+        each = tree.Each(listed, values.span, ((name, values),), tree.Variable(kind, values.span, name))
     return looped(lowering, each.lists, lambda: step(lowering.value(each.element), each.element.kind))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import (
     INT64,
     BoolKind,
@@ -14,7 +15,6 @@ from router.compiler.expressions.kinds import (
     StringKind,
     as_int,
 )
-from router.compiler.expressions.tree import Relation as TreeRelation
 from router.compiler.lowering.operations import Code, Operation, code, integer
 from router.declared import Compared, Op, Relation, Sign
 
@@ -73,7 +73,7 @@ _SWAPPED: Mapping[Relation, Relation] = {
 """Relations of the same two values in the other order, where that is another one."""
 
 
-def compare(relation: TreeRelation, left: Code, right: Code, left_kind: Kind, right_kind: Kind) -> Code:
+def compare(relation: tree.Relation, left: Code, right: Code, left_kind: Kind, right_kind: Kind) -> Code:
     """Whether a relation holds, exactly. The operation wants an integer in front of a real number, and a signed one
     in front of an unsigned one: so the right operand may be evaluated first.
     """

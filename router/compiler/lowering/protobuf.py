@@ -6,7 +6,7 @@ The bytes are those of the protobuf library: fields by ascending number, what ha
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
@@ -19,21 +19,7 @@ from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op
 from router.types.descriptors import container, message_of
 from router.types.protobuf import PayloadCase
-from router.types.wire import GROUP, GROUP_END, LEN, varint, wire_type_of
-
-_WRITES: Mapping[int, Op] = {
-    FieldDescriptor.TYPE_SINT32: Op.WRITE_ZIGZAG,
-    FieldDescriptor.TYPE_SINT64: Op.WRITE_ZIGZAG,
-    FieldDescriptor.TYPE_FIXED32: Op.WRITE_FIXED32,
-    FieldDescriptor.TYPE_SFIXED32: Op.WRITE_FIXED32,
-    FieldDescriptor.TYPE_FIXED64: Op.WRITE_FIXED64,
-    FieldDescriptor.TYPE_SFIXED64: Op.WRITE_FIXED64,
-    FieldDescriptor.TYPE_FLOAT: Op.WRITE_FLOAT,
-    FieldDescriptor.TYPE_DOUBLE: Op.WRITE_DOUBLE,
-    FieldDescriptor.TYPE_STRING: Op.WRITE_BYTES,
-    FieldDescriptor.TYPE_BYTES: Op.WRITE_BYTES,
-}
-"""By type of a field; all others are varints."""
+from router.types.wire import GROUP, GROUP_END, LEN, kind_of, varint
 
 _CLOSE = Operation(Op.CLOSE)
 
@@ -105,7 +91,7 @@ class _Writer:
             data = _encoded(made.constant, to)
             is_written = is_always or _is_set(made.constant, to)
             return at(place, known(varint(tag) * bool(tag) + data)) if is_written else []
-        write = _WRITES.get(to.type, Op.WRITE_VARINT)
+        write = kind_of(to).write
         return at(place, self._value(made, write), Operation(write, flag=is_always, size=tag))
 
     def _value(self, made: Leaf, write: Op) -> Code:
@@ -114,7 +100,7 @@ class _Writer:
 
 
 def _tag(to: FieldDescriptor) -> int:
-    return to.number << 3 | wire_type_of(to)
+    return to.number << 3 | kind_of(to).wire_type
 
 
 # ---- known bytes
@@ -122,7 +108,7 @@ def _tag(to: FieldDescriptor) -> int:
 
 def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
     """A constant without its tag."""
-    write = _WRITES.get(to.type, Op.WRITE_VARINT)
+    write = kind_of(to).write
     if write is Op.WRITE_FLOAT:
         return struct.pack("<f", value)
     if write is Op.WRITE_DOUBLE:
@@ -131,18 +117,15 @@ def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
         return varint(len(value.encode())) + value.encode()
     number = int(value)
     if write is Op.WRITE_FIXED32:
-        return (number & 0xFFFF_FFFF).to_bytes(4, "little")
+        return struct.pack("<i" if number < 0 else "<I", number)
     if write is Op.WRITE_FIXED64:
-        return (number & _ALL_BITS).to_bytes(8, "little")
-    return varint((number << 1 ^ number >> 63 if write is Op.WRITE_ZIGZAG else number) & _ALL_BITS)
-
-
-_ALL_BITS = (1 << 64) - 1
+        return struct.pack("<q" if number < 0 else "<Q", number)
+    return varint(number << 1 ^ number >> 63 if write is Op.WRITE_ZIGZAG else number)
 
 
 def _is_set(value: bool | float | str, to: FieldDescriptor) -> bool:
     """Whether a constant is not zero, which has no presence. Minus zero is not."""
-    is_real = _WRITES.get(to.type) in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
+    is_real = kind_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
 
 
