@@ -152,7 +152,7 @@ class Router:
         self._services.save_recording(reason)
 
     def _open_services(self, change: Change, opening: ExitStack) -> None:
-        diagnostics = change.topics.publications.get(DIAGNOSTICS) if change.topics else None
+        diagnostics = change.ros.publications.get(DIAGNOSTICS) if change.ros else None
         self._services.open(opening, (self._runtime.node_name, diagnostics.publish) if diagnostics else None)
         opening.callback(self.mirror.close)
 

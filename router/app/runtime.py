@@ -40,7 +40,7 @@ class Change:
     """A prepared program. `undo` closes what was opened for it."""
 
     sockets: SocketChange
-    topics: RosChange | None
+    ros: RosChange | None
     built: Built
     gateways: GatewayChange | None
     undo: ExitStack
@@ -155,8 +155,8 @@ class Runtime:
             change.undo.close()
             raise
         self.sockets.apply(change.sockets)
-        if self._ros is not None and change.topics is not None:
-            self._ros.apply(change.topics)
+        if self._ros is not None and change.ros is not None:
+            self._ros.apply(change.ros)
 
     def finish(self, change: Change, earlier: Built | None) -> None:
         """Watch the peers of new topics, and close what only the earlier program used.
@@ -167,8 +167,8 @@ class Runtime:
         change.undo.pop_all()  # discarded
         with ExitStack() as last_first:
             last_first.callback(self._close_passed, change, earlier)
-            if self._ros is not None and change.topics is not None:
-                self._ros.watch(change.topics)
+            if self._ros is not None and change.ros is not None:
+                self._ros.watch(change.ros)
 
     def take_over(self, change: Change) -> None:
         """Adopt the prepared program, and finish. Raises StuckError or StartError, with nothing changed.
@@ -205,8 +205,8 @@ class Runtime:
     def _close_left(self, change: Change, earlier: Built | None) -> None:
         with ExitStack() as last_first:
             last_first.callback(change.sockets.left.close)
-            if self._ros is not None and change.topics is not None:
-                last_first.callback(self._ros.finish, change.topics)
+            if self._ros is not None and change.ros is not None:
+                last_first.callback(self._ros.finish, change.ros)
             last_first.callback(change.built.state.forget_previous)
             if earlier is not None:
                 last_first.callback(self.plane.end, earlier)

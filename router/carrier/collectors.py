@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Sequence
 
 from router import declared as c
-from router.carrier.lowered import Programs
+from router.carrier.lowered import Routines
 from router.carrier.state import State
 from router.compiler.lowering import LoweredCollect
 from router.compiler.program import RoutePlan
@@ -34,14 +34,14 @@ def kept_collector(library: ctypes.CDLL, state: State, plan: RoutePlan) -> Nativ
     return state.keep(key, lambda: NativeCollector(library, timeout))
 
 
-def native_collect(lowered: LoweredCollect, programs: Programs, senders: Sequence[int]) -> c.Collect:
-    """Without a collector. `senders` are numbers of names, by column. The programs are those of the route."""
+def native_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:
+    """Without a collector. `senders` are numbers of names, by column. The routines are those of the route."""
     numbers = (ctypes.c_uint32 * len(senders))(*senders)
-    programs.arrays.append(numbers)
+    routines.arrays.append(numbers)
     return c.Collect(
-        by=programs.code(lowered.by),
-        count=programs.code(lowered.count),
-        order=programs.code(lowered.order),
+        by=routines.routine(lowered.by),
+        count=routines.routine(lowered.count),
+        order=routines.routine(lowered.order),
         senders=numbers,
         is_text=lowered.is_text,
         signs=lowered.signs,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-from router.carrier.lowered import Programs, native_values
+from router.carrier.lowered import Routines, native_values
 from router.compiler.lowering import LoweredCondition
 from router.declared import EVALUATED, LOSSES
 
@@ -14,9 +14,9 @@ class NativeCondition:
 
     def __init__(self, library: ctypes.CDLL, lowered: LoweredCondition) -> None:
         self._arrays: list[object] = []
-        programs = Programs(lowered.layout, self._arrays)
-        self._code = programs.code(lowered.code)
-        self._layout = programs.layout()
+        routines = Routines(lowered.layout, self._arrays)
+        self._routine = routines.routine(lowered.routine)
+        self._layout = routines.layout()
         self._holds = library.condition_holds
 
     def holds(self, payload: bytes, source: str, received_at: int) -> bool | None:
@@ -26,8 +26,8 @@ class NativeCondition:
         """
         named: list[object] = []
         sender, holds = native_values([source.encode()], named), ctypes.c_bool()
-        code, size = ctypes.byref(self._code), len(payload)
-        outcome = self._holds(self._layout, code, sender, received_at, payload, size, ctypes.byref(holds))
+        routine, size = ctypes.byref(self._routine), len(payload)
+        outcome = self._holds(self._layout, routine, sender, received_at, payload, size, ctypes.byref(holds))
         if outcome == LOSSES:
             raise MemoryError("a condition cannot be evaluated")
         return holds.value if outcome == EVALUATED else None

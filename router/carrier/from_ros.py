@@ -12,7 +12,7 @@ from time import sleep
 from typing import Protocol
 
 from router import declared as c
-from router.carrier.lowered import Programs
+from router.carrier.lowered import Routines
 from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.targets import TargetStates, TargetWriter
@@ -73,10 +73,10 @@ def native_from_ros(program: Program, generation: int, outlets: Outlets) -> Nati
 
 def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
     assert plan.topic is not None  # noqa: S101 - of a route from ROS
-    counters, programs = writer.program.counters, Programs(feed.layout, writer.arrays)
-    targets = writer.targets(plan, plan.targets, feed.targets, programs)
-    for_each = native_for_each(feed.for_each, programs)
-    targets.layout = programs.layout()
+    counters, routines = writer.program.counters, Routines(feed.layout, writer.arrays)
+    targets = writer.targets(plan, plan.targets, feed.targets, routines)
+    for_each = native_for_each(feed.for_each, routines)
+    targets.layout = routines.layout()
     seconds, nanoseconds = feed.stamp or (NONE, NONE)
     return c.RosRoute(
         targets=targets,
@@ -89,14 +89,14 @@ def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRou
     )
 
 
-def native_for_each(elements: LoweredElements | None, programs: Programs) -> c.ForEach:
+def native_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
     """`for_each` of a route, None without."""
     if elements is None:
         return c.ForEach()
     return c.ForEach(
-        list=programs.code(elements.code),
+        list=routines.routine(elements.routine),
         stored=elements.scalar,
-        node=elements.node,
+        section=elements.section,
         item=elements.item,
         index=elements.index,
         count=elements.count,

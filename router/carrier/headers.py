@@ -42,13 +42,13 @@ class HeaderError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class _Member:
-    """A field: its type, the number of `*`, and the size of an array. `parts` are the members of a union instead."""
+    """A field: its type, the number of `*`, and the size of an array. `members` are those of a union instead."""
 
     name: str
     type: str
     pointers: int = 0
     size: str = ""
-    parts: tuple[_Member, ...] = ()
+    members: tuple[_Member, ...] = ()
 
 
 @dataclass(slots=True)
@@ -162,7 +162,7 @@ def _inside(body: str) -> str:
 
 
 def _declare_enum(tag: str, body: str, declared: _Declared) -> None:
-    enumerators = [tuple(part.strip() for part in each.partition("=")[::2]) for each in _split(body, ",")]
+    enumerators = [tuple(word.strip() for word in each.partition("=")[::2]) for each in _split(body, ",")]
     names = [name for name, _ in enumerators]
     prefix = names[0].partition("_")[0] + "_"
     if sum(name.startswith(prefix) for name in names) < max(2, len(names) - 1):
@@ -190,10 +190,10 @@ def _members(body: str) -> list[_Member] | None:
     made: list[_Member] = []
     for text in _split(body):
         if text.startswith("union {"):
-            parts = _members(_inside(text.partition("{")[2]))
-            if parts is None:
+            members = _members(_inside(text.partition("{")[2]))
+            if members is None:
                 return None
-            made.append(_Member(f"_{len(made)}", "union", parts=tuple(parts)))
+            made.append(_Member(f"_{len(made)}", "union", members=tuple(members)))
             continue
         found = _TYPE.fullmatch(_plain(text))
         if found is None or "(" in text or "_Atomic" in text:
@@ -279,8 +279,8 @@ def _known(structures: Mapping[str, list[_Member]]) -> Iterator[tuple[str, list[
     known: set[str] = set()
 
     def is_known(member: _Member) -> bool:
-        if member.pointers or member.parts:
-            return all(map(is_known, member.parts))
+        if member.pointers or member.members:
+            return all(map(is_known, member.members))
         return member.type in _PLAIN or member.type.startswith("enum ") or member.type.removeprefix("struct ") in known
 
     for tag, members in structures.items():
@@ -292,10 +292,10 @@ def _known(structures: Mapping[str, list[_Member]]) -> Iterator[tuple[str, list[
 def _fields(owner: str, members: Iterable[_Member], known: Mapping[str, object]) -> Iterator[str]:
     lines, unions = [], []
     for each in members:
-        if each.parts:
+        if each.members:
             union = f"_{owner}{each.name}"
             yield f"\n\nclass {union}(ctypes.Union):\n    pass\n\n"
-            yield from _fields(union, each.parts, known)
+            yield from _fields(union, each.members, known)
             unions.append(each.name)
             lines.append(f'("{each.name}", {union})')
         else:

@@ -1,4 +1,4 @@
-"""The arrays of lowered programs: operations, layouts and values, as `native/operations.h` declares them."""
+"""The arrays of lowered routines: operations, layouts and values, as `native/operations.h` declares them."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
-from router.compiler.lowering.layout import Layout, NodeField, PlacedNode, ReadOperation
-from router.compiler.lowering.operations import Code
+from router.compiler.lowering.layout import Layout, PlacedSection, ReadOperation, WantedField
+from router.compiler.lowering.operations import Routine
 
 
 @dataclass(slots=True)
-class Programs:
-    """Makes the programs of one layout. `arrays` gets what has to live as long as they do."""
+class Routines:
+    """Makes the routines of one layout. `arrays` gets what has to live as long as they do."""
 
     _layout: Layout
     arrays: list[object]
     _literals: bytearray = field(default_factory=bytearray)
 
-    def code(self, code: Code) -> c.Code:
-        if not code:
-            return c.Code()
-        made = (c.Operation * len(code))()
-        for to, (kind, slot, flag, size, number, data) in zip(made, code, strict=True):
+    def routine(self, routine: Routine) -> c.Routine:
+        if not routine:
+            return c.Routine()
+        made = (c.Operation * len(routine))()
+        for to, (kind, slot, flag, size, number, data) in zip(made, routine, strict=True):
             if data:
                 number = len(self._literals)  # noqa: PLW2901 - where the data stands
                 self._literals += data
@@ -35,15 +35,15 @@ class Programs:
             else:
                 to.integer = number
         self.arrays.append(made)
-        return c.Code(operations=made, count=len(code))
+        return c.Routine(operations=made, count=len(routine))
 
     def layout(self) -> Any:
-        """A pointer to the layout, once all code was made: its literals are those of the code."""
+        """A pointer to the layout, once all routines were made: its literals are theirs."""
         layout = self._layout
-        nodes = [self._node(node) for node in layout.nodes]
+        sections = [self._section(section) for section in layout.sections]
         closed = [self._closed(numbers) for numbers in layout.closed]
         made = c.Layout(
-            nodes=(c.Node * len(nodes))(*nodes),
+            sections=(c.Section * len(sections))(*sections),
             defaults=native_values(layout.defaults, self.arrays),
             closed=(c.ClosedEnum * len(closed))(*closed),
             literals=bytes(self._literals),
@@ -53,13 +53,13 @@ class Programs:
         self.arrays.append(made)
         return ctypes.pointer(made)
 
-    def _node(self, node: PlacedNode) -> c.Node:
-        made = c.Node(count=len(node.entries), first_slot=node.first_slot, slot_count=node.slot_count)
-        entries = map(_native_entry, node.entries)
+    def _section(self, section: PlacedSection) -> c.Section:
+        made = c.Section(count=len(section.reads), first_slot=section.first_slot, slot_count=section.slot_count)
+        reads = map(_native_read, section.reads)
         if self._layout.is_cdr:
-            made.steps = (c.ReadOperation * made.count)(*entries)
+            made.steps = (c.ReadOperation * made.count)(*reads)
         else:
-            made.fields = (c.NodeField * made.count)(*entries)
+            made.fields = (c.WantedField * made.count)(*reads)
         self.arrays.append(made)
         return made
 
@@ -69,10 +69,10 @@ class Programs:
         return c.ClosedEnum(numbers=made, count=len(numbers))
 
 
-def _native_entry(entry: NodeField | ReadOperation) -> c.NodeField | c.ReadOperation:
-    if isinstance(entry, NodeField):
-        return c.NodeField(**entry._asdict())
-    return c.ReadOperation(kind=entry.kind, size=entry.size, type=entry.type, slot=entry.slot, count=entry.elements)
+def _native_read(read: WantedField | ReadOperation) -> c.WantedField | c.ReadOperation:
+    if isinstance(read, WantedField):
+        return c.WantedField(**read._asdict())
+    return c.ReadOperation(kind=read.kind, size=read.size, type=read.type, slot=read.slot, count=read.elements)
 
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: list[object]) -> ctypes.Array[c.Value]:

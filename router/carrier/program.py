@@ -106,7 +106,7 @@ class _Writer:
             repairs=framing is Framing.ZERO_TRIMMED,
             keeps_input=opened.is_inherited,
             peers=self.array(c.Peer, peers),
-            entries=self.array(c.Entry, list(self._entries())),
+            choices=self.array(c.Choice, list(self._choices())),
             peer_count=len(peers),
             columns=len(self.columns) + 1,
             received=counters.index("datagrams_received", name),
@@ -125,21 +125,21 @@ class _Writer:
             number = self.outlets.names.number(name)
             yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen, id=number)
 
-    def _entries(self) -> Iterator[c.Entry]:
+    def _choices(self) -> Iterator[c.Choice]:
         """Row by row, as in `cases`: a column for each endpoint, and the last one for strangers."""
         for plans in self.program.inbound.values():
             by_source = {source: plan for plan in plans for source in plan.sources}
-            stranger = self._entry(by_source.get(STRANGER), STRANGER)
+            stranger = self._choice(by_source.get(STRANGER), STRANGER)
             for name in self.columns:
                 found = by_source.get(name)
-                yield self._entry(found, name) if found else stranger
+                yield self._choice(found, name) if found else stranger
             yield stranger
 
-    def _entry(self, plan: RoutePlan | None, source: str | None) -> c.Entry:
+    def _choice(self, plan: RoutePlan | None, source: str | None) -> c.Choice:
         if plan is None:
-            return c.Entry(route=-1)
+            return c.Choice(route=-1)
         received = self.counters.index("messages_received", plan.route, source_label(source))
-        return c.Entry(route=self.numbers[plan.route], received=received)
+        return c.Choice(route=self.numbers[plan.route], received=received)
 
     # routes
 
@@ -148,12 +148,12 @@ class _Writer:
         topics = [target for target in plan.targets if target.is_topic]
         destinations = [target for target in plan.targets if not target.is_topic]
         made = c.Route(
-            sends=of_datagrams(plan, destinations, lowered.conditions.get(plan.route)),
+            sends=of_datagrams(plan, destinations, lowered.to_destinations.get(plan.route)),
             last_message=self.counters.index("route_last_message_timestamp_seconds", plan.route),
             duration=self.counters.index("route_duration_seconds", plan.route),
         )
         if topics:
-            made.publishes = of_datagrams(plan, topics, lowered.topics[plan.route])
+            made.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
         return made
 
 

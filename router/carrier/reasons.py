@@ -29,5 +29,5 @@ def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, 
     if topic is not None:
         serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
     else:
-        serving = [by_route[route] for by_route in (lowered.topics, lowered.conditions) if route in by_route]
+        serving = [by_route[route] for by_route in (lowered.to_topics, lowered.to_destinations) if route in by_route]
     return next(each.targets[target] for each in serving if target in each.targets).places[place]

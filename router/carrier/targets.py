@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from router import declared as c
 from router.carrier.collectors import native_collect
 from router.carrier.deferrals import Adoption, held_period
-from router.carrier.lowered import Programs, native_values
+from router.carrier.lowered import Routines, native_values
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredRoute, LoweredTarget
@@ -87,16 +87,16 @@ class TargetWriter:
     _sources: ctypes.Array[c.Value] | None = None
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
-        """Targets that get datagrams; `lowered` are the programs of those that have some."""
+        """Targets that get datagrams; `lowered` are the routines of those that have some."""
         if lowered is None:
             return self.targets(plan, targets, {}, None)
-        programs = Programs(lowered.layout, self.arrays)
-        made = self.targets(plan, targets, lowered.targets, programs)
+        routines = Routines(lowered.layout, self.arrays)
+        made = self.targets(plan, targets, lowered.targets, routines)
         if lowered.collect is not None:
-            collect = native_collect(lowered.collect, programs, self._ids_of_senders())
+            collect = native_collect(lowered.collect, routines, self._ids_of_senders())
             made.collect = ctypes.pointer(collect)
             self.states.add_collector(self.outlets, made, collect, plan)
-        made.layout, made.sources = programs.layout(), self._names_of_senders()
+        made.layout, made.sources = routines.layout(), self._names_of_senders()
         return made
 
     def targets(
@@ -104,15 +104,15 @@ class TargetWriter:
         plan: RoutePlan,
         targets: Sequence[TargetPlan],
         lowered: Mapping[str, LoweredTarget],
-        programs: Programs | None,
+        routines: Routines | None,
     ) -> c.Targets:
         """The targets, without their layout."""
         made = []
         for target in targets:
             native = self._topic_target(target) if target.is_topic else self._destination(target)
-            if programs is not None and target.label in lowered:
-                native.condition = programs.code(lowered[target.label].condition)
-                native.message = programs.code(lowered[target.label].message)
+            if routines is not None and target.label in lowered:
+                native.condition = routines.routine(lowered[target.label].condition)
+                native.message = routines.routine(lowered[target.label].message)
             self._complete(native, plan, target)
             made.append(native)
         number = self.outlets.names.number

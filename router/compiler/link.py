@@ -72,8 +72,8 @@ def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageT
 def _published_by_clients(gateways: Iterable[GatewayPlan]) -> Iterator[TopicPlan]:
     """The topics that clients of gateways publish on, under absolute names."""
     for gateway in gateways:
-        for entry in gateway.inbound.values():
-            yield _topic(entry.settings.topic, entry.type, entry.label)
+        for inbound in gateway.inbound.values():
+            yield _topic(inbound.settings.topic, inbound.type, inbound.label)
 
 
 def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:

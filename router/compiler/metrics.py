@@ -181,12 +181,12 @@ HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000
 class Series:
     """What an index counts: a metric, with its label values in the metric's order.
 
-    A histogram has several indexes in a row, one for each `part`: each bound, everything slower, the sum (ns).
+    A histogram has several indexes in a row, one for each `cell`: each bound, everything slower, the sum (ns).
     """
 
     metric: str
     labels: tuple[str, ...]
-    part: int = 0
+    cell: int = 0
 
 
 HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
@@ -238,8 +238,8 @@ class Counters:
         if first not in self._indexes:
             length = _length_of(declared)
             start = self._run(length)
-            for part in range(length):
-                self._indexes[Series(metric, labels, part)] = start + part
+            for cell in range(length):
+                self._indexes[Series(metric, labels, cell)] = start + cell
         return self._indexes[first]
 
     def _run(self, length: int) -> int:
@@ -274,7 +274,7 @@ class Counters:
         so that totals never decrease.
         """
         lists = list(threads)
-        for first in [series for series in self._indexes if series.part == 0 and series not in self._current]:
+        for first in [series for series in self._indexes if series.cell == 0 and series not in self._current]:
             declared, start = _BY_NAME[first.metric], self._indexes[first]
             length = _length_of(declared)
             run = slice(start, start + length)
@@ -282,8 +282,8 @@ class Counters:
                 continue
             for counts in lists:
                 counts[run] = [0] * length
-            for part in range(length):
-                del self._indexes[Series(first.metric, first.labels, part)]
+            for cell in range(length):
+                del self._indexes[Series(first.metric, first.labels, cell)]
             self._free.setdefault(length, []).append(start)
 
 

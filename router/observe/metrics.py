@@ -45,7 +45,7 @@ class CountersCollector(Collector):
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
-            if series.part == 0:
+            if series.cell == 0:
                 labels = dict(zip(metric_named(series.metric).labels, series.labels, strict=True))
                 self._indexes[series.metric].append((labels, index))
 
@@ -88,8 +88,8 @@ def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
 
 
 def _histogram(name: str, labels: dict[str, str], threads: Iterable[Sequence[int]]) -> Iterator[Sample]:
-    *parts, sum_ns = map(sum, zip(*threads, strict=True))
-    cumulative = list(accumulate(parts))
+    *cells, sum_ns = map(sum, zip(*threads, strict=True))
+    cumulative = list(accumulate(cells))
     for bound, count in zip(_BOUNDS, cumulative, strict=True):
         yield Sample(f"{name}{BUCKETS}", {**labels, "le": bound}, count)
     yield Sample(f"{name}_count", labels, cumulative[-1])

@@ -245,9 +245,9 @@ def explained_gateway(checked: GatewayPlan, topics: Topics) -> Iterator[str]:
     yield f"  messages of up to {gateway.max_outbound} bytes{_gateway_sizes(gateway)}"
     yield from _patterns(gateway)
     yield from _matched(TopicSelector(gateway, checked.inbound), topics)
-    for entry in checked.inbound.values():
+    for inbound in checked.inbound.values():
         yield ""
-        yield from _inbound(entry)
+        yield from _inbound(inbound)
 
 
 def ignored_gateway(gateway: IgnoredGateway) -> Iterator[str]:
@@ -319,14 +319,14 @@ def _matched(selector: TopicSelector, topics: Topics) -> Iterator[str]:
         yield f"  ~ {name}  {types}  {period}  by {why}".rstrip()
 
 
-def _inbound(entry: InboundPlan) -> Iterator[str]:
-    inbound = entry.settings
-    yield f"  from clients {entry.label}: {entry.type}  ({inbound.span})"
+def _inbound(plan: InboundPlan) -> Iterator[str]:
+    inbound = plan.settings
+    yield f"  from clients {plan.label}: {plan.type}  ({inbound.span})"
     yield _quality(inbound.topic)
     yield from (f"    {words}" for words in phrases(inbound).values())
     if inbound.topic.max_rate is not None:
         yield f"    {phrases(inbound.topic)['max_rate']}"
-    if inbound.deadman is not None and entry.deadman is not None:
+    if inbound.deadman is not None and plan.deadman is not None:
         deadman = inbound.deadman
         sent = str(deadman.fields) if deadman.fields.entries else "all fields at their defaults"
         yield (

@@ -13,8 +13,8 @@ from enum import Enum
 from router.compiler.checked import CheckedRoute
 from router.compiler.expressions import tree
 from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredTarget
-from router.compiler.lowering.layout import Layout, NodeField, ReadOperation
-from router.compiler.lowering.operations import Code, Operation
+from router.compiler.lowering.layout import Layout, ReadOperation, WantedField
+from router.compiler.lowering.operations import Operation, Routine
 from router.compiler.program import Program
 from router.declared import NONE, Compared, Op, ReadKind, Relation, Scalar, Sign
 from router.errors import plural
@@ -25,10 +25,10 @@ _MOST_SHOWN = 16
 
 
 def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
-    """All code of a route."""
+    """All routine of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name
-    for kind, routes in (("destination", lowered.conditions), ("topic", lowered.topics)):
+    for kind, routes in (("destination", lowered.to_destinations), ("topic", lowered.to_topics)):
         if name in routes:
             route = routes[name]
             yield from _layout(route.layout)
@@ -52,24 +52,24 @@ def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
 
 
 def _layout(layout: Layout) -> Iterator[str]:
-    for number, (node, message) in enumerate(zip(layout.nodes, layout.messages, strict=True)):
-        if node.entries:
+    for number, (section, message) in enumerate(zip(layout.sections, layout.messages, strict=True)):
+        if section.reads:
             yield ""
-            yield f"  reads {message}, node {number}"
-        yield from _fields([entry for entry in node.entries if isinstance(entry, NodeField)], layout)
+            yield f"  reads {message}, section {number}"
+        yield from _fields([read for read in section.reads if isinstance(read, WantedField)], layout)
         depth = 2
-        for step in node.entries:
+        for step in section.reads:
             if isinstance(step, ReadOperation):
                 depth -= step.kind is ReadKind.AGAIN
                 yield _INDENT * depth + _step(step, layout)
                 depth += step.kind in (ReadKind.EACH, ReadKind.EACH_SEQUENCE)
 
 
-def _fields(fields: list[NodeField], layout: Layout) -> Iterator[str]:
+def _fields(fields: list[WantedField], layout: Layout) -> Iterator[str]:
     """The fields of a protobuf message of which something is read, and the slots that say which member a oneof has."""
     for field in fields:
         places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
-        places += [f"node {field.node}"] if field.node != NONE else []
+        places += [f"section {field.section}"] if field.section != NONE else []
         if places:
             repeated = "repeated " * field.is_repeated
             yield f"    field {field.number}: {repeated}{_word(field.type)} -> {', '.join(places)}"
@@ -115,28 +115,28 @@ def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) 
     _, _, place, *_ = target.places
     yield ""
     yield f"  elements, {_stored(elements.scalar)}"
-    yield from _listed(elements.code, [place] * len(elements.code), layout)
+    yield from _listed(elements.routine, [place] * len(elements.routine), layout)
     slots = [_slot(each, layout) for each in (elements.item, elements.index, elements.count) if each != NONE]
-    into = [f"node {elements.node}"] * (elements.node != NONE) + slots
+    into = [f"section {elements.section}"] * (elements.section != NONE) + slots
     yield f"    each -> {', '.join(into)}" if into else "    each"
 
 
 def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> Iterator[str]:
     _, _, place, *_ = target.places
-    for what, code in (("frame", collect.by), ("its size", collect.count), ("the place in it", collect.order)):
+    for what, routine in (("frame", collect.by), ("its size", collect.count), ("the place in it", collect.order)):
         yield ""
         yield f"  {what}"
-        yield from _listed(code, [place] * len(code), layout)
+        yield from _listed(routine, [place] * len(routine), layout)
     slots = [_slot(each, layout) for each in (collect.items, collect.counted) if each != NONE]
     if slots:
         yield f"    all of a frame -> {', '.join(slots)}"
 
 
-def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:
+def _listed(routine: Routine, places: list[str], layout: Layout) -> Iterator[str]:
     """One operation a line, by number; a line for each place where that changes. Loops are indented."""
     depth = 0
     before = ""
-    for number, (operation, place) in enumerate(zip(code, places, strict=True)):
+    for number, (operation, place) in enumerate(zip(routine, places, strict=True)):
         if place != before:
             span, _, field = place.partition(": ")
             yield f"    # {field}  ({span})" if field else f"    # {span}"
@@ -149,7 +149,7 @@ def _listed(code: Code, places: list[str], layout: Layout) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """An operation and its number in the code."""
+    """An operation and its number in the routine."""
 
     number: int
     operation: Operation
@@ -242,7 +242,7 @@ _OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
     Op.OCTETS: _of_stored,
     Op.MEMBER: _member,
     Op.ELEMENT: _element,
-    Op.ENTER: lambda line: f"node {line.index}, {line.layout.messages[line.index]}",
+    Op.ENTER: lambda line: f"section {line.index}, {line.layout.messages[line.index]}",
     Op.REPEAT: _repeat,
     Op.NEXT: _of_slot,
     Op.LIST: lambda line: f"of {line.operation.size}",

@@ -85,7 +85,7 @@ def test_a_command_is_sent_while_python_is_held(site: Site, publisher: Publisher
     python, process = ctypes.PyDLL(None), publisher.process  # calls through PyDLL keep the interpreter lock
     buffer, at_start = ctypes.create_string_buffer(1000), len(BRAKE)
     with site.router(table) as router:
-        assert "ros commands" in thread_names()
+        assert "ros urgent" in thread_names()
         assert publisher.line() == "matched"
         assert len(site.basestation.recv(1000)) == at_start
         site.basestation.settimeout(None)

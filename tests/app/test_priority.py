@@ -11,7 +11,7 @@ import pytest
 
 from tests.acceptance.site import RouterProcess, site, wait_until
 
-THREADS = {"receive", "timers", "ros commands"}
+THREADS = {"receive", "timers", "ros urgent"}
 UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
 
 

@@ -77,4 +77,4 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
     if asked.language.is_ros:
         (made,) = lowered.from_ros[SOURCE]
         return made
-    return lowered.topics[_ROUTE] if plan is not None else lowered.conditions[_ROUTE]
+    return lowered.to_topics[_ROUTE] if plan is not None else lowered.to_destinations[_ROUTE]

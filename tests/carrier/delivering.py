@@ -13,7 +13,7 @@ from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.collectors import NativeCollector, native_collect
 from router.carrier.from_ros import native_for_each
-from router.carrier.lowered import Programs, native_values
+from router.carrier.lowered import Routines, native_values
 from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.declared import NONE
@@ -83,14 +83,14 @@ class Delivering:
         self._lowered = [*lowered.targets.values()]
         self._arrays: list[object] = []
         self._counters = (c_int64 * (1 + (1 + len(self._lowered)) * _OF_TARGET))()
-        programs = Programs(lowered.layout, self._arrays)
+        routines = Routines(lowered.layout, self._arrays)
         wanted, is_from_ros = (ctypes.c_uint8 * 1)(1), isinstance(lowered, LoweredFeed)
         topic = c.Topic(wanted=ctypes.addressof(wanted))
         self._arrays += [wanted, topic]
         targets = []
         for number, target in enumerate(self._lowered):
             first = 1 + number * _OF_TARGET
-            made = c.Target(condition=programs.code(target.condition), message=programs.code(target.message))
+            made = c.Target(condition=routines.routine(target.condition), message=routines.routine(target.message))
             made.id, made.delivered, made.filtered = number, first + _DELIVERED, first + _FILTERED
             made.collected, made.delivered_bytes = first + _COLLECTED, first + _BYTES
             made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(c.LOSSES)]
@@ -106,16 +106,16 @@ class Delivering:
         self._route: c.RosRoute | None = None
         if isinstance(lowered, LoweredFeed):
             self._route = c.RosRoute(
-                for_each=native_for_each(lowered.for_each, programs), seconds=NONE, nanoseconds=NONE
+                for_each=native_for_each(lowered.for_each, routines), seconds=NONE, nanoseconds=NONE
             )
         self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.pointer(self._targets)))
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
             collector = NativeCollector(functions, timeout)
             self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
-            collect = native_collect(lowered.collect, programs, range(1 + len(others)))
+            collect = native_collect(lowered.collect, routines, range(1 + len(others)))
             collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
-        self._targets.layout = programs.layout()
+        self._targets.layout = routines.layout()
         if self._route is not None:
             self._route.targets = self._targets
         self._address = functions.seam_open(self._counters)

@@ -10,7 +10,7 @@ struct tested {
 struct tested *seam_machine_open(void);
 void seam_machine_close(struct tested *tested);
 bool seam_machine_read(struct tested *tested, const struct layout *layout, const uint8_t *data, size_t size);
-int seam_machine_value(struct tested *tested, const struct code *code, struct value *value, uint32_t *at);
+int seam_machine_value(struct tested *tested, const struct routine *routine, struct value *value, uint32_t *at);
 const struct value *seam_machine_slots(const struct tested *tested);
 const struct cell *seam_machine_cells(const struct tested *tested);
 const uint8_t *seam_machine_output(const struct tested *tested, size_t *size);
@@ -37,10 +37,10 @@ bool seam_machine_read(struct tested *tested, const struct layout *layout, const
 }
 
 /* What a program leaves on the stack. It is there until the next call. */
-int seam_machine_value(struct tested *tested, const struct code *code, struct value *value, uint32_t *at) {
+int seam_machine_value(struct tested *tested, const struct routine *routine, struct value *value, uint32_t *at) {
     tested->machine.cell_count = tested->cell_count;
     tested->machine.text_size = tested->text_size;
-    return evaluate_list(&tested->machine, code, value, at);
+    return evaluate_list(&tested->machine, routine, value, at);
 }
 
 const struct value *seam_machine_slots(const struct tested *tested) { return tested->machine.slots; }

@@ -66,27 +66,27 @@ class Step:
 
 
 @dataclass(frozen=True)
-class NodeField:
-    """`struct node_field`."""
+class WantedField:
+    """`struct wanted_field`."""
 
     number: int
     type: str
     slot: int = c.NONE
     is_repeated: bool = False
     presence: int = c.NONE
-    node: int = c.NONE
+    section: int = c.NONE
     choice: int = c.NONE
     cleared: tuple[int, int] = (0, 0)
     closed: int = c.NONE
 
     def packed(self) -> bytes:
-        fixed = self.slot, self.presence, self.node, self.choice, *self.cleared, self.closed
-        return bytes(c.NodeField(self.number, C[self.type], self.is_repeated, *fixed))
+        fixed = self.slot, self.presence, self.section, self.choice, *self.cleared, self.closed
+        return bytes(c.WantedField(self.number, C[self.type], self.is_repeated, *fixed))
 
 
 @dataclass(frozen=True)
-class Node:
-    entries: Sequence[NodeField | Step]
+class Section:
+    reads: Sequence[WantedField | Step]
     first_slot: int = 0
     slot_count: int = 0
 
@@ -99,7 +99,7 @@ class Refusal:
 
 @dataclass
 class Layout:
-    nodes: Sequence[Node] = (Node(()),)
+    sections: Sequence[Section] = (Section(()),)
     slot_count: int = 64
     closed: Sequence[Sequence[int]] = ()
     is_cdr: bool = False
@@ -141,7 +141,7 @@ class Machine:
         self._library.seam_machine_close(self._address)
 
     def read(self, data: bytes = CDR_HEADER) -> bool:
-        """Begin with a message: its node is the first one. Without a layout there is nothing to read."""
+        """Begin with a message: its section is the first one. Without a layout there is nothing to read."""
         copy = (ctypes.c_char * len(data)).from_buffer_copy(data) if data else b""  # exactly, for sanitizers
         self._message = copy
         return bool(self._library.seam_machine_read(self._address, byref(self._layout), copy, len(data)))
@@ -153,22 +153,22 @@ class Machine:
         """A slot's list in cells."""
         return self._elements(c.Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index), of)
 
-    def value(self, *code: Operation, of: str = INTEGER) -> object:
+    def value(self, *routine: Operation, of: str = INTEGER) -> object:
         """What a program leaves on the stack: an int64 for INTEGER, the elements of LISTs in cells as integers."""
         value, at = c.Value(), c_uint32()
-        made = self._code(code)
+        made = self._routine(routine)
         outcome = self._library.seam_machine_value(self._address, byref(made), byref(value), byref(at))
         return self._made(value, of) if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
 
-    def condition(self, *code: Operation) -> bool | Refusal:
+    def condition(self, *routine: Operation) -> bool | Refusal:
         is_true, at = c_bool(), c_uint32()
-        made = self._code(code)
+        made = self._routine(routine)
         outcome = self._library.evaluate_condition(self._address, byref(made), byref(is_true), byref(at))
         return is_true.value if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
 
-    def message(self, *code: Operation) -> bytes | Refusal:
+    def message(self, *routine: Operation) -> bytes | Refusal:
         at, size = c_uint32(), c_size_t()
-        made = self._code(code)
+        made = self._routine(routine)
         outcome = self._library.evaluate_message(self._address, byref(made), byref(at))
         if outcome != c.EVALUATED:
             return Refusal(_LOSSES[outcome], at.value)
@@ -198,7 +198,7 @@ class Machine:
         return ctypes.addressof(array)
 
     def _native_layout(self, layout: Layout) -> c.Layout:
-        nodes = [self._node(node, is_cdr=layout.is_cdr) for node in layout.nodes]
+        sections = [self._section(section, is_cdr=layout.is_cdr) for section in layout.sections]
         closed = [c.ClosedEnum((ctypes.c_int32 * len(each))(*each), len(each)) for each in layout.closed]
         defaults = (c.Value * layout.slot_count)()
         for index, value in layout.defaults.items():
@@ -210,7 +210,7 @@ class Machine:
                 defaults[index].integer = value
         self._room = ctypes.create_string_buffer(1 << 16)
         return c.Layout(
-            nodes=(c.Node * len(nodes))(*nodes),
+            sections=(c.Section * len(sections))(*sections),
             defaults=defaults,
             closed=(c.ClosedEnum * len(closed))(*closed),
             literals=ctypes.addressof(self._room),
@@ -218,19 +218,19 @@ class Machine:
             is_cdr=layout.is_cdr,
         )
 
-    def _node(self, node: Node, *, is_cdr: bool) -> c.Node:
-        entries = self._keep(b"".join(each.packed() for each in node.entries))
-        made = c.Node(count=len(node.entries), first_slot=node.first_slot, slot_count=node.slot_count)
+    def _section(self, section: Section, *, is_cdr: bool) -> c.Section:
+        reads = self._keep(b"".join(each.packed() for each in section.reads))
+        made = c.Section(count=len(section.reads), first_slot=section.first_slot, slot_count=section.slot_count)
         if is_cdr:
-            made.steps = ctypes.cast(entries, ctypes.POINTER(c.ReadOperation))
+            made.steps = ctypes.cast(reads, ctypes.POINTER(c.ReadOperation))
         else:
-            made.fields = ctypes.cast(entries, ctypes.POINTER(c.NodeField))
+            made.fields = ctypes.cast(reads, ctypes.POINTER(c.WantedField))
         return made
 
-    def _code(self, operations: Sequence[Operation]) -> c.Code:
+    def _routine(self, operations: Sequence[Operation]) -> c.Routine:
         packed = b"".join(each.packed(self._literals) for each in operations)
         ctypes.memmove(self._room, bytes(self._literals), len(self._literals))
-        return c.Code((c.Operation * len(operations)).from_buffer_copy(packed), len(operations))
+        return c.Routine((c.Operation * len(operations)).from_buffer_copy(packed), len(operations))
 
 
 def integer(value: int) -> Operation:

@@ -59,7 +59,7 @@ def to_ros(
     lowered, findings = lower_table([route], envelope)
     if findings:
         raise Misfit(findings)
-    carrier = Delivering(functions, lowered.topics["route"], RECEIVED_AT, SOURCE)
+    carrier = Delivering(functions, lowered.to_topics["route"], RECEIVED_AT, SOURCE)
 
     def by_carrier(payload: bytes) -> Made:
         return [outcome.got for outcome in carrier.datagram(payload, is_single=True)]

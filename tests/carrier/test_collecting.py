@@ -96,7 +96,7 @@ class Collecting:
 
     def __init__(self, functions: CDLL, case: str = "part") -> None:
         self.case, self.now = case, 0
-        self.carrier = Delivering(functions, program().lowered.topics[case], 0, "left", ("right",), NS)
+        self.carrier = Delivering(functions, program().lowered.to_topics[case], 0, "left", ("right",), NS)
 
     def offer(self, *, column: int = 0, **fields: Any) -> list[str] | None:
         """Offer a part, and return the names of those of the frame that is complete then."""

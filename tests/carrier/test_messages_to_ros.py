@@ -60,16 +60,16 @@ def test_topics_of_tables_get_the_same_messages(delivering: CDLL, program: Progr
     carried = 0
     for number, handlers in program.inbound.items():
         for handler in handlers:
-            if handler.route in program.lowered.topics:
+            if handler.route in program.lowered.to_topics:
                 _assert_same(delivering, program, number, handler)
-                carried += len(program.lowered.topics[handler.route].targets)
+                carried += len(program.lowered.to_topics[handler.route].targets)
     assert carried == sum(target.is_topic for handler in program.routes for target in handler.targets)
     assert carried > 0
 
 
 def _assert_same(library: CDLL, program: Program, number: int, handler: RoutePlan) -> None:
     serve = Published(program, handler)
-    carrier = Delivering(library, program.lowered.topics[handler.route], RECEIVED_AT, SOURCE)
+    carrier = Delivering(library, program.lowered.to_topics[handler.route], RECEIVED_AT, SOURCE)
     parse = handler.case.message_class.FromString
 
     def in_python(message: Any) -> dict[str, bytes | str]:
@@ -80,7 +80,7 @@ def _assert_same(library: CDLL, program: Program, number: int, handler: RoutePla
     def by_carrier(data: bytes, *, is_single: bool) -> dict[str, bytes | str]:
         return {outcome.label: outcome.got for outcome in carrier.datagram(data, is_single=is_single)}
 
-    carried = program.lowered.topics[handler.route].targets
+    carried = program.lowered.to_topics[handler.route].targets
 
     @EACH_TYPE
     @given(payloads(handler.case), st.randoms())
@@ -111,9 +111,9 @@ def test_rclpy_reads_of_them_what_it_reads_of_those_of_python(delivering: CDLL, 
     types = {target.label: target.type.name for route in checked.routes for target in route.targets if target.type}
     for handlers in made.inbound.values():
         for handler in handlers:
-            if handler.route not in made.lowered.topics:
+            if handler.route not in made.lowered.to_topics:
                 continue
-            carrier = Delivering(delivering, made.lowered.topics[handler.route], RECEIVED_AT, SOURCE)
+            carrier = Delivering(delivering, made.lowered.to_topics[handler.route], RECEIVED_AT, SOURCE)
             serve = Published(made, handler)
             for payload in some_payloads(handler.case, seed=handler.case.number):
                 carried = {outcome.label: outcome.got for outcome in carrier.datagram(payload, is_single=True)}

@@ -18,9 +18,9 @@ from tests.carrier.evaluating import (
     C,
     Layout,
     Machine,
-    Node,
     Operation,
     Refusal,
+    Section,
     Step,
     integer,
     load,
@@ -77,7 +77,7 @@ def test_scalars_are_aligned_to_their_size(evaluating: CDLL, names: list[str], d
         written.scalar(SCALARS[name], values[-1])
         read, skipped = Step("READ_SCALAR", slot, type=f"SCALAR_{name}"), Step("READ_SKIP", size=_size(name), count=1)
         steps.append(data.draw(st.sampled_from([read, skipped])))
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     message = written.message()
     assert machine.read(message)
     for slot, (name, step) in enumerate(zip(names, steps, strict=True)):
@@ -99,7 +99,7 @@ def test_arrays_and_sequences_are_lists_where_they_are(evaluating: CDLL, data: s
     written.scalar("B", 9)
     step = Step("READ_ARRAY" if is_array else "READ_SEQUENCE", 1, size=_size(name), count=len(values) * is_array)
     steps = [Step("READ_SCALAR", 0, type="SCALAR_UINT64"), step, Step("READ_SCALAR", 2, type="SCALAR_UINT8")]
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     assert machine.read(written.message())
     assert (machine.slot(0), machine.slot(2), machine.value(load(1), Operation("OP_SIZE"))) == (7, 9, len(values))
     for index, value in enumerate(values):
@@ -129,7 +129,7 @@ def test_texts_come_without_their_final_nul(evaluating: CDLL, texts: list[bytes]
     message = written.text(b"end").message()
     each = Step("READ_EACH", count=len(texts)) if is_array else Step("READ_EACH_SEQUENCE")
     steps = [Step("READ_TEXT", 0), each, Step("READ_TEXTS", 1), Step("READ_AGAIN"), Step("READ_TEXT", 2)]
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     assert machine.read(message)
     assert machine.value(load(0), of=TEXT) == b"one"
     assert machine.listed(1, of=TEXT) == texts
@@ -140,7 +140,7 @@ def test_texts_come_without_their_final_nul(evaluating: CDLL, texts: list[bytes]
 def test_only_what_uses_a_text_without_its_nul_refuses_it(evaluating: CDLL) -> None:
     each = [Step("READ_EACH", count=2), Step("READ_TEXTS", 2), Step("READ_AGAIN")]
     steps = [Step("READ_TEXT", 0), Step("READ_TEXT", 1), *each]
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     message = Written().text(b"").text(b"whole").text(b"a").text(b"b").message()
     assert machine.read(message[:8] + b"x" + message[9:])
     assert machine.value(load(0), Operation("OP_UTF8"), of=TEXT) == Refusal("mapping_error", 1)
@@ -155,7 +155,7 @@ def test_only_what_uses_a_text_without_its_nul_refuses_it(evaluating: CDLL) -> N
 
 def test_some_writers_leave_out_the_nul_of_empty_strings(evaluating: CDLL) -> None:
     steps = [Step("READ_TEXT", 0), Step("READ_TEXT"), Step("READ_SCALAR", 1, type="SCALAR_UINT8")]
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     assert machine.read(CDR_HEADER + bytes(8) + b"\x05")
     assert machine.value(load(0), of=TEXT) == b""
     assert machine.slot(1) == 5
@@ -177,7 +177,7 @@ def test_elements_are_entered_where_they_begin(
              Step("READ_SCALAR", 1, type="SCALAR_UINT8")]  # fmt: skip
     inner = [Step("READ_SCALAR", 2, type="SCALAR_UINT8"), Step("READ_SCALAR", 3, type="SCALAR_FLOAT64"),
              Step("READ_SEQUENCE", 4, size=2)]  # fmt: skip
-    machine = Machine(evaluating, Layout((Node(outer), Node(inner, first_slot=2, slot_count=3)), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(outer), Section(inner, first_slot=2, slot_count=3)), is_cdr=True))
     assert machine.read(message)
     assert machine.slot(1) == last
     assert machine.value(load(0), Operation("OP_SIZE")) == len(elements)
@@ -200,7 +200,7 @@ def test_lists_in_lists_are_stepped_over(evaluating: CDLL) -> None:
     message = written.scalar("H", 77).message()
     each, again = Step("READ_EACH_SEQUENCE"), Step("READ_AGAIN")
     steps = [each, each, Step("READ_TEXT"), again, again, Step("READ_SCALAR", 0, type="SCALAR_UINT16")]
-    machine = Machine(evaluating, Layout((Node(steps),), is_cdr=True))
+    machine = Machine(evaluating, Layout((Section(steps),), is_cdr=True))
     assert machine.read(message)
     assert machine.slot(0) == 77
     assert machine.read(Written().scalar("I", 0).scalar("H", 5).message())
@@ -209,7 +209,7 @@ def test_lists_in_lists_are_stepped_over(evaluating: CDLL) -> None:
 
 @pytest.mark.parametrize("message", [b"", CDR_HEADER[:3], b"\0\0\0\0\1\0\0\0", b"\0\7\0\0\1\0\0\0"])
 def test_other_representations_are_refused(evaluating: CDLL, message: bytes) -> None:
-    assert not Machine(evaluating, Layout((Node(()),), is_cdr=True)).read(message)
+    assert not Machine(evaluating, Layout((Section(()),), is_cdr=True)).read(message)
 
 
 @pytest.mark.parametrize("count", [5, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF])
@@ -220,9 +220,9 @@ def test_a_length_beyond_the_end_is_refused(evaluating: CDLL, count: int, size: 
     nothing = [Step("READ_EACH_SEQUENCE"), Step("READ_AGAIN")]
     sequence = Step("READ_SEQUENCE", size=size)
     for steps in ([replace(sequence, slot=0)], [sequence], [Step("READ_TEXT", 0)], loop, nothing):
-        assert not Machine(evaluating, Layout((Node(steps),), is_cdr=True)).read(message)
+        assert not Machine(evaluating, Layout((Section(steps),), is_cdr=True)).read(message)
 
 
 def test_a_message_that_ends_in_its_alignment_is_refused(evaluating: CDLL) -> None:
     steps = [Step("READ_SKIP", size=1, count=1), Step("READ_SCALAR", 0, type="SCALAR_FLOAT64")]
-    assert not Machine(evaluating, Layout((Node(steps),), is_cdr=True)).read(CDR_HEADER + b"\1")
+    assert not Machine(evaluating, Layout((Section(steps),), is_cdr=True)).read(CDR_HEADER + b"\1")

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router.types.wire import delimited, varint
-from tests.carrier.evaluating import TEXT, C, Layout, Machine, Node, NodeField, Operation, load
+from tests.carrier.evaluating import TEXT, C, Layout, Machine, Operation, Section, WantedField, load
 from tests.carrier.messages import some_payloads
 from tests.compiler.payloads import wire_of
 from tests.envelopes import VARINT, tag
@@ -26,19 +26,19 @@ NEEDED, IS_CLOSED, CLOSED_THERE, SOME, PACKED, TEXTS, EXPANDED, ONE_CLOSED, ONE_
 )
 _OF_ONE = {"choice": ONE, "cleared": (ONE_CLOSED, INNER_TEXT - ONE_CLOSED + 1)}
 _OLD = Layout(
-    nodes=(
-        Node((
-            NodeField(1, "TYPE_INT32", NEEDED),
-            NodeField(4, "TYPE_CLOSED_ENUM", IS_CLOSED, presence=CLOSED_THERE, closed=0),
-            NodeField(5, "TYPE_CLOSED_ENUM", SOME, is_repeated=True, closed=0),
-            NodeField(6, "TYPE_CLOSED_ENUM", PACKED, is_repeated=True, closed=0),
-            NodeField(8, "TYPE_BYTES", TEXTS, is_repeated=True),
-            NodeField(12, "TYPE_INT32", EXPANDED, is_repeated=True),
-            NodeField(14, "TYPE_CLOSED_ENUM", ONE_CLOSED, closed=0, **_OF_ONE),  # type: ignore[arg-type]
-            NodeField(15, "TYPE_INT32", ONE_NUMBER, **_OF_ONE),  # type: ignore[arg-type]
-            NodeField(16, "TYPE_MESSAGE", node=1, **_OF_ONE),  # type: ignore[arg-type]
+    sections=(
+        Section((
+            WantedField(1, "TYPE_INT32", NEEDED),
+            WantedField(4, "TYPE_CLOSED_ENUM", IS_CLOSED, presence=CLOSED_THERE, closed=0),
+            WantedField(5, "TYPE_CLOSED_ENUM", SOME, is_repeated=True, closed=0),
+            WantedField(6, "TYPE_CLOSED_ENUM", PACKED, is_repeated=True, closed=0),
+            WantedField(8, "TYPE_BYTES", TEXTS, is_repeated=True),
+            WantedField(12, "TYPE_INT32", EXPANDED, is_repeated=True),
+            WantedField(14, "TYPE_CLOSED_ENUM", ONE_CLOSED, closed=0, **_OF_ONE),  # type: ignore[arg-type]
+            WantedField(15, "TYPE_INT32", ONE_NUMBER, **_OF_ONE),  # type: ignore[arg-type]
+            WantedField(16, "TYPE_MESSAGE", section=1, **_OF_ONE),  # type: ignore[arg-type]
         )),
-        Node((NodeField(1, "TYPE_INT32", INNER), NodeField(2, "TYPE_BYTES", INNER_TEXT))),
+        Section((WantedField(1, "TYPE_INT32", INNER), WantedField(2, "TYPE_BYTES", INNER_TEXT))),
     ),
     closed=(CLOSED,),
 )  # fmt: skip
@@ -128,10 +128,10 @@ def test_a_message_has_the_cells_of_the_one_before(machine: Machine) -> None:
 
 def test_elements_of_lists_are_entered_with_their_own_defaults(evaluating: CDLL) -> None:
     points, x, is_x, numbers = 0, 1, 2, 3
-    fields = NodeField(1, "TYPE_SINT32", x, presence=is_x), NodeField(2, "TYPE_FIXED32", numbers, is_repeated=True)
-    inner = Node(fields, first_slot=x, slot_count=3)
-    node = Node((NodeField(7, "TYPE_MESSAGE", points, is_repeated=True),))
-    machine = Machine(evaluating, Layout(nodes=(node, inner), defaults={x: 42}))
+    fields = WantedField(1, "TYPE_SINT32", x, presence=is_x), WantedField(2, "TYPE_FIXED32", numbers, is_repeated=True)
+    inner = Section(fields, first_slot=x, slot_count=3)
+    section = Section((WantedField(7, "TYPE_MESSAGE", points, is_repeated=True),))
+    machine = Machine(evaluating, Layout(sections=(section, inner), defaults={x: 42}))
     elements = [b"\x08\x03", b"", delimited(2, bytes([1, 0, 0, 0, 2, 0, 0, 0])) + b"\x15\x03\0\0\0"]
     assert machine.read(b"".join(delimited(7, each) for each in elements))
 

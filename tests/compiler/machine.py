@@ -55,7 +55,7 @@ def machine(
     route: Any = SimpleNamespace(name=_ROUTE, ttl=None, ignore=None, span=span)
     lowered, findings = lower_table([CheckedRoute(route, case, (checked,))], envelope)
     assert not findings, findings
-    carrier = Delivering(functions(), lowered.topics[_ROUTE], received_at, sender)
+    carrier = Delivering(functions(), lowered.to_topics[_ROUTE], received_at, sender)
 
     def make(message: Any) -> bytes:
         payload: Any = case.message_class()

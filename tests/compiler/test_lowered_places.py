@@ -10,7 +10,7 @@ from tests.compiler.conftest import CheckText
 def lowered(check_text: CheckText, topic: str, payload: str = "imu_info") -> LoweredTarget:
     checked = check_text(f"routes:\n  {payload}:\n    source: board\n    topics:\n      - {topic}\n")
     assert checked.program is not None, checked.diagnostics
-    [target] = checked.program.lowered.topics[payload].targets.values()
+    [target] = checked.program.lowered.to_topics[payload].targets.values()
     return target
 
 
@@ -64,5 +64,5 @@ routes:
 """
     )
     assert checked.program is not None, checked.diagnostics
-    (target,) = checked.program.lowered.topics["imu_info"].targets.values()
+    (target,) = checked.program.lowered.to_topics["imu_info"].targets.values()
     assert target.places[2] == "table.yaml:9:5: collect"

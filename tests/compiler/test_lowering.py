@@ -1,4 +1,4 @@
-"""Programs: what is made of expressions and mappings, operation by operation, and what is too large for one."""
+"""Routines: what is made of expressions and mappings, operation by operation, and what is too large for one."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from router.compiler.lowering import LoweredTarget, operations, sources
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.layout import ReadOperation
 from router.compiler.lowering.names import TooLargeError
-from router.compiler.lowering.operations import Code, Operation, depths, most_executed
+from router.compiler.lowering.operations import Operation, Routine, depths, most_executed
 from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.lowering.sources import MOST_CONDITION_OPERATIONS, Datagram, RosMessage
 from router.compiler.mapping import build
-from router.declared import MOST_NODES_DEEP, MOST_OPEN, Op, ReadKind, Scalar, Sign
-from router.errors import Code as FindingCode
+from router.declared import MOST_OPEN, MOST_SECTIONS_DEEP, Op, ReadKind, Scalar, Sign
+from router.errors import Code
 from router.types.model import Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
 from tests.compiler.conftest import CheckText
@@ -58,7 +58,7 @@ def _shown(operation: Operation) -> str:
     return f"{name}:{operation.size}" if operation.kind in (Op.JUMP, Op.UNLESS, Op.AND, Op.OR, Op.REPEAT) else name
 
 
-def lowered(text: str) -> Code:
+def lowered(text: str) -> Routine:
     return RosMessage(SOURCE, "topic").lowering().value(check(written(text), scope_of(SOURCE, [MODE])))
 
 
@@ -202,7 +202,7 @@ def steps(declared: MessageType, *wanted: str) -> tuple[ReadOperation, ...]:
     source = RosMessage(declared, "topic")
     for text in wanted:
         source.lowering().value(check(written(text), scope_of(declared)))
-    return source.layout(SPAN).nodes[0].entries  # type: ignore[return-value]
+    return source.layout(SPAN).sections[0].reads  # type: ignore[return-value]
 
 
 def test_what_is_not_wanted_is_skipped_in_one_step() -> None:
@@ -233,8 +233,8 @@ def test_elements_of_lists_are_read_as_far_as_they_are_wanted() -> None:
     source = RosMessage(SOURCE, "topic")
     source.lowering().value(check(written("points[0].x + points[1].y"), scope_of(SOURCE)))
     made = source.layout(SPAN)
-    assert [len(node.entries) for node in made.nodes[1:]] == [1, 2]
-    assert made.names[made.nodes[2].first_slot] == "points[].y"
+    assert [len(section.reads) for section in made.sections[1:]] == [1, 2]
+    assert made.names[made.sections[2].first_slot] == "points[].y"
 
 
 def test_nothing_is_read_for_nothing() -> None:
@@ -281,11 +281,11 @@ def test_a_condition_of_the_receive_thread_is_bounded(when: str) -> None:
         of_many(when)
     found = caught.value.diagnostic
     assert found.message.startswith("this could take ")
-    assert (found.code, found.span.line) == (FindingCode.TOO_LARGE, 7)
+    assert (found.code, found.span.line) == (Code.TOO_LARGE, 7)
     assert of_many(when, is_bounded=False)  # that of a topic
 
 
-def of_many(when: str, *, is_bounded: bool = True) -> Code:
+def of_many(when: str, *, is_bounded: bool = True) -> Routine:
     _, envelope = made_wire()
     case = envelope.cases["many"]
     source = Datagram(case, envelope)
@@ -333,9 +333,9 @@ def test_what_is_read_is_bounded() -> None:
         source.lowering().value(check(written(".".join(seeds(depth))), scope_of(case.type)))
         source.layout(SPAN)
 
-    read_as_deep(MOST_NODES_DEEP - 3)
+    read_as_deep(MOST_SECTIONS_DEEP - 3)
     with pytest.raises(TooLargeError, match="this reads a field 32 messages deep, and at most 31 are possible"):
-        read_as_deep(MOST_NODES_DEEP - 1)
+        read_as_deep(MOST_SECTIONS_DEEP - 1)
 
 
 def seeds(depth: int) -> list[str]:
@@ -377,8 +377,8 @@ def test_targets_are_lowered_by_what_feeds_them(check_text: CheckText) -> None:
     program = check_text(routes, endpoints=ENDPOINTS).program
     assert program is not None
     lowered = program.lowered
-    assert {route: list(each.targets) for route, each in lowered.conditions.items()} == {"imu_info": ["tool"]}
-    assert {route: list(each.targets) for route, each in lowered.topics.items()} == {"imu_info": ["a", "b"]}
+    assert {route: list(each.targets) for route, each in lowered.to_destinations.items()} == {"imu_info": ["tool"]}
+    assert {route: list(each.targets) for route, each in lowered.to_topics.items()} == {"imu_info": ["a", "b"]}
     (feed,) = lowered.from_ros["gps"]
     assert (feed.route, list(feed.targets)) == ("gps_info", ["base", "tool"])
 
@@ -387,7 +387,7 @@ def test_each_target_is_lowered_once(definitions: Definitions, monkeypatch: pyte
     made: list[str] = []
     kind = LoweredTarget
 
-    def counted(label: str, condition: Code, message: Code, places: tuple[str, ...]) -> LoweredTarget:
+    def counted(label: str, condition: Routine, message: Routine, places: tuple[str, ...]) -> LoweredTarget:
         made.append(places[-1])
         return kind(label, condition, message, places)
 

@@ -28,8 +28,8 @@ def test_histogram_takes_a_run_of_slots() -> None:
     counters = Counters()
     first = counters.index("route_duration_seconds", "a")
     assert counters.index("route_duration_seconds", "b") == first + HISTOGRAM_CELLS
-    parts = [series.part for series, _ in counters.series() if series.labels == ("a",)]
-    assert parts == list(range(HISTOGRAM_CELLS))
+    cells = [series.cell for series, _ in counters.series() if series.labels == ("a",)]
+    assert cells == list(range(HISTOGRAM_CELLS))
 
 
 def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:

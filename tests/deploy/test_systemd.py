@@ -152,7 +152,7 @@ def test_what_receives_and_brakes_runs_at_a_real_time_priority(running: Machine)
         pytest.skip("systemd may not raise limits here; tests/platforms/systemd.sh boots one that may")
     threads = running.shell("ps -L -o cls=,rtprio=,comm= -p $(systemctl show -P MainPID rover-router)").splitlines()
     first = {tuple(line.split(maxsplit=2)) for line in threads if line.split()[0] == "FF"}
-    assert first == {("FF", "1", name) for name in ("receive", "timers", "ros commands")}
+    assert first == {("FF", "1", name) for name in ("receive", "timers", "ros urgent")}
 
 
 def test_nothing_else_waits_for_its_sockets_at_boot(running: Machine) -> None:

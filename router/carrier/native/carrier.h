@@ -24,7 +24,7 @@ struct route {
 };
 
 /* What a sender's messages of a payload case come to: the index of a route, or -1. */
-struct entry {
+struct choice {
     int32_t route;
     uint32_t received; /* counter */
 };
@@ -32,7 +32,7 @@ struct entry {
 /* A field of the envelope's oneof. */
 struct payload_case {
     uint32_t number;
-    int32_t row;        /* of the listener's entries; -1 for a case without a route */
+    int32_t row;        /* of the listener's choices; -1 for a case without a route */
     uint32_t is_ignored;
     uint32_t unhandled; /* counter */
 };
@@ -41,7 +41,7 @@ struct payload_case {
 struct peer {
     uint32_t address; /* host byte order */
     uint32_t port;    /* 0: any */
-    uint32_t column;  /* of the listener's entries */
+    uint32_t column;  /* of the listener's choices */
     uint32_t last_seen; /* counter */
     uint32_t id;        /* of the endpoint, in what is mirrored */
 };
@@ -52,7 +52,7 @@ struct listener {
     uint32_t repairs;
     uint32_t keeps_input; /* what it holds at the stop is left for the next process */
     const struct peer *peers; /* by address; of one address, those with a port first */
-    const struct entry *entries; /* `columns` for each row; the last one is for strangers */
+    const struct choice *choices; /* `columns` for each row; the last one is for strangers */
     uint32_t peer_count, columns;
     uint32_t received, received_bytes, padded, rejected[REASONS]; /* counters */
     uint32_t reserved;

@@ -172,9 +172,9 @@ static void compact(struct collector *collector) {
     collector->used = kept;
 }
 
-static const struct node_field *find_field(const struct node *node, uint32_t number) {
-    for (uint32_t index = 0; index < node->count; index++)
-        if (node->fields[index].number == number) return &node->fields[index];
+static const struct wanted_field *find_field(const struct section *section, uint32_t number) {
+    for (uint32_t index = 0; index < section->count; index++)
+        if (section->fields[index].number == number) return &section->fields[index];
     return NULL;
 }
 
@@ -185,12 +185,12 @@ static uint32_t write_payload(const struct layout *layout, const struct datagram
         memcpy(to, from->data + from->start, from->length);
         return from->length;
     }
-    const struct node *envelope = &layout->nodes[NODE_ENVELOPE];
+    const struct section *envelope = &layout->sections[SECTION_ENVELOPE];
     struct bytes rest = {from->data, from->data + from->size}, value;
     uint32_t tag, size = 0;
     while (rest.at < rest.end && read_tag(&rest, &tag) && read_value(&rest, tag & 7, &value)) {
-        const struct node_field *field = (tag & 7) == LEN ? find_field(envelope, tag >> 3) : NULL;
-        if (field && field->node == NODE_PAYLOAD) {
+        const struct wanted_field *field = (tag & 7) == LEN ? find_field(envelope, tag >> 3) : NULL;
+        if (field && field->section == SECTION_PAYLOAD) {
             memcpy(to + size, value.at, left(&value));
             size += (uint32_t)left(&value);
         } else if (field) {
@@ -417,7 +417,7 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
     const struct collect *of = to->collect;
     struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
     begin_datagram(machine, to, last);
-    if (!machine_read(machine, NODE_PAYLOAD, first.bytes, first.size)) return false;
+    if (!machine_read(machine, SECTION_PAYLOAD, first.bytes, first.size)) return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
         if (!list_add(machine, &items, payload_of(of->collector, frame, index))) return false;
     if (of->items != NONE) machine->slots[of->items] = items;

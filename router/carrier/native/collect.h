@@ -22,7 +22,7 @@ struct collector;
 /* How the datagrams of a route make frames. */
 struct collect {
     struct collector *collector;
-    struct code by, count, order; /* the name of a frame, its number of datagrams, and the place of this one, from 0 */
+    struct routine by, count, order; /* the name of a frame, its number of datagrams, and the place of this one, from 0 */
     const uint32_t *senders;      /* ids of senders, by column: each has frames of its own */
     uint32_t is_text;             /* `by` is */
     uint32_t signs;               /* enum sign: whether `count` (FIRST) and `order` (SECOND) are unsigned */

@@ -60,8 +60,8 @@ void begin_datagram(struct machine *machine, const struct targets *to, const str
 
 bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
     begin_datagram(machine, to, from);
-    if (!from->is_single) return machine_read(machine, NODE_ENVELOPE, from->data, from->size);
-    return machine_read(machine, NODE_PAYLOAD, from->data + from->start, from->length);
+    if (!from->is_single) return machine_read(machine, SECTION_ENVELOPE, from->data, from->size);
+    return machine_read(machine, SECTION_PAYLOAD, from->data + from->start, from->length);
 }
 
 /* Read the message unless that was done for another target. */

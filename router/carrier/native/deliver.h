@@ -5,7 +5,7 @@
  *     condition   `when`                                              else filtered
  *     age         `ttl`                                               else stale
  *     rate        `max_rate`                                          else rate_limited
- *     message     what the program writes, or the envelope as it was received
+ *     message     what its routine writes, or the envelope as it was received
  *     board       what the firmware can take                          else too_large or non_finite
  *     defer       `on_limit: latest` and `bandwidth` (defer.h)
  *     send or publish, and feed deadmen
@@ -39,8 +39,8 @@ struct topic {
 };
 
 struct target {
-    struct code condition; /* empty: it gets every message */
-    struct code message;   /* empty: it gets the envelope as it was received */
+    struct routine condition; /* empty: it gets every message */
+    struct routine message;   /* empty: it gets the envelope as it was received */
     struct limit *limit;   /* `max_rate` with `on_limit: first`, or NULL */
     struct deferral *deferral; /* what may hold its messages back, or NULL */
     int64_t period;            /* of `on_limit: latest`, ns; 0 without */
@@ -59,16 +59,16 @@ struct target {
 
 struct deferral;
 
-/* The first slots of every layout of datagrams, and its first nodes. */
+/* The first slots of every layout of datagrams, and its first sections. */
 enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
-enum { NODE_PAYLOAD, NODE_ENVELOPE };
+enum { SECTION_PAYLOAD, SECTION_ENVELOPE };
 
 struct collect;
 
 /* The targets of a route that one thread serves. */
 struct targets {
     int64_t ttl;                 /* ns, 0 for none */
-    const struct layout *layout; /* what their programs read; NULL if there are none */
+    const struct layout *layout; /* what their routines read; NULL if there are none */
     const struct value *sources; /* names of senders, by column; of datagrams */
     const struct collect *collect; /* they get frames (collect.h), not each datagram; NULL without `collect` */
     const struct target *targets;
@@ -89,7 +89,7 @@ struct datagram {
     int64_t received_at;    /* wall clock */
 };
 
-/* A message on its way to the targets of a route. Its fields are read when a program first needs them. */
+/* A message on its way to the targets of a route. Its fields are read when a routine first needs them. */
 struct message {
     const struct datagram *datagram; /* NULL if it is from ROS: then it has been read */
     int64_t now;                     /* boot clock: when it was received */
@@ -138,7 +138,7 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
 /* Begin with a datagram: slots have their defaults, but those of its time and its sender. */
 void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
 
-/* Begin with it, and read the fields that programs of the route use. Return false if it is malformed. */
+/* Begin with it, and read the fields that routines of the route use. Return false if it is malformed. */
 bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
 
 /* Count and report that a target loses a message. `lost` has the reason, and details if there are any. */

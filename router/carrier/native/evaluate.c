@@ -84,15 +84,15 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
     WANT(to_integer(top))
 
 /* Execute operations. What they leave on the stack is in its second value. */
-static int execute(struct machine *machine, const struct code *code, uint32_t *at) {
-    const struct operation *operations = code->operations;
+static int execute(struct machine *machine, const struct routine *routine, uint32_t *at) {
+    const struct operation *operations = routine->operations;
     const uint8_t *literals = machine->layout->literals;
     struct value *slots = machine->slots;
     struct output *output = &machine->output;
     struct value *top = machine->stack; /* the first one is never used; `top[1]` is what an operation has taken off */
     struct loop loops[MOST_LOOPS + 1], *loop = loops; /* nor is the first of these */
     struct opened opened[MOST_OPEN + 1], *open = opened;
-    for (const struct operation *op = operations, *end = op + code->count; op < end; op++) {
+    for (const struct operation *op = operations, *end = op + routine->count; op < end; op++) {
         switch ((enum op)op->kind) {
         case OP_INTEGER: (++top)->integer = op->integer; break;
         case OP_REAL: (++top)->real = op->real; break;
@@ -208,35 +208,35 @@ static int execute(struct machine *machine, const struct code *code, uint32_t *a
     return EVALUATED;
 }
 
-int evaluate_list(struct machine *machine, const struct code *code, struct value *list, uint32_t *at) {
-    int outcome = execute(machine, code, at);
+int evaluate_list(struct machine *machine, const struct routine *routine, struct value *list, uint32_t *at) {
+    int outcome = execute(machine, routine, at);
     *list = machine->stack[1];
     return outcome;
 }
 
-/* Execute a program, and free the cells and text that it takes. */
-static int run(struct machine *machine, const struct code *code, uint32_t *at) {
+/* Execute a routine, and free the cells and text that it takes. */
+static int run(struct machine *machine, const struct routine *routine, uint32_t *at) {
     uint32_t cell_count = machine->cell_count;
     size_t text_size = machine->text_size;
-    int outcome = execute(machine, code, at);
+    int outcome = execute(machine, routine, at);
     machine->cell_count = cell_count;
     machine->text_size = text_size;
     return outcome;
 }
 
-int evaluate_value(struct machine *machine, const struct code *code, struct value *value, uint32_t *at) {
-    int outcome = run(machine, code, at);
+int evaluate_value(struct machine *machine, const struct routine *routine, struct value *value, uint32_t *at) {
+    int outcome = run(machine, routine, at);
     *value = machine->stack[1];
     return outcome;
 }
 
-int evaluate_condition(struct machine *machine, const struct code *code, bool *is_true, uint32_t *at) {
-    int outcome = run(machine, code, at);
+int evaluate_condition(struct machine *machine, const struct routine *routine, bool *is_true, uint32_t *at) {
+    int outcome = run(machine, routine, at);
     *is_true = machine->stack[1].integer;
     return outcome;
 }
 
-int evaluate_message(struct machine *machine, const struct code *code, uint32_t *at) {
+int evaluate_message(struct machine *machine, const struct routine *routine, uint32_t *at) {
     machine->output.size = 0;
-    return run(machine, code, at);
+    return run(machine, routine, at);
 }

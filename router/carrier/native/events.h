@@ -38,7 +38,7 @@ struct lost_event {
 };
 #define NO_NAME UINT32_MAX
 
-/* Where a program refuses a message: `places` of a LoweredTarget in compiler/lowering. */
+/* Where a routine refuses a message: `places` of a LoweredTarget in compiler/lowering. */
 enum place {
     PLACE_MESSAGE,
     PLACE_CONDITION,

@@ -178,7 +178,7 @@ struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct 
     thread->wake = eventfd(0, EFD_CLOEXEC);
     bool is_open = stage_open(&thread->routing.stage, counters, events, timers);
     if (!is_open || thread->epoll < 0 || thread->wake < 0 || from_ros_watch(thread, thread->wake) ||
-        start_thread(&thread->thread, is_urgent ? "ros commands" : "ros messages", run, thread)) {
+        start_thread(&thread->thread, is_urgent ? "ros urgent" : "ros messages", run, thread)) {
         from_ros_close(thread);
         return NULL;
     }

@@ -34,15 +34,15 @@ void machine_begin(struct machine *machine, const struct layout *layout) {
     memcpy(machine->slots, layout->defaults, layout->slot_count * sizeof *machine->slots);
 }
 
-bool machine_read(struct machine *machine, uint16_t node, const uint8_t *data, size_t size) {
-    if (!machine->layout->is_cdr) return read_protobuf(machine, node, data, size);
-    return read_cdr(machine, node, data, size);
+bool machine_read(struct machine *machine, uint16_t section, const uint8_t *data, size_t size) {
+    if (!machine->layout->is_cdr) return read_protobuf(machine, section, data, size);
+    return read_cdr(machine, section, data, size);
 }
 
-bool machine_enter(struct machine *machine, uint16_t node, const struct value *element) {
+bool machine_enter(struct machine *machine, uint16_t section, const struct value *element) {
     const struct layout *layout = machine->layout;
-    const struct node *of = &layout->nodes[node];
+    const struct section *of = &layout->sections[section];
     memcpy(machine->slots + of->first_slot, layout->defaults + of->first_slot, of->slot_count * sizeof *machine->slots);
-    if (!layout->is_cdr) return read_protobuf(machine, node, element->bytes, element->size);
-    return read_cdr_element(machine, node, element->bytes);
+    if (!layout->is_cdr) return read_protobuf(machine, section, element->bytes, element->size);
+    return read_cdr_element(machine, section, element->bytes);
 }

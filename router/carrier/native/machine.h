@@ -1,9 +1,9 @@
-/* The machine that runs programs (operations.h): it reads a message into slots, evaluates conditions on it, and writes
+/* The machine that runs routines (operations.h): it reads a message into slots, evaluates conditions on it, and writes
  * the messages of targets from it. Each thread that does so has one of its own.
  *
  *     machine_begin(machine, layout);             slots have their defaults
  *     machine->slots[...] = ...;                  values other than fields: time of receipt, sender
- *     machine_read(machine, node, data, size);    fields are in slots now
+ *     machine_read(machine, section, data, size);    fields are in slots now
  *     evaluate_condition(...), evaluate_message(...)   any number of times (evaluate.h)
  *
  * Text, bytes and lists in slots point into the message that was read: it must not change until the next begin. */
@@ -21,7 +21,7 @@ enum {
     FIRST_CELLS = 16 * 1024, /* enough for a datagram: each element of a list takes at least a byte of it */
     /* A message that needs more is refused: */
     MOST_CELLS = 1 << 22, /* 96 MiB */
-    MOST_WORK = 1 << 24,  /* turns of loops in all programs together, or BYTES_PER_TURN of text */
+    MOST_WORK = 1 << 24,  /* turns of loops in all routines together, or BYTES_PER_TURN of text */
     BYTES_PER_TURN = 16
 };
 
@@ -30,7 +30,7 @@ struct machine {
     struct value *slots;
     struct cell *cells; /* moves when it grows */
     uint32_t cell_count, cell_capacity;
-    uint8_t *text; /* MOST_TEXT bytes, for text that programs put together */
+    uint8_t *text; /* MOST_TEXT bytes, for text that routines put together */
     size_t text_size;
     uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* what was read last; offsets in CDR count from its first byte */
@@ -38,7 +38,7 @@ struct machine {
     struct value stack[MOST_STACKED];
 };
 
-/* Note work that a program does, in turns of loops. Return false if the message takes too much: lists that are gone
+/* Note work that a routine does, in turns of loops. Return false if the message takes too much: lists that are gone
  * through for each element of others could hold up a thread for hours. */
 static inline bool spend(struct machine *machine, size_t work) {
     bool is_enough = work <= machine->work_left;
@@ -53,10 +53,10 @@ void machine_close(struct machine *machine);
 /* Begin with another message, of this layout: slots get their defaults, cells and text are freed. */
 void machine_begin(struct machine *machine, const struct layout *layout);
 
-/* Read a message into the slots of a node. Return false if it is malformed, or for lack of memory. */
-bool machine_read(struct machine *machine, uint16_t node, const uint8_t *data, size_t size);
+/* Read a message into the slots of a section. Return false if it is malformed, or for lack of memory. */
+bool machine_read(struct machine *machine, uint16_t section, const uint8_t *data, size_t size);
 
-/* Give the slots of a node their defaults, and read an element of a list of messages into them. */
-bool machine_enter(struct machine *machine, uint16_t node, const struct value *element);
+/* Give the slots of a section their defaults, and read an element of a list of messages into them. */
+bool machine_enter(struct machine *machine, uint16_t section, const struct value *element);
 
 #endif

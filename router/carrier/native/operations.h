@@ -1,6 +1,6 @@
-/* The program format, the same for every direction. A layout says which fields a reader puts into which slots
+/* The format of routines, the same for every direction. A layout says which fields a reader puts into which slots
  * (read_protobuf.h, read_cdr.h). Operations compute with slots on a stack (evaluate.h); some of them write a message
- * (write_cdr.h, write_protobuf.h). router/compiler/lowering makes programs of checked expressions.
+ * (write_cdr.h, write_protobuf.h). router/compiler/lowering makes routines of checked expressions.
  *
  * Values carry no type: the compiler knows the type of each one, and the range of each integer. Integers have 64 bits,
  * signed or unsigned. Where a result may not fit, an operation checks it. An operation without a result refuses the
@@ -14,9 +14,9 @@ enum {
     MOST_STACKED = 256,  /* values at a time; the first one is never used */
     MOST_LOOPS = 8,      /* loops in loops */
     MOST_OPEN = 32,      /* payloads in payloads, while one is written */
-    MOST_TEXT = 1 << 20  /* bytes of text that a program puts together: the compiler has added them up */
+    MOST_TEXT = 1 << 20  /* bytes of text that a routine puts together: the compiler has added them up */
 };
-enum { NONE = UINT16_MAX }; /* no such slot, node or enum */
+enum { NONE = UINT16_MAX }; /* no such slot, section or enum */
 
 /* ---- values ---- */
 
@@ -136,7 +136,7 @@ enum op {
     OP_MEMBER,     /* refuses an integer that is not among `size` ascending int32 in the literals, from `integer` */
     /* Lists. `flag` (enum scalar) says how a list is stored: */
     OP_ELEMENT, /* the element with the index `integer`; refuses a list that has none */
-    OP_ENTER,   /* pops a message, and reads it into node `slot` */
+    OP_ENTER,   /* pops a message, and reads it into section `slot` */
     OP_REPEAT,  /* pops an integer, and repeats the next `size` operations so many times; the last of them is its OP_AGAIN.
                    `flag` 1: cells and text that they take are kept, else each turn frees what it has taken */
     OP_AGAIN,
@@ -194,8 +194,8 @@ struct operation {
     };
 };
 
-/* Operations, in order. */
-struct code {
+/* Operations, in order: they decide a condition, write a message, or give a value. */
+struct routine {
     const struct operation *operations;
     uint32_t count, reserved;
 };
@@ -221,13 +221,13 @@ enum field_type {
 };
 
 /* A wanted field of a protobuf message, or a member of its oneof. */
-struct node_field {
+struct wanted_field {
     uint32_t number;
     uint8_t type; /* enum field_type */
     uint8_t is_repeated;
     uint16_t slot;     /* of its value or list, or NONE */
     uint16_t presence; /* slot that becomes 1 when it is there, or NONE */
-    uint16_t node;     /* of a message that is not repeated, or NONE */
+    uint16_t section;  /* of a message that is not repeated, or NONE */
     uint16_t choice;   /* slot with the number of the oneof's member that is there, or NONE */
     uint16_t cleared, cleared_count; /* slots of the oneof's members */
     uint16_t closed;   /* of the layout's closed enums, or NONE */
@@ -263,18 +263,18 @@ struct read_operation {
 
 /* A message at one place: of protobuf the wanted fields, and all members of their oneofs, by ascending number; of CDR the
  * steps up to its last wanted field. */
-struct node {
+struct section {
     union {
-        const struct node_field *fields;
+        const struct wanted_field *fields;
         const struct read_operation *steps;
     };
     uint32_t count;
     uint16_t first_slot, slot_count; /* of an element of a list: its own, with those of messages in it */
 };
 
-/* What programs have in common that read the same messages. */
+/* What routines have in common that read the same messages. */
 struct layout {
-    const struct node *nodes; /* the first one is the message; of a datagram the second one is the envelope around it */
+    const struct section *sections; /* the first one is the message; of a datagram the second one is its envelope */
     const struct value *defaults; /* what slots hold where nothing was read */
     const struct closed_enum *closed;
     const uint8_t *literals;

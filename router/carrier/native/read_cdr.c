@@ -78,10 +78,10 @@ static bool add_beginning(struct machine *machine, const struct reader *reader, 
     return list_add(machine, &machine->slots[list], beginning);
 }
 
-static bool read_steps(struct machine *machine, struct reader *reader, const struct node *node) {
+static bool read_steps(struct machine *machine, struct reader *reader, const struct section *section) {
     struct value *slots = machine->slots;
     struct repetition repetitions[MOST_LOOPS + 1], *inner = repetitions; /* the first one is never used */
-    for (const struct read_operation *step = node->steps, *end = step + node->count; step < end; step++) {
+    for (const struct read_operation *step = section->steps, *end = step + section->count; step < end; step++) {
         struct value *slot = step->slot == NONE ? NULL : &slots[step->slot], text;
         uint32_t count = step->count;
         switch ((enum read_kind)step->kind) {
@@ -128,17 +128,17 @@ static bool read_steps(struct machine *machine, struct reader *reader, const str
     return true;
 }
 
-bool read_cdr(struct machine *machine, uint16_t node, const uint8_t *message, size_t size) {
+bool read_cdr(struct machine *machine, uint16_t section, const uint8_t *message, size_t size) {
     static const uint8_t CDR_LE[] = {0, 1};
     if (size < HEADER || memcmp(message, CDR_LE, sizeof CDR_LE) != 0) return false;
     machine->message = message;
     machine->message_end = message + size;
     struct reader reader = {message, size, HEADER};
-    return read_steps(machine, &reader, &machine->layout->nodes[node]);
+    return read_steps(machine, &reader, &machine->layout->sections[section]);
 }
 
-bool read_cdr_element(struct machine *machine, uint16_t node, const uint8_t *beginning) {
+bool read_cdr_element(struct machine *machine, uint16_t section, const uint8_t *beginning) {
     struct reader reader = {machine->message, (size_t)(machine->message_end - machine->message),
                             (size_t)(beginning - machine->message)};
-    return read_steps(machine, &reader, &machine->layout->nodes[node]);
+    return read_steps(machine, &reader, &machine->layout->sections[section]);
 }

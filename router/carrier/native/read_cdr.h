@@ -12,10 +12,10 @@
 
 #include "machine.h"
 
-/* Read a message with its header into the slots of a node, which have their defaults. */
-bool read_cdr(struct machine *machine, uint16_t node, const uint8_t *message, size_t size);
+/* Read a message with its header into the slots of a section, which have their defaults. */
+bool read_cdr(struct machine *machine, uint16_t section, const uint8_t *message, size_t size);
 
 /* Likewise an element of a list, which begins at `beginning` in the message that was read last. */
-bool read_cdr_element(struct machine *machine, uint16_t node, const uint8_t *beginning);
+bool read_cdr_element(struct machine *machine, uint16_t section, const uint8_t *beginning);
 
 #endif

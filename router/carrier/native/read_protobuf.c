@@ -6,17 +6,17 @@
 #include "wire.h"
 
 /* Find a field. Most messages have theirs in order: `guess` is where the next one is then. */
-static const struct node_field *find(const struct node *node, uint32_t number, uint32_t *guess) {
-    if (*guess < node->count && node->fields[*guess].number == number) return &node->fields[(*guess)++];
-    uint32_t low = 0, high = node->count;
+static const struct wanted_field *find(const struct section *section, uint32_t number, uint32_t *guess) {
+    if (*guess < section->count && section->fields[*guess].number == number) return &section->fields[(*guess)++];
+    uint32_t low = 0, high = section->count;
     while (low < high) {
         uint32_t middle = low + (high - low) / 2;
-        if (node->fields[middle].number < number) low = middle + 1;
+        if (section->fields[middle].number < number) low = middle + 1;
         else high = middle;
     }
-    if (low == node->count || node->fields[low].number != number) return NULL;
+    if (low == section->count || section->fields[low].number != number) return NULL;
     *guess = low + 1;
-    return &node->fields[low];
+    return &section->fields[low];
 }
 
 static uint32_t wire_type_of(enum field_type type) {
@@ -67,7 +67,7 @@ static bool read_scalar(struct bytes *from, enum field_type type, struct value *
 }
 
 /* Whether a field can hold a value: of a closed enum, only its own numbers. */
-static bool is_known(const struct machine *machine, const struct node_field *field, const struct value *value) {
+static bool is_known(const struct machine *machine, const struct wanted_field *field, const struct value *value) {
     if (field->type != TYPE_CLOSED_ENUM) return true;
     const struct closed_enum *closed = &machine->layout->closed[field->closed];
     uint32_t low = 0, high = closed->count;
@@ -84,14 +84,15 @@ static struct value range(const struct bytes *bytes) {
     return (struct value){.bytes = bytes->at, .size = (uint32_t)left(bytes)};
 }
 
-static bool read_element(struct machine *machine, const struct node_field *field, struct bytes *from) {
+static bool read_element(struct machine *machine, const struct wanted_field *field, struct bytes *from) {
     struct value element;
     if (!read_scalar(from, field->type, &element)) return false;
     return !is_known(machine, field, &element) || list_add(machine, &machine->slots[field->slot], element);
 }
 
 /* Read a value of a repeated field, or several that are packed. */
-static bool read_elements(struct machine *machine, const struct node_field *field, uint32_t wire_type, struct bytes *from) {
+static bool read_elements(struct machine *machine, const struct wanted_field *field, uint32_t wire_type,
+                          struct bytes *from) {
     struct bytes many;
     if (wire_type != LEN) return read_element(machine, field, from);
     if (!read_len(from, &many)) return false;
@@ -102,13 +103,13 @@ static bool read_elements(struct machine *machine, const struct node_field *fiel
     return true;
 }
 
-static bool has_type(const struct node_field *field, uint32_t wire_type) {
+static bool has_type(const struct wanted_field *field, uint32_t wire_type) {
     uint32_t declared = wire_type_of(field->type);
     return wire_type == declared || (wire_type == LEN && field->is_repeated);
 }
 
 /* A member of a oneof clears the others. */
-static void choose(struct machine *machine, const struct node_field *field) {
+static void choose(struct machine *machine, const struct wanted_field *field) {
     struct value *slots = machine->slots;
     if (slots[field->choice].integer == field->number) return;
     memcpy(slots + field->cleared, machine->layout->defaults + field->cleared, field->cleared_count * sizeof *slots);
@@ -116,13 +117,13 @@ static void choose(struct machine *machine, const struct node_field *field) {
 }
 
 /* Note that a field is there. */
-static inline void mark(struct machine *machine, const struct node_field *field) {
+static inline void mark(struct machine *machine, const struct wanted_field *field) {
     if (field->choice != NONE) choose(machine, field);
     if (field->presence != NONE) machine->slots[field->presence].integer = 1;
 }
 
 /* A number that a closed enum does not have is an unknown field: it neither clears nor marks anything. */
-static bool read_single(struct machine *machine, const struct node_field *field, struct bytes *from) {
+static bool read_single(struct machine *machine, const struct wanted_field *field, struct bytes *from) {
     struct value value;
     if (!read_scalar(from, field->type, &value)) return false;
     if (!is_known(machine, field, &value)) return true;
@@ -131,29 +132,29 @@ static bool read_single(struct machine *machine, const struct node_field *field,
     return true;
 }
 
-static bool read_node(struct machine *machine, uint16_t of, struct bytes rest, int depth);
+static bool read_section(struct machine *machine, uint16_t of, struct bytes rest, int depth);
 
-static bool read_field(struct machine *machine, const struct node_field *field, uint32_t wire_type, struct bytes *from,
-                       int depth) {
+static bool read_field(struct machine *machine, const struct wanted_field *field, uint32_t wire_type,
+                       struct bytes *from, int depth) {
     struct bytes value;
     if (field->is_repeated && field->slot != NONE) return read_elements(machine, field, wire_type, from);
     if (wire_type != LEN && wire_type != GROUP) return read_single(machine, field, from);
     mark(machine, field);
     if (!read_value(from, wire_type, &value)) return false;
-    if (field->node != NONE) return read_node(machine, field->node, value, depth - 1);
+    if (field->section != NONE) return read_section(machine, field->section, value, depth - 1);
     if (field->slot != NONE) machine->slots[field->slot] = range(&value);
     return true;
 }
 
-static bool read_node(struct machine *machine, uint16_t of, struct bytes rest, int depth) {
+static bool read_section(struct machine *machine, uint16_t of, struct bytes rest, int depth) {
     if (!depth) return false;
-    const struct node *node = &machine->layout->nodes[of];
+    const struct section *section = &machine->layout->sections[of];
     uint32_t guess = 0;
     while (rest.at < rest.end) {
         uint32_t tag;
         struct bytes unknown;
         if (!read_tag(&rest, &tag)) return false;
-        const struct node_field *field = find(node, tag >> 3, &guess);
+        const struct wanted_field *field = find(section, tag >> 3, &guess);
         bool is_read = field != NULL && has_type(field, tag & 7) ? read_field(machine, field, tag & 7, &rest, depth)
                                                                  : read_value(&rest, tag & 7, &unknown);
         if (!is_read) return false;
@@ -161,6 +162,6 @@ static bool read_node(struct machine *machine, uint16_t of, struct bytes rest, i
     return true;
 }
 
-bool read_protobuf(struct machine *machine, uint16_t node, const uint8_t *message, size_t size) {
-    return read_node(machine, node, (struct bytes){message, message + size}, MOST_NODES_DEEP);
+bool read_protobuf(struct machine *machine, uint16_t section, const uint8_t *message, size_t size) {
+    return read_section(machine, section, (struct bytes){message, message + size}, MOST_SECTIONS_DEEP);
 }

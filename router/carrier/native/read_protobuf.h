@@ -11,9 +11,9 @@
 
 #include "machine.h"
 
-enum { MOST_NODES_DEEP = 32 }; /* messages in messages */
+enum { MOST_SECTIONS_DEEP = 32 }; /* messages in messages */
 
-/* Read a message into the slots of a node, which have their defaults. */
-bool read_protobuf(struct machine *machine, uint16_t node, const uint8_t *message, size_t size);
+/* Read a message into the slots of a section, which have their defaults. */
+bool read_protobuf(struct machine *machine, uint16_t section, const uint8_t *message, size_t size);
 
 #endif

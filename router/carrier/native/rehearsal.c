@@ -211,7 +211,7 @@ const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size) {
 
 /* ---- conditions by themselves ---- */
 
-static int evaluate_on_payload(struct machine *machine, const struct layout *layout, const struct code *condition,
+static int evaluate_on_payload(struct machine *machine, const struct layout *layout, const struct routine *condition,
                                const struct value *source, int64_t received_at, const void *payload, size_t size,
                                bool *holds) {
     uint32_t at;
@@ -219,11 +219,11 @@ static int evaluate_on_payload(struct machine *machine, const struct layout *lay
     machine_begin(machine, layout);
     machine->slots[SLOT_RECEIVED_AT].integer = received_at;
     machine->slots[SLOT_SOURCE] = *source;
-    if (!machine_read(machine, NODE_PAYLOAD, payload, size)) return LOSS_MAPPING_ERROR;
+    if (!machine_read(machine, SECTION_PAYLOAD, payload, size)) return LOSS_MAPPING_ERROR;
     return evaluate_condition(machine, condition, holds, &at);
 }
 
-int condition_holds(const struct layout *layout, const struct code *condition, const struct value *source,
+int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
                     int64_t received_at, const void *payload, size_t size, bool *holds) {
     struct machine *machine = calloc(1, sizeof *machine);
     if (!machine) return LOSSES;

@@ -68,7 +68,7 @@ const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size);
 
 /* Evaluate a condition on a payload, as `when` of a route is evaluated. `source` is the name of the sender. Return EVALUATED,
  * an enum loss if it has no value for this payload or the payload is malformed, or LOSSES for lack of memory. */
-int condition_holds(const struct layout *layout, const struct code *condition, const struct value *source,
+int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
                     int64_t received_at, const void *payload, size_t size, bool *holds);
 
 #endif

@@ -117,11 +117,11 @@ static int route(struct routing *routing, const struct payload_case *found, stru
         stage_count(&routing->stage, found->unhandled, 1);
         return UNHANDLED;
     }
-    const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
-    if (entry->route < 0) return SOURCE_MISMATCH;
-    const struct route *chosen = &program->routes[entry->route];
+    const struct choice *choice = &listener->choices[(uint32_t)found->row * listener->columns + received->column];
+    if (choice->route < 0) return SOURCE_MISMATCH;
+    const struct route *chosen = &program->routes[choice->route];
     received->route = chosen;
-    stage_count(&routing->stage, entry->received, 1);
+    stage_count(&routing->stage, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
     counter_set(routing->stage.counters, chosen->last_message, received->received_at);

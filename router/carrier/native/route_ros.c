@@ -52,8 +52,8 @@ static void serve_element(struct ros_routing *routing, const struct ros_route *r
     uint32_t cell_count = machine->cell_count;
     struct value item = list_next(machine, list, each->stored);
     if (each->index != NONE) machine->slots[each->index].integer = index;
-    if (each->node == NONE) machine->slots[each->item] = item;
-    else if (!machine_enter(machine, each->node, &item)) message.outcome = LOSS_MAPPING_ERROR;
+    if (each->section == NONE) machine->slots[each->item] = item;
+    else if (!machine_enter(machine, each->section, &item)) message.outcome = LOSS_MAPPING_ERROR;
     deliver_to_all(&routing->stage, &route->targets, &message);
     machine->cell_count = cell_count;
 }

@@ -16,9 +16,9 @@
 
 /* `for_each`: each element of a list is served as a message. */
 struct for_each {
-    struct code list;   /* leaves the list on the stack; empty without `for_each` */
+    struct routine list;   /* leaves the list on the stack; empty without `for_each` */
     uint16_t stored;    /* how, an enum scalar */
-    uint16_t node;      /* into which an element is read that is a message, or NONE */
+    uint16_t section;      /* into which an element is read that is a message, or NONE */
     uint16_t item;      /* slot of any other element */
     uint16_t index, count; /* slots, NONE if nothing uses them */
     uint16_t reserved[3];

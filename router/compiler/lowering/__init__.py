@@ -1,6 +1,6 @@
-"""From the routes of a table without errors to the programs that the carrier executes.
+"""From the routes of a table without errors to the routines that the carrier executes.
 
-Each target is lowered once. A program that would be too large is a finding.
+Each target is lowered once. A routine that would be too large is a finding.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 from router.compiler.checked import CheckedRoute
 from router.compiler.expressions.tree import Node
-from router.compiler.lowering.names import TooLargeError
-from router.compiler.lowering.programs import (
+from router.compiler.lowering.lowered import (
     Lowered,
     LoweredCollect,
     LoweredCondition,
@@ -19,6 +18,7 @@ from router.compiler.lowering.programs import (
     LoweredRoute,
     LoweredTarget,
 )
+from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
 from router.errors import Diagnostic
 from router.types.protobuf import Envelope, PayloadCase
@@ -38,14 +38,14 @@ __all__ = [
 
 def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Lowered, list[Diagnostic]]:
     """Lower all targets of a table without errors."""
-    conditions: dict[str, LoweredRoute] = {}
-    topics: dict[str, LoweredRoute] = {}
+    to_destinations: dict[str, LoweredRoute] = {}
+    to_topics: dict[str, LoweredRoute] = {}
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}
     findings: list[Diagnostic] = []
     for checked in routes:
         filtered = [target for target in checked.targets if not target.topic and target.when is not None]
         published = [target for target in checked.targets if target.topic]
-        for targets, lowered in ((filtered, conditions), (published, topics)):
+        for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             try:
                 if targets:
                     lowered[checked.route.name] = Datagram(checked.case, envelope).lowered(checked, targets)
@@ -57,11 +57,11 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Low
                 from_ros[topic] = (*from_ros.get(topic, ()), RosMessage(feed.type, topic).lowered(checked, feed))
             except TooLargeError as error:
                 findings.append(error.diagnostic)
-    return Lowered(conditions, topics, from_ros), findings
+    return Lowered(to_destinations, to_topics, from_ros), findings
 
 
 def lower_condition(condition: Node, case: PayloadCase, envelope: Envelope) -> LoweredCondition:
     """Lower a condition on a payload by itself. Raises TooLargeError."""
     source = Datagram(case, envelope)
-    code, _ = source.condition(source.lowering(), [condition])
-    return LoweredCondition(code, source.layout(condition.span))
+    routine, _ = source.condition(source.lowering(), [condition])
+    return LoweredCondition(routine, source.layout(condition.span))

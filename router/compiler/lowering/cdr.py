@@ -12,10 +12,10 @@ from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
 from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
-from router.compiler.lowering.nodes import size_of
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Operation, keep, known, load
+from router.compiler.lowering.sections import size_of
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op, Scalar
 from router.types.model import Float, Int, String

@@ -2,7 +2,7 @@
 
 The tree has the kind of each value, the range of each integer, and which results have to be checked. A value on the
 stack is an integer, a real number, text, bytes or a list, according to its kind; a time is its nanoseconds. A message
-is on the stack only as an element of a list: its fields are read from a Node.
+is on the stack only as an element of a list: its fields are read from a Section.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.lowering import functions, lists
 from router.compiler.lowering.names import Names
-from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs, to_real
 from router.compiler.lowering.operations import (
     DROP,
-    Code,
     Operation,
+    Routine,
     Slot,
     chained,
     choice,
-    code,
     integer,
     keep,
     load,
     once,
     real,
+    routine,
     text,
 )
+from router.compiler.lowering.sections import Section
 from router.declared import Compared, Op, Scalar
 from router.types.model import Field
 
@@ -69,7 +69,7 @@ class Lowering:
 
     names: Names
 
-    def value(self, node: tree.Node) -> Code:
+    def value(self, node: tree.Node) -> Routine:
         """Return the operations that put the value of a node on the stack.
 
         A value that no turn of a loop changes is computed once, in the first turn that needs it.
@@ -91,9 +91,9 @@ class Lowering:
             level -= 1
         return level if level < len(loops) else None
 
-    def _value(self, node: tree.Node) -> Code:  # noqa: C901, PLR0912 - a case a node
+    def _value(self, node: tree.Node) -> Routine:  # noqa: C901, PLR0912 - a case a node
         if isinstance(node.kind, ListKind):
-            return lists.stored(self, node).code
+            return lists.stored(self, node).routine
         match node:
             case tree.Constant():
                 return _constant(node)
@@ -103,7 +103,7 @@ class Lowering:
                 return self._field(node)
             case tree.Present():
                 before, holder = self.message(node.holder)
-                return code(before, load(holder.presence(node.field)))
+                return routine(before, load(holder.presence(node.field)))
             case tree.Element():
                 return self._element(node)
             case tree.Unary():
@@ -124,18 +124,18 @@ class Lowering:
             case _:
                 raise AssertionError(f"{node.kind} is no list")
 
-    def real(self, node: tree.Node) -> Code:
+    def real(self, node: tree.Node) -> Routine:
         """Return those that put a number there as a real one."""
         return to_real(self.value(node), node.kind)
 
     # messages and their fields
 
-    def message(self, node: tree.Node) -> tuple[Code, Node]:
-        """Return the node that has the fields of a message, and the operations that read them into it."""
+    def message(self, node: tree.Node) -> tuple[Routine, Section]:
+        """Return the section that has the fields of a message, and the operations that read them into it."""
         match node:
             case tree.Variable():
                 meaning = self.names.variables[node.name]
-                assert isinstance(meaning, Node)  # noqa: S101 - it is a message
+                assert isinstance(meaning, Section)  # noqa: S101 - it is a message
                 return (), meaning
             case tree.Read():
                 before, holder = self.message(node.holder)
@@ -145,60 +145,60 @@ class Lowering:
             case _:
                 raise AssertionError(f"no message is computed, as by {type(node).__name__}")
 
-    def _field(self, node: tree.Read) -> Code:
+    def _field(self, node: tree.Read) -> Routine:
         if isinstance(node.kind, TimeKind):
             return self.time(*self.message(node))
         before, holder = self.message(node.holder)
         if isinstance(node.kind, MessageKind):  # the only element of a list
-            return code(before, load(holder.value(node.field)), Operation(Op.ELEMENT, flag=Scalar.IN_CELLS))
-        made = code(before, load(holder.value(node.field)))
-        return code(made, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else made
+            return routine(before, load(holder.value(node.field)), Operation(Op.ELEMENT, flag=Scalar.IN_CELLS))
+        made = routine(before, load(holder.value(node.field)))
+        return routine(made, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else made
 
-    def time(self, before: Code, moment: Node) -> Code:
+    def time(self, before: Routine, moment: Section) -> Routine:
         """Return the nanoseconds of a message with seconds and nanoseconds. They always fit."""
         seconds, nanoseconds = moment.type.fields
-        whole = code(load(moment.value(seconds)), integer(NS_PER_SECOND), Operation(Op.MULTIPLY))
-        return code(before, whole, load(moment.value(nanoseconds)), Operation(Op.ADD))
+        whole = routine(load(moment.value(seconds)), integer(NS_PER_SECOND), Operation(Op.MULTIPLY))
+        return routine(before, whole, load(moment.value(nanoseconds)), Operation(Op.ADD))
 
-    def _variable(self, node: tree.Variable) -> Code:
+    def _variable(self, node: tree.Variable) -> Routine:
         meaning = self.names.variables[node.name]
         return (load(meaning),) if isinstance(meaning, Slot) else self.time((), meaning)
 
-    def _element(self, node: tree.Element) -> Code:
+    def _element(self, node: tree.Element) -> Routine:
         if isinstance(node.kind, TimeKind) and lists.are_messages(node.values):
             return self.time(*lists.entered(self, node))
         return lists.element(self, node)
 
     # operators
 
-    def _unary(self, node: tree.Unary) -> Code:
+    def _unary(self, node: tree.Unary) -> Routine:
         operand = self.value(node.operand)
         if node.operator is tree.Operator.NOT:
-            return code(operand, Operation(Op.NOT))
+            return routine(operand, Operation(Op.NOT))
         if isinstance(node.kind, FloatKind):
-            return code(to_real(operand, node.operand.kind), Operation(Op.REAL_NEGATE))
+            return routine(to_real(operand, node.operand.kind), Operation(Op.REAL_NEGATE))
         negate = Op.CHECKED_NEGATE if node.is_checked else Op.NEGATE
-        return code(operand, Operation(negate, flag=signs(node.kind, node.operand.kind)))
+        return routine(operand, Operation(negate, flag=signs(node.kind, node.operand.kind)))
 
-    def _binary(self, node: tree.Binary) -> Code:
+    def _binary(self, node: tree.Binary) -> Routine:
         if isinstance(node.kind, StringKind):
             self.names.count_text(functions.longest(node), node.span)
-            return code(self.value(node.left), self.value(node.right), Operation(Op.JOIN))
+            return routine(self.value(node.left), self.value(node.right), Operation(Op.JOIN))
         if isinstance(node.kind, FloatKind):
-            return code(self.real(node.left), self.real(node.right), Operation(_REALS[node.operator]))
+            return routine(self.real(node.left), self.real(node.right), Operation(_REALS[node.operator]))
         if node.operator is tree.Operator.POWER:
             return self._power(node)
         operator = _INTEGERS[node.operator][node.is_checked]
         flag = signs(node.kind, node.left.kind, node.right.kind)
-        return code(self.value(node.left), self.value(node.right), Operation(operator, flag=flag))
+        return routine(self.value(node.left), self.value(node.right), Operation(operator, flag=flag))
 
-    def _power(self, node: tree.Binary) -> Code:
+    def _power(self, node: tree.Binary) -> Routine:
         """A power of an integer, by multiplication. A lower power fits wherever the result does."""
         assert isinstance(node.right, tree.Constant)  # noqa: S101 - exponents are literals
         exponent = int(node.right.value)
         base = self.value(node.left)
         if exponent == 0:
-            return code(base, DROP, integer(1))
+            return routine(base, DROP, integer(1))
         if exponent == 1:
             return base
         slot = self.names.temporary()
@@ -206,14 +206,14 @@ class Lowering:
         kind = node.left.kind
         again = load(slot), Operation(multiply, flag=signs(kind, kind, kind))
         last = load(slot), Operation(multiply, flag=signs(node.kind, kind, kind))
-        return code(base, keep(slot), again * (exponent - 2), last)
+        return routine(base, keep(slot), again * (exponent - 2), last)
 
-    def _compare(self, node: tree.Compare) -> Code:
+    def _compare(self, node: tree.Compare) -> Routine:
         """Each operand is evaluated once, and none behind a comparison that is false."""
         slots = [self.names.temporary() for _ in node.operands[1:-1]]
         values = list(map(self.value, node.operands))
         firsts = [values[0], *((load(slot),) for slot in slots)]
-        seconds = [*(code(value, keep(slot)) for value, slot in zip(values[1:], slots, strict=False)), values[-1]]
+        seconds = [*(routine(value, keep(slot)) for value, slot in zip(values[1:], slots, strict=False)), values[-1]]
         kinds = pairwise(operand.kind for operand in node.operands)
         parts = [
             compare(relation, first, second, *both)
@@ -228,12 +228,12 @@ _COSTLY = frozenset({
 """Operations whose time grows with a list, a text or a message."""
 
 
-def _is_costly(made: Code) -> bool:
+def _is_costly(made: Routine) -> bool:
     return any(each.kind in _COSTLY or (each.kind is Op.COMPARE and each.slot == Compared.TEXTS) for each in made)
 
 
 def _can_be_kept(node: tree.Node) -> bool:
-    """Whether a value can stay in a slot from turn to turn: no list, and no text that the program puts together."""
+    """Whether a value can stay in a slot from turn to turn: no list, and no text that the routine puts together."""
     if isinstance(node.kind, StringKind):
         return isinstance(node, tree.Read) or (isinstance(node, tree.Element) and isinstance(node.values, tree.Read))
     return not isinstance(node, (tree.Constant, tree.Variable)) and not isinstance(
@@ -249,11 +249,11 @@ def _variables(node: tree.Node) -> Iterator[str]:
         yield from _variables(part)
 
 
-def _is_unchecked(holder: Node, member: Field, kind: Kind) -> bool:
+def _is_unchecked(holder: Section, member: Field, kind: Kind) -> bool:
     return isinstance(kind, StringKind) and holder.is_unchecked(member)
 
 
-def _constant(node: tree.Constant) -> Code:
+def _constant(node: tree.Constant) -> Routine:
     value = node.value
     if isinstance(value, str):
         return (text(value.encode()),)

@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.lowering import lists
 from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
-from router.compiler.lowering.operations import DROP, WANT, Code, Operation, code, integer, keep, load, real, text
+from router.compiler.lowering.operations import DROP, WANT, Operation, Routine, integer, keep, load, real, routine, text
 from router.declared import MAX_DATAGRAM, Compared, Op, Relation
 
 if TYPE_CHECKING:
@@ -40,18 +40,18 @@ _LONGEST_DECIMAL, _LONGEST_DIGITS = 20, 1 + 309 + 1 + 17
 """Characters of an integer, and of a double with 17 decimals."""
 
 
-def called(lowering: Lowering, node: tree.Call) -> Code:
+def called(lowering: Lowering, node: tree.Call) -> Routine:
     """Return the operations that put the result of a call on the stack."""
     name, first = node.function, node.arguments[0]
     if name in EXTREMES:
         return _extreme(lowering, node)
     if name in _OF_REALS:
-        return code(*map(lowering.real, node.arguments), Operation(_OF_REALS[name]))
+        return routine(*map(lowering.real, node.arguments), Operation(_OF_REALS[name]))
     if name in _ROUNDINGS:
         made = lowering.value(first)
-        return code(made, Operation(_ROUNDINGS[name])) if isinstance(first.kind, FloatKind) else made
+        return routine(made, Operation(_ROUNDINGS[name])) if isinstance(first.kind, FloatKind) else made
     if name in _FACTORS:
-        return code(lowering.real(first), real(_FACTORS[name]), Operation(Op.REAL_MULTIPLY))
+        return routine(lowering.real(first), real(_FACTORS[name]), Operation(Op.REAL_MULTIPLY))
     if name in _TIMES:
         return _time(lowering, first, _TIMES[name])
     if name in _OF_THREE:
@@ -62,80 +62,82 @@ def called(lowering: Lowering, node: tree.Call) -> Code:
 # ---- numbers
 
 
-def _extreme(lowering: Lowering, node: tree.Call) -> Code:
+def _extreme(lowering: Lowering, node: tree.Call) -> Routine:
     of_integers, of_reals = EXTREMES[node.function]
     if len(node.arguments) == 1:
         return lists.extreme(lowering, node, of_integers, of_reals)
     first, *others = node.arguments
     if isinstance(node.kind, FloatKind):
-        return code(lowering.real(first), *(code(lowering.real(each), Operation(of_reals)) for each in others))
+        return routine(lowering.real(first), *(routine(lowering.real(each), Operation(of_reals)) for each in others))
     made, kind = lowering.value(first), first.kind
     pick = min if of_integers is Op.LEAST else max
     for each in others:
         (low, high), (low_too, high_too) = bounds(kind), bounds(each.kind)
         result = IntKind(pick(low, low_too), pick(high, high_too))
-        made = code(made, lowering.value(each), Operation(of_integers, flag=signs(result, kind, each.kind)))
+        made = routine(made, lowering.value(each), Operation(of_integers, flag=signs(result, kind, each.kind)))
         kind = result
     return made
 
 
-def _between(lowering: Lowering, node: tree.Call) -> Code:
+def _between(lowering: Lowering, node: tree.Call) -> Routine:
     """clamp() and wrap()."""
     of_integers, of_reals = _OF_THREE[node.function]
     if isinstance(node.kind, FloatKind):
         assert of_reals is not None  # noqa: S101 - wrap() takes integers
-        return code(*map(lowering.real, node.arguments), Operation(of_reals))
+        return routine(*map(lowering.real, node.arguments), Operation(of_reals))
     flag = signs(node.kind, *(each.kind for each in node.arguments))
-    return code(*map(lowering.value, node.arguments), Operation(of_integers, flag=flag))
+    return routine(*map(lowering.value, node.arguments), Operation(of_integers, flag=flag))
 
 
-def _fit(lowering: Lowering, node: tree.Call) -> Code:
+def _fit(lowering: Lowering, node: tree.Call) -> Routine:
     first, low, high = node.arguments
     assert isinstance(low, tree.Constant)  # noqa: S101 - as `tree.CHECKS` says
     assert isinstance(high, tree.Constant)  # noqa: S101
     return fitted(lowering.value(first), first.kind, IntKind(int(low.value), int(high.value)))
 
 
-def _time(lowering: Lowering, node: tree.Node, factor: int) -> Code:
+def _time(lowering: Lowering, node: tree.Node, factor: int) -> Routine:
     """A time in nanoseconds. It is refused if it does not fit 64 bits."""
     if isinstance(node.kind, FloatKind):
-        return code(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
+        return routine(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
     flag = signs(TimeKind(), node.kind)
-    return code(lowering.value(node), integer(factor), Operation(Op.CHECKED_MULTIPLY, flag=flag))
+    return routine(lowering.value(node), integer(factor), Operation(Op.CHECKED_MULTIPLY, flag=flag))
 
 
-def _absolute(lowering: Lowering, node: tree.Call) -> Code:
+def _absolute(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     made = lowering.value(first)
     if isinstance(node.kind, FloatKind):
-        return code(to_real(made, first.kind), Operation(Op.REAL_ABSOLUTE))
-    return code(made, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else made
+        return routine(to_real(made, first.kind), Operation(Op.REAL_ABSOLUTE))
+    return routine(made, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else made
 
 
-def _seconds(lowering: Lowering, node: tree.Call) -> Code:
-    return code(lowering.real(node.arguments[0]), real(NS_PER_SECOND), Operation(Op.REAL_DIVIDE))
+def _seconds(lowering: Lowering, node: tree.Call) -> Routine:
+    return routine(lowering.real(node.arguments[0]), real(NS_PER_SECOND), Operation(Op.REAL_DIVIDE))
 
 
 # ---- enums
 
 
-def _named(lowering: Lowering, node: tree.Call) -> Code:
+def _named(lowering: Lowering, node: tree.Call) -> Routine:
     """The number of a name. Another text is refused."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
-    found: Code = (integer(0), WANT, integer(0))
+    found: Routine = (integer(0), WANT, integer(0))
     for name, number in reversed(node.kind.enum.values):
         is_it = load(slot), text(name.encode()), Operation(Op.COMPARE, int(Compared.TEXTS), flag=Relation.EQUAL)
-        found = code(is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found)
-    return code(lowering.value(node.arguments[0]), keep(slot), DROP, found)
+        found = routine(
+            is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found
+        )
+    return routine(lowering.value(node.arguments[0]), keep(slot), DROP, found)
 
 
-def _member(lowering: Lowering, node: tree.Call) -> Code:
+def _member(lowering: Lowering, node: tree.Call) -> Routine:
     """A number of a closed enum. Another one is refused."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     numbers = sorted({number for _, number in node.kind.enum.values})
     data = struct.pack(f"<{len(numbers)}i", *numbers)
-    return code(lowering.value(node.arguments[0]), Operation(Op.MEMBER, size=len(numbers), data=data))
+    return routine(lowering.value(node.arguments[0]), Operation(Op.MEMBER, size=len(numbers), data=data))
 
 
 # ---- text and bytes
@@ -159,51 +161,51 @@ def longest(node: tree.Node) -> int:
             return MAX_DATAGRAM
 
 
-def _str(lowering: Lowering, node: tree.Call) -> Code:
+def _str(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     made = lowering.value(first)
     if isinstance(first.kind, StringKind):
         return made
     if isinstance(first.kind, BoolKind):
         yes, no = text(b"True"), text(b"False")
-        return code(made, Operation(Op.UNLESS, size=2), yes, Operation(Op.JUMP, size=1), no)
+        return routine(made, Operation(Op.UNLESS, size=2), yes, Operation(Op.JUMP, size=1), no)
     lowering.names.count_text(_LONGEST_DECIMAL, node.span)
-    return code(made, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
+    return routine(made, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
 
 
-def _text(lowering: Lowering, node: tree.Call) -> Code:
+def _text(lowering: Lowering, node: tree.Call) -> Routine:
     number, digits = node.arguments
     assert isinstance(digits, tree.Constant)  # noqa: S101 - it is a literal
     lowering.names.count_text(_LONGEST_DIGITS, node.span)
-    return code(lowering.real(number), Operation(Op.DIGITS, int(digits.value)))
+    return routine(lowering.real(number), Operation(Op.DIGITS, int(digits.value)))
 
 
-def _length(lowering: Lowering, node: tree.Call) -> Code:
+def _length(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     if isinstance(first.kind, StringKind):
-        return code(lowering.value(first), Operation(Op.CHARACTERS))
+        return routine(lowering.value(first), Operation(Op.CHARACTERS))
     return lists.length(lowering, first)
 
 
-def _fit_text(lowering: Lowering, node: tree.Call) -> Code:
+def _fit_text(lowering: Lowering, node: tree.Call) -> Routine:
     first, most = node.arguments
     assert isinstance(most, tree.Constant)  # noqa: S101 - as `tree.CHECKS` says
-    return code(lowering.value(first), Operation(Op.FIT_SIZE, number=int(most.value)))
+    return routine(lowering.value(first), Operation(Op.FIT_SIZE, number=int(most.value)))
 
 
-def _octets(lowering: Lowering, node: tree.Call) -> Code:
+def _octets(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     if isinstance(first, tree.Listed) and all(isinstance(item, tree.Constant) for item in first.items):
         return (text(bytes(int(item.value) for item in first.items if isinstance(item, tree.Constant))),)
     made = lists.stored(lowering, first)
-    return made.code if made.is_octets else code(made.code, Operation(Op.OCTETS, flag=made.scalar))
+    return made.routine if made.is_octets else routine(made.routine, Operation(Op.OCTETS, flag=made.scalar))
 
 
-def _same(lowering: Lowering, node: tree.Call) -> Code:
+def _same(lowering: Lowering, node: tree.Call) -> Routine:
     return lowering.value(node.arguments[0])
 
 
-_OTHERS: Mapping[str, Callable[[Lowering, tree.Call], Code]] = {
+_OTHERS: Mapping[str, Callable[[Lowering, tree.Call], Routine]] = {
     "abs": _absolute,
     "fit": _fit,
     "float64": lambda lowering, node: lowering.real(node.arguments[0]),

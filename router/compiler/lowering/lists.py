@@ -23,24 +23,24 @@ from router.compiler.expressions.kinds import (
     element_of,
 )
 from router.compiler.lowering.names import Loop
-from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.numbers import coerced, compare, signs
 from router.compiler.lowering.operations import (
     DROP,
     EQUAL,
     SIZE,
     WANT,
-    Code,
     Operation,
+    Routine,
     Slot,
     choice,
-    code,
     integer,
     keep,
     load,
     real,
     repeat,
+    routine,
 )
+from router.compiler.lowering.sections import Section
 from router.declared import Op, Scalar
 
 if TYPE_CHECKING:
@@ -53,16 +53,16 @@ _MOST_STACKED = 32
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A list that `code` puts on the stack. `scalar` says how it is stored.
+    """A list that `routine` puts on the stack. `scalar` says how it is stored.
 
-    `element` is the kind of its elements. Those that are messages, as times of ROS are, are read into nodes like
+    `element` is the kind of its elements. Those that are messages, as times of ROS are, are read into sections like
     `message`. With `is_unchecked` they are texts that may not be UTF-8.
     """
 
-    code: Code
+    routine: Routine
     scalar: Scalar
     element: Kind | None
-    message: Node | None = None
+    message: Section | None = None
     is_unchecked: bool = False
 
     @property
@@ -105,7 +105,7 @@ def _read(lowering: Lowering, node: tree.Read) -> Stored:
     element = node.kind.element
     message = holder.inner(node.field) if isinstance(element, (MessageKind, TimeKind)) else None
     is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
-    made = code(before, load(holder.value(node.field)))
+    made = routine(before, load(holder.value(node.field)))
     return Stored(made, holder.stored(node.field), element, message, is_unchecked)
 
 
@@ -113,26 +113,26 @@ def _payloads(lowering: Lowering, node: tree.Variable) -> Stored:
     """`items` of `collect`: the only variable with a list, of messages like the source message."""
     items, payload = lowering.names.variables[node.name], lowering.names.variables[tree.MESSAGE]
     assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
-    assert isinstance(payload, Node)  # noqa: S101
+    assert isinstance(payload, Section)  # noqa: S101
     assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
-    message = Node(payload.type, payload.descriptor, f"{node.name}[].")
+    message = Section(payload.type, payload.descriptor, f"{node.name}[].")
     return Stored((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
 
 def _listed(lowering: Lowering, node: tree.Listed) -> Stored:
     element = node.kind.element
-    items = [code(lowering.value(item), *_as(item.kind, element)) for item in node.items]
-    message: Node | None = None
+    items = [routine(lowering.value(item), *_as(item.kind, element)) for item in node.items]
+    message: Section | None = None
     if isinstance(element, MessageKind):
-        message = Node(element.type, None, "[].")  # only those of ROS are values
+        message = Section(element.type, None, "[].")  # only those of ROS are values
     if len(items) <= _MOST_STACKED:
-        return Stored(code(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
+        return Stored(routine(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
     made = lowering.names.temporary()
-    appended = (code(item, Operation(Op.APPEND, made)) for item in items)
-    return Stored(code(_begun(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
+    appended = (routine(item, Operation(Op.APPEND, made)) for item in items)
+    return Stored(routine(_begun(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
 
 
-def _begun(made: Slot) -> Code:
+def _begun(made: Slot) -> Routine:
     """An empty list in a slot."""
     return Operation(Op.LIST, size=0), keep(made), DROP
 
@@ -144,12 +144,12 @@ def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
 def _computed(lowering: Lowering, node: tree.Each) -> Stored:
     made = lowering.names.temporary()
 
-    def append() -> Code:
+    def append() -> Routine:
         element = node.kind.element
         assert element is not None  # noqa: S101 - it is computed
-        return code(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
+        return routine(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
 
-    filled = code(_begun(made), looped(lowering, node.lists, append, keeps=True), load(made))
+    filled = routine(_begun(made), looped(lowering, node.lists, append, keeps=True), load(made))
     return Stored(filled, Scalar.IN_CELLS, node.kind.element)
 
 
@@ -160,14 +160,14 @@ def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
     if body.scalar is not orelse.scalar:
         body, orelse = map(_in_cells, (body, orelse))
-    return replace(body, code=choice(lowering.value(node.test), body.code, orelse.code))
+    return replace(body, routine=choice(lowering.value(node.test), body.routine, orelse.routine))
 
 
 def _in_cells(values: Stored) -> Stored:
     if values.scalar is Scalar.IN_CELLS:
         return values
-    unpacked = code(values.code, Operation(Op.UNPACK, flag=values.scalar))
-    return replace(values, code=unpacked, scalar=Scalar.IN_CELLS)
+    unpacked = routine(values.routine, Operation(Op.UNPACK, flag=values.scalar))
+    return replace(values, routine=unpacked, scalar=Scalar.IN_CELLS)
 
 
 def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
@@ -177,71 +177,71 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
         return replace(values, element=element)
     made, each = lowering.names.temporary(), lowering.names.temporary()
-    start = code(_begun(made), values.code, keep(each), SIZE)
+    start = routine(_begun(made), values.routine, keep(each), SIZE)
     taken, meaning = _taken(lowering, values, each)
-    one = lowering.time((), meaning) if isinstance(meaning, Node) else ()
-    body = code(taken, one, *_as(kind, element), Operation(Op.APPEND, made))
-    return Stored(code(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
+    one = lowering.time((), meaning) if isinstance(meaning, Section) else ()
+    body = routine(taken, one, *_as(kind, element), Operation(Op.APPEND, made))
+    return Stored(routine(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
 
 
 # ---- loops
 
 
 def looped(
-    lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Code], *, keeps: bool = False
-) -> Code:
+    lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Routine], *, keeps: bool = False
+) -> Routine:
     """Repeat `body`, which uses the variables of `lists`, for their elements side by side.
 
     On the stack, it changes the value on top at the most.
     """
     counted, each = gone_through(lowering, lists)
-    before, turn = code_of_each(lowering, each, body)
-    return code(counted, before, repeat(turn, keeps=keeps))
+    before, turn = routine_of_each(lowering, each, body)
+    return routine(counted, before, repeat(turn, keeps=keeps))
 
 
 Taken = tuple[str, Stored, Slot]
 """A variable, its list, and the slot with the elements that are left."""
 
 
-def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Code, list[Taken]]:
+def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[Taken]]:
     """Copy lists to slots, and put their number of elements on the stack. Lists of different length are refused."""
-    made: Code = ()
+    made: Routine = ()
     taken: list[Taken] = []
     for variable, values in lists:
         of = stored(lowering, values)
         slot = lowering.names.temporary()
-        made = code(made, of.code, keep(slot), SIZE)
+        made = routine(made, of.routine, keep(slot), SIZE)
         if taken:
-            made = code(made, EQUAL, WANT, load(slot), SIZE)
+            made = routine(made, EQUAL, WANT, load(slot), SIZE)
         taken.append((variable, of, slot))
     return made, taken
 
 
-def code_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Code]) -> tuple[Code, Code]:
+def routine_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Routine]) -> tuple[Routine, Routine]:
     """Return what comes in front of a loop, and its body: what is done with the next element of each list."""
-    before: Code = ()
+    before: Routine = ()
     for variable, of, slot in taken:
-        one, node = _taken(lowering, of, slot)
-        meaning = node or lowering.names.temporary()
+        one, section = _taken(lowering, of, slot)
+        meaning = section or lowering.names.temporary()
         lowering.names.variables[variable] = meaning
-        before = code(before, one) if isinstance(meaning, Node) else code(before, one, keep(meaning), DROP)
+        before = routine(before, one) if isinstance(meaning, Section) else routine(before, one, keep(meaning), DROP)
     loop = Loop(frozenset(variable for variable, _, _ in taken))
     lowering.names.loops.append(loop)
-    turn = _without_a_detour(code(before, body()))
+    turn = _without_a_detour(routine(before, body()))
     lowering.names.loops.pop()
-    return code(*((integer(0), keep(flag), DROP) for flag in loop.flags)), turn
+    return routine(*((integer(0), keep(flag), DROP) for flag in loop.flags)), turn
 
 
-def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Code, Node | None]:
-    """Take an element off a list. It is on the stack then, or if it is a message, in a node."""
+def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section | None]:
+    """Take an element off a list. It is on the stack then, or if it is a message, in a section."""
     taken = Operation(Op.NEXT, slot, flag=of.scalar)
     if of.message is not None:
-        node = lowering.names.element(of.message)
-        return (taken, Operation(Op.ENTER, node)), node
+        section = lowering.names.element(of.message)
+        return (taken, Operation(Op.ENTER, section)), section
     return ((taken, Operation(Op.UTF8)) if of.is_unchecked else (taken,)), None
 
 
-def _without_a_detour(made: Code) -> Code:
+def _without_a_detour(made: Routine) -> Routine:
     """Leave an element on the stack that would be kept, dropped and loaded again, and is used nowhere else."""
     for index, operation in enumerate(made[:-2]):
         if operation.kind is Op.KEEP:
@@ -257,18 +257,20 @@ def _without_a_detour(made: Code) -> Code:
 # ---- elements
 
 
-def element(lowering: Lowering, node: tree.Element) -> Code:
+def element(lowering: Lowering, node: tree.Element) -> Routine:
     """Lower an element: a scalar, text or bytes, or a message that becomes an element of another list."""
     of = checked_list(lowering, node.values)
-    return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
+    return routine(of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
 
 
-def entered(lowering: Lowering, node: tree.Element) -> tuple[Code, Node]:
-    """Read a message in a list into a node."""
+def entered(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
+    """Read a message in a list into a section."""
     of = stored(lowering, node.values)
     assert of.message is not None  # noqa: S101 - said by the caller
     made = lowering.names.element(of.message)
-    return code(of.code, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)), made
+    return routine(
+        of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)
+    ), made
 
 
 def checked_list(lowering: Lowering, node: tree.Node) -> Stored:
@@ -278,50 +280,50 @@ def checked_list(lowering: Lowering, node: tree.Node) -> Stored:
         return of
     slot = lowering.names.temporary()
     body = Operation(Op.NEXT, slot, flag=of.scalar), Operation(Op.UTF8), DROP
-    return replace(of, code=code(of.code, keep(slot), SIZE, repeat(body), of.code), is_unchecked=False)
+    return replace(of, routine=routine(of.routine, keep(slot), SIZE, repeat(body), of.routine), is_unchecked=False)
 
 
 # ---- whole lists
 
 
-def length(lowering: Lowering, node: tree.Node) -> Code:
+def length(lowering: Lowering, node: tree.Node) -> Routine:
     """Lower len() of a list. A message of a literal is no value, but it has to be there."""
     if isinstance(node, tree.Listed) and are_messages(node):
-        return code(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
-    return code(checked_list(lowering, node).code, SIZE)
+        return routine(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
+    return routine(checked_list(lowering, node).routine, SIZE)
 
 
-def contains(lowering: Lowering, node: tree.Contains) -> Code:
+def contains(lowering: Lowering, node: tree.Contains) -> Routine:
     """Lower `in`. All elements are evaluated."""
     sought = lowering.names.temporary()
-    found = code(lowering.value(node.sought), keep(sought), DROP, integer(0))
+    found = routine(lowering.value(node.sought), keep(sought), DROP, integer(0))
     again = (load(sought),)
 
-    def look(one: Code, kind: Kind) -> Code:
+    def look(one: Routine, kind: Kind) -> Routine:
         is_it = compare(tree.Relation.EQUAL, one, again, kind, node.sought.kind)
-        return code(is_it, Operation(Op.EITHER))
+        return routine(is_it, Operation(Op.EITHER))
 
     if isinstance(node.values, tree.Listed):
-        found = code(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
+        found = routine(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
     else:
-        found = code(found, _folded(lowering, node.values, look))
-    return code(found, Operation(Op.NOT)) if node.is_negated else found
+        found = routine(found, _folded(lowering, node.values, look))
+    return routine(found, Operation(Op.NOT)) if node.is_negated else found
 
 
-def total(lowering: Lowering, node: tree.Call) -> Code:
+def total(lowering: Lowering, node: tree.Call) -> Routine:
     """Lower sum(). Each partial sum of integers is checked."""
     (values,) = node.arguments
     is_real = isinstance(node.kind, FloatKind)
 
-    def add(one: Code, kind: Kind) -> Code:
+    def add(one: Routine, kind: Kind) -> Routine:
         if is_real:
-            return code(coerced(one, kind, node.kind), Operation(Op.REAL_ADD))
-        return code(one, Operation(Op.CHECKED_ADD, flag=signs(node.kind, node.kind, kind)))
+            return routine(coerced(one, kind, node.kind), Operation(Op.REAL_ADD))
+        return routine(one, Operation(Op.CHECKED_ADD, flag=signs(node.kind, node.kind, kind)))
 
-    return code(real(0.0) if is_real else integer(0), _folded(lowering, values, add))
+    return routine(real(0.0) if is_real else integer(0), _folded(lowering, values, add))
 
 
-def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Code:
+def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Routine:
     """Lower min() or max() of a list. It begins with the first element, and is refused if there is none."""
     of = stored(lowering, node.arguments[0])
     kind = of.element
@@ -329,12 +331,12 @@ def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) 
     whole, left = lowering.names.temporary(), lowering.names.temporary()
     operator = of_reals if isinstance(kind, FloatKind) else of_integers
     step = Operation(operator, flag=0 if isinstance(kind, FloatKind) else signs(kind, kind, kind))
-    first = code(of.code, keep(whole), Operation(Op.ELEMENT, flag=of.scalar))
-    rest = code(load(whole), keep(left), SIZE, repeat((Operation(Op.NEXT, left, flag=of.scalar), step)))
-    return coerced(code(first, rest), kind, node.kind)
+    first = routine(of.routine, keep(whole), Operation(Op.ELEMENT, flag=of.scalar))
+    rest = routine(load(whole), keep(left), SIZE, repeat((Operation(Op.NEXT, left, flag=of.scalar), step)))
+    return coerced(routine(first, rest), kind, node.kind)
 
 
-def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Code, Kind], Code]) -> Code:
+def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Routine, Kind], Routine]) -> Routine:
     """Combine each element with the value on the stack. A computed list is not stored for that."""
     if isinstance(values, tree.Each):
         each = values

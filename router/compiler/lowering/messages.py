@@ -8,7 +8,7 @@ from typing import NamedTuple
 from router.compiler.lowering import lists
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
-from router.compiler.lowering.operations import WANT, Code, Operation, code, integer, keep, known, load, repeat
+from router.compiler.lowering.operations import WANT, Operation, Routine, integer, keep, known, load, repeat, routine
 from router.compiler.plan import Each
 from router.declared import Compared, Op, Relation
 from router.errors import SourceSpan
@@ -28,8 +28,8 @@ class Place(NamedTuple):
 Placed = tuple[Operation, Place]
 
 
-def at(place: Place, *parts: Operation | Code) -> list[Placed]:
-    return [(operation, place) for operation in code(*parts)]
+def at(place: Place, *parts: Operation | Routine) -> list[Placed]:
+    return [(operation, place) for operation in routine(*parts)]
 
 
 def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
@@ -51,34 +51,34 @@ def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
         yield last
 
 
-def counted(lowering: Lowering, made: Each) -> tuple[Code, list[Taken]]:
+def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
     """Copy the lists to slots, and put their number of elements on the stack, if the field takes so many."""
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
     if declared.length is not None:
-        return code(count, _wanted(lowering, declared.length, Relation.EQUAL)), taken
+        return routine(count, _wanted(lowering, declared.length, Relation.EQUAL)), taken
     if declared.bound is not None:
-        return code(count, _wanted(lowering, declared.bound, Relation.LESS_OR_EQUAL)), taken
+        return routine(count, _wanted(lowering, declared.bound, Relation.LESS_OR_EQUAL)), taken
     return count, taken
 
 
-def _wanted(lowering: Lowering, limit: int, relation: Relation) -> Code:
+def _wanted(lowering: Lowering, limit: int, relation: Relation) -> Routine:
     """Check the number on the stack."""
     slot = lowering.names.temporary()
     compared = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=relation)
-    return code(keep(slot), integer(limit), compared, WANT, load(slot))
+    return routine(keep(slot), integer(limit), compared, WANT, load(slot))
 
 
 def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
     """Repeat `body` as often as the number on the stack says. `place` is that of the loop itself."""
     placed: list[Placed] = []
 
-    def lowered() -> Code:
+    def lowered() -> Routine:
         placed.extend(body())
         return tuple(operation for operation, _ in placed)
 
-    before, made = lists.code_of_each(lowering, taken, lowered)
+    before, made = lists.routine_of_each(lowering, taken, lowered)
     front = len(made) - len(placed)
     places = [place] * front + [own for _, own in placed]
     opening, *_, closing = repeat(made)

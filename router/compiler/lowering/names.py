@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Union
 
-from router.compiler.lowering.nodes import Node
 from router.compiler.lowering.operations import Flag, Slot
+from router.compiler.lowering.sections import Section
 from router.declared import MOST_TEXT
 from router.errors import Code, Diagnostic, SourceSpan
 
-Meaning = Union[Slot, Node]
+Meaning = Union[Slot, Section]
 
 
 class TooLargeError(Exception):
-    """What the table asks for is more than a program can do; the finding says what, and where."""
+    """What the table asks for is more than a routine can do; the finding says what, and where."""
 
     def __init__(self, span: SourceSpan, message: str, hint: str) -> None:
         super().__init__(message)
@@ -36,13 +36,13 @@ class Loop:
 class Names:
     """`variables` by name. Temporaries and elements are numbered with them in one layout.
 
-    `elements` are the nodes that elements of lists are read into, `joined` the bytes of text that are put together
+    `elements` are the sections that elements of lists are read into, `joined` the bytes of text that are put together
     outside of loops.
     """
 
     variables: dict[str, Meaning]
     temporaries: list[Slot] = field(default_factory=list)
-    elements: list[Node] = field(default_factory=list)
+    elements: list[Section] = field(default_factory=list)
     joined: int = 0
     loops: list[Loop] = field(default_factory=list)
     """Those around what is being lowered, from the outermost one."""
@@ -58,8 +58,8 @@ class Names:
         loop.flags.append(made)
         return made
 
-    def element(self, like: Node) -> Node:
-        """A new node for an element of a list, of which another one is given."""
+    def element(self, like: Section) -> Section:
+        """A new section for an element of a list, of which another one is given."""
         self.elements.append(replace(like, wanted={}))
         return self.elements[-1]
 

@@ -15,7 +15,7 @@ from router.compiler.expressions.kinds import (
     StringKind,
     as_int,
 )
-from router.compiler.lowering.operations import Code, Operation, code, integer
+from router.compiler.lowering.operations import Operation, Routine, integer, routine
 from router.declared import Compared, Op, Relation, Sign
 
 
@@ -39,14 +39,14 @@ def signs(result: Kind, *operands: Kind) -> int:
     return unsigned + int(Sign.RESULT_UNSIGNED) * is_unsigned(result)
 
 
-def to_real(made: Code, kind: Kind) -> Code:
+def to_real(made: Routine, kind: Kind) -> Routine:
     """Convert a number to a real one."""
     if isinstance(kind, FloatKind):
         return made
-    return code(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
+    return routine(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 
-def coerced(made: Code, kind: Kind, to: Kind) -> Code:
+def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
     """Convert a value to a kind that other values have as well."""
     if isinstance(to, FloatKind):
         return to_real(made, kind)
@@ -55,13 +55,13 @@ def coerced(made: Code, kind: Kind, to: Kind) -> Code:
     return made
 
 
-def fitted(made: Code, kind: Kind, to: Kind) -> Code:
+def fitted(made: Routine, kind: Kind, to: Kind) -> Routine:
     """Refuse an integer outside of the range of another kind."""
     (low, high), (least, most) = bounds(kind), bounds(to)
     if least <= low and high <= most:
         return made
     ends = IntKind(least, least), IntKind(most, most)
-    return code(made, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
+    return routine(made, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
 
 
 _SWAPPED: Mapping[Relation, Relation] = {
@@ -73,17 +73,17 @@ _SWAPPED: Mapping[Relation, Relation] = {
 """Relations of the same two values in the other order, where that is another one."""
 
 
-def compare(relation: tree.Relation, left: Code, right: Code, left_kind: Kind, right_kind: Kind) -> Code:
+def compare(relation: tree.Relation, left: Routine, right: Routine, left_kind: Kind, right_kind: Kind) -> Routine:
     """Whether a relation holds, exactly. The operation wants an integer in front of a real number, and a signed one
     in front of an unsigned one: so the right operand may be evaluated first.
     """
     straight = Relation[relation.name]
     how = _compared(left_kind, right_kind)
     if how is not None:
-        return code(left, right, Operation(Op.COMPARE, int(how), flag=straight))
+        return routine(left, right, Operation(Op.COMPARE, int(how), flag=straight))
     how = _compared(right_kind, left_kind)
     assert how is not None  # noqa: S101 - one of two orders is right
-    return code(right, left, Operation(Op.COMPARE, int(how), flag=_SWAPPED.get(straight, straight)))
+    return routine(right, left, Operation(Op.COMPARE, int(how), flag=_SWAPPED.get(straight, straight)))
 
 
 def _compared(left: Kind, right: Kind) -> Compared | None:

@@ -1,4 +1,4 @@
-"""Programs of the operations that `native/operations.h` declares, and what is known before they run."""
+"""Routines of the operations that `native/operations.h` declares, and what is known before they run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Union
 from router.declared import MAX_DATAGRAM, Compared, Op, Relation
 
 if TYPE_CHECKING:
-    from router.compiler.lowering.nodes import Node
+    from router.compiler.lowering.sections import Section
 
 
 @dataclass(eq=False, slots=True)
@@ -34,18 +34,18 @@ class Operation(NamedTuple):
     """`struct operation`; `slot` may be what has an index, `data` are bytes of the literals."""
 
     kind: Op
-    slot: Union[int, Slot, Node] = 0
+    slot: Union[int, Slot, Section] = 0
     flag: int = 0
     size: int = 0
     number: int | float = 0
     data: bytes = b""
 
 
-Code = tuple[Operation, ...]
+Routine = tuple[Operation, ...]
 
 
-def code(*parts: Operation | Code) -> Code:
-    """One code of operations and codes, in order."""
+def routine(*parts: Operation | Routine) -> Routine:
+    """One of operations and other routines, in order."""
     made: list[Operation] = []
     for part in parts:
         if isinstance(part, Operation):
@@ -83,31 +83,31 @@ DROP, SIZE, WANT = Operation(Op.DROP), Operation(Op.SIZE), Operation(Op.WANT)
 EQUAL = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=Relation.EQUAL)
 
 
-def repeat(body: Code, *, keeps: bool = False) -> Code:
+def repeat(body: Routine, *, keeps: bool = False) -> Routine:
     """`body`, as often as the integer on the stack says. `keeps`: lists and text that it makes are used behind it."""
     return (Operation(Op.REPEAT, flag=keeps, size=len(body) + 1), *body, Operation(Op.AGAIN))
 
 
-def chained(op: Op, codes: Sequence[Code]) -> Code:
+def chained(op: Op, routines: Sequence[Routine]) -> Routine:
     """Several truths, of which those behind a decision are not evaluated."""
-    left, made = sum(map(len, codes)) + len(codes) - 1, list[Operation]()
-    for each in codes[:-1]:
+    left, made = sum(map(len, routines)) + len(routines) - 1, list[Operation]()
+    for each in routines[:-1]:
         left -= len(each) + 1
         made += *each, Operation(op, size=left)
-    return (*made, *codes[-1])
+    return (*made, *routines[-1])
 
 
-def choice(test: Code, body: Code, orelse: Code) -> Code:
+def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
     """One of two values; the other one is not evaluated."""
-    return code(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
+    return routine(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
 
 
-def once(made: Code, flag: Flag, kept: Slot) -> Code:
+def once(made: Routine, flag: Flag, kept: Slot) -> Routine:
     """`made`, in a loop: it is computed when its value is first needed, and then kept. `flag` is 0 before the loop."""
-    return choice((load(flag),), (load(kept),), code(made, keep(kept), integer(1), keep(flag), DROP))
+    return choice((load(flag),), (load(kept),), routine(made, keep(kept), integer(1), keep(flag), DROP))
 
 
-# ---- what is known of a program
+# ---- what is known of a routine
 
 _GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
 _TAKE_ONE = frozenset({

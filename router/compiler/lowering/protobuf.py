@@ -14,7 +14,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
 from router.compiler.lowering.numbers import to_real
-from router.compiler.lowering.operations import Code, Operation, known
+from router.compiler.lowering.operations import Operation, Routine, known
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op
 from router.types.descriptors import container, message_of
@@ -94,7 +94,7 @@ class _Writer:
         write = kind_of(to).write
         return at(place, self._value(made, write), Operation(write, flag=is_always, size=tag))
 
-    def _value(self, made: Leaf, write: Op) -> Code:
+    def _value(self, made: Leaf, write: Op) -> Routine:
         value = self.lowering.value(made.node)
         return to_real(value, made.node.kind) if write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE) else value
 

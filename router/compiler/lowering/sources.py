@@ -1,4 +1,4 @@
-"""The programs that read one message: its slots and nodes, which they share, and how large they may be."""
+"""The routines that read one message: its slots and sections, which they share, and how large they may be."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.layout import Layout, protobuf_layout
-from router.compiler.lowering.messages import Placed
-from router.compiler.lowering.names import Meaning, Names, TooLargeError
-from router.compiler.lowering.nodes import Node
-from router.compiler.lowering.numbers import signs
-from router.compiler.lowering.operations import Code, Operation, Slot, chained, depths, most_executed, nesting
-from router.compiler.lowering.programs import (
+from router.compiler.lowering.lowered import (
     LoweredCollect,
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
     LoweredTarget,
 )
+from router.compiler.lowering.messages import Placed
+from router.compiler.lowering.names import Meaning, Names, TooLargeError
+from router.compiler.lowering.numbers import signs
+from router.compiler.lowering.operations import Operation, Routine, Slot, chained, depths, most_executed, nesting
 from router.compiler.lowering.protobuf import protobuf_message
+from router.compiler.lowering.sections import Section
 from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
-from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_NODES_DEEP, MOST_OPEN, MOST_STACKED, NONE, Op
+from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_OPEN, MOST_SECTIONS_DEEP, MOST_STACKED, NONE, Op
 from router.errors import SourceSpan
 from router.table.model import Route
 from router.types.model import MessageType
@@ -43,12 +43,12 @@ _MOST_SLOTS = NONE
 
 @dataclass
 class _Source:
-    """A message that programs read into `root`. `topic` is where it comes from, empty if it is from UDP."""
+    """A message that routines read into `root`. `topic` is where it comes from, empty if it is from UDP."""
 
-    root: Node
+    root: Section
     topic: str = ""
     temporaries: list[Slot] = field(default_factory=list)
-    elements: list[Node] = field(default_factory=list)
+    elements: list[Section] = field(default_factory=list)
     variables: dict[str, Meaning] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -67,19 +67,19 @@ class _Source:
 
     def condition(
         self, lowering: Lowering, conditions: Sequence[tree.Node | None], *, is_bounded: bool = False
-    ) -> tuple[Code, str]:
+    ) -> tuple[Routine, str]:
         """Lower the conjunction of conditions, with its place. One that the receive thread evaluates `is_bounded`."""
         given = [each for each in conditions if each is not None]
         if not given:
             return (), ""
-        code = chained(Op.AND, [lowering.value(each) for each in given])
-        _want_small([(operation, given[-1].span) for operation in code])
-        if is_bounded and (most := most_executed(code)) > MOST_CONDITION_OPERATIONS:
+        routine = chained(Op.AND, [lowering.value(each) for each in given])
+        _want_small([(operation, given[-1].span) for operation in routine])
+        if is_bounded and (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
             limit = f"and a destination's `when` takes at most {MOST_CONDITION_OPERATIONS:,}"
             message = f"this could take {most:,} operations on the longest datagram, {limit}"
             hint = f"a list counts with {MAX_DATAGRAM:,} elements: look into fewer lists, or fewer times"
             raise TooLargeError(given[-1].span, message, hint)
-        return code, ", or ".join(f"{each.span}: when" for each in given)
+        return routine, ", or ".join(f"{each.span}: when" for each in given)
 
 
 class Datagram(_Source):
@@ -88,7 +88,7 @@ class Datagram(_Source):
     def __init__(self, case: PayloadCase, envelope: Envelope) -> None:
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
         around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]
-        super().__init__(Node(case.type, descriptor))
+        super().__init__(Section(case.type, descriptor))
         self._case, self._envelope = case.name, around
 
     def lowered(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute:
@@ -114,20 +114,20 @@ class Datagram(_Source):
         message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
         return LoweredTarget(target.label, condition, message, ("", when, place, *places))
 
-    def _number(self, node: tree.Node) -> Code:
-        code = self.lowering().value(node)
-        _want_small([(operation, node.span) for operation in code])
-        return code
+    def _number(self, node: tree.Node) -> Routine:
+        routine = self.lowering().value(node)
+        _want_small([(operation, node.span) for operation in routine])
+        return routine
 
-    def published(self, lowering: Lowering, plan: Record) -> tuple[Code, tuple[str, ...]]:
+    def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
         """Lower the ROS message of a topic, with the place of each operation."""
         return _with_places(cdr_message(lowering, plan))
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Return the layout of all programs that have been made. Raises TooLargeError."""
-        for node in (self.root, *self.elements):
-            if (depth := node.depth()) >= MOST_NODES_DEEP:
-                message = f"this reads a field {depth} messages deep, and at most {MOST_NODES_DEEP - 1} are possible"
+        """Return the layout of all routines that have been made. Raises TooLargeError."""
+        for section in (self.root, *self.elements):
+            if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
+                message = f"this reads a field {depth} messages deep, and at most {MOST_SECTIONS_DEEP - 1} are possible"
                 raise TooLargeError(span, message, "read fields that are less deep")
         return _small(protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements), span)
 
@@ -136,7 +136,7 @@ class RosMessage(_Source):
     """A message from a topic of ROS."""
 
     def __init__(self, declared: MessageType, topic: str) -> None:
-        super().__init__(Node(declared, None), topic)
+        super().__init__(Section(declared, None), topic)
 
     def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
         """Lower what a route makes of the messages. Raises TooLargeError."""
@@ -161,7 +161,7 @@ class RosMessage(_Source):
             self._elements(elements, targets.values()) if elements else None,
         )
 
-    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> tuple[Code, tuple[str, ...]]:
+    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> tuple[Routine, tuple[str, ...]]:
         """Lower the envelope for a destination, with the place of each operation."""
         return _with_places(protobuf_message(lowering, plan, case))
 
@@ -176,7 +176,7 @@ class RosMessage(_Source):
         """Lower the list of `for_each`. Expressions can use `item`, `index` and `count` from now on."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
-        _want_small([(operation, node.span) for operation in of.code])
+        _want_small([(operation, node.span) for operation in of.routine])
         if of.message is None:
             self.add(Slot(0, tree.ITEM))
         else:
@@ -188,11 +188,11 @@ class RosMessage(_Source):
 
     def _elements(self, of: lists.Stored, targets: Iterable[LoweredTarget]) -> LoweredElements:
         item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
-        node = item.index if isinstance(item, Node) and item.wanted else NONE
-        return LoweredElements(of.code, of.scalar, node, *_used((item, *counts), targets))
+        section = item.index if isinstance(item, Section) and item.wanted else NONE
+        return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Return the layout of all programs that have been made. Raises TooLargeError."""
+        """Return the layout of all routines that have been made. Raises TooLargeError."""
         return _small(cdr_layout(self.temporaries, self.root, self.elements, span), span)
 
 
@@ -209,7 +209,7 @@ def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Ite
         yield variable.index if is_used else NONE
 
 
-def _with_places(placed: Sequence[Placed]) -> tuple[Code, tuple[str, ...]]:
+def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
     _want_small([(operation, place.span) for operation, place in placed])
     return tuple(operation for operation, _ in placed), tuple(str(place) for _, place in placed)
 
@@ -218,7 +218,7 @@ def _with_places(placed: Sequence[Placed]) -> tuple[Code, tuple[str, ...]]:
 
 
 def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
-    """Raise TooLargeError for what nests deeper than a program can."""
+    """Raise TooLargeError for what nests deeper than a routine can."""
     operations = [operation for operation, _ in placed]
     loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
     limits = (
@@ -233,8 +233,8 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
 
 
 def _small(layout: Layout, span: SourceSpan) -> Layout:
-    """The layout. Raises TooLargeError if its slots or nodes cannot be numbered."""
-    most = max(len(layout.defaults), len(layout.nodes))
+    """The layout. Raises TooLargeError if its slots or sections cannot be numbered."""
+    most = max(len(layout.defaults), len(layout.sections))
     if most > _MOST_SLOTS:
         message = f"these mappings use {most} values, and at most {_MOST_SLOTS} are possible"
         raise TooLargeError(span, message, "make several routes of it, or map less")

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from router.compiler.lowering.layout import Layout, Numbering, PlacedNode, ReadOperation
+from router.compiler.lowering.layout import Layout, Numbering, PlacedSection, ReadOperation
 from router.compiler.lowering.names import TooLargeError
-from router.compiler.lowering.nodes import Node, Wanted, scalar_of, size_of
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Slot
+from router.compiler.lowering.sections import Section, Wanted, scalar_of, size_of
 from router.declared import MOST_LOOPS, ReadKind
 from router.errors import SourceSpan
 from router.types.model import List, MessageType, String, Type
 
 
-def cdr_layout(slots: Sequence[Slot], message: Node, elements: Sequence[Node], span: SourceSpan) -> Layout:
+def cdr_layout(slots: Sequence[Slot], message: Section, elements: Sequence[Section], span: SourceSpan) -> Layout:
     """Number `slots`, from 0, then those of the message, and those of elements of lists.
 
-    Raises TooLargeError at `span` if the message nests more lists of messages than a program can read.
+    Raises TooLargeError at `span` if the message nests more lists of messages than a routine can read.
     """
     maker = Numbering(slots)
-    maker.number_nodes([message, *elements])
+    maker.number_sections([message, *elements])
     for index, root in enumerate((message, *elements)):
         first = len(maker.defaults)
         steps = _Steps(maker, span, Offset(HIGHEST) if root is message else Offset())
         steps.message(root.type, root)
-        maker.nodes[index] = PlacedNode(steps.up_to_the_last_wanted(), first, len(maker.defaults) - first)
+        maker.sections[index] = PlacedSection(steps.up_to_the_last_wanted(), first, len(maker.defaults) - first)
     return maker.made(is_cdr=True)
 
 
@@ -48,9 +48,9 @@ class _Steps:
     def up_to_the_last_wanted(self) -> tuple[ReadOperation, ...]:
         return tuple(self.made[: self._wanted])
 
-    def message(self, declared: MessageType, node: Node | None) -> None:
+    def message(self, declared: MessageType, section: Section | None) -> None:
         for member in declared.fields:
-            wanted = node.wanted.get(member.name) if node is not None else None
+            wanted = section.wanted.get(member.name) if section is not None else None
             self._field(member.type, wanted)
         if not declared.fields:
             self._scalars(1, 1)  # rosidl gives it a byte
@@ -59,7 +59,7 @@ class _Steps:
         slot = wanted.value if wanted is not None else None
         match declared:
             case MessageType():
-                self._inner(declared, wanted.node if wanted is not None else None, slot)
+                self._inner(declared, wanted.section if wanted is not None else None, slot)
             case List():
                 self._list(declared, slot)
             case String(wide=wide):
@@ -75,12 +75,12 @@ class _Steps:
             case _:
                 self._scalars(size_of(declared), 1)
 
-    def _inner(self, declared: MessageType, node: Node | None, slot: Slot | None) -> None:
+    def _inner(self, declared: MessageType, section: Section | None, slot: Slot | None) -> None:
         """A message in the message. If the whole of it is wanted, it is the only element of a list."""
         if slot is None:
-            self.message(declared, node)
+            self.message(declared, section)
             return
-        self._loop(ReadOperation(ReadKind.EACH, elements=1), slot, lambda steps: steps.message(declared, node))
+        self._loop(ReadOperation(ReadKind.EACH, elements=1), slot, lambda steps: steps.message(declared, section))
 
     def _list(self, declared: List, slot: Slot | None) -> None:
         element, length = declared.element, declared.length

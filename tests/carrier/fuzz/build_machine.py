@@ -64,8 +64,8 @@ def _random_seeds() -> tuple[bytes, bytes]:
 
 
 _STRUCTURE = (
-    "struct fuzzed { struct layout layout; struct code condition, message, list; "
-    "uint16_t stored, node, item, has_envelope; };"
+    "struct fuzzed { struct layout layout; struct routine condition, message, list; "
+    "uint16_t stored, section, item, has_envelope; };"
 )
 
 
@@ -83,12 +83,14 @@ def _bytes(name: str, data: bytes) -> str:
 
 
 def _layout(index: int, layout: Layout) -> Iterator[str]:
-    nodes = []
-    for number, node in enumerate(layout.nodes):
-        name = f"node_{index}_{number}"
-        yield _bytes(name, b"".join(entry.packed() for entry in node.entries))
-        nodes.append(f"{{{{(const void *){name}}}, {len(node.entries)}, {node.first_slot}, {node.slot_count}}}")
-    yield f"static const struct node nodes_{index}[] = {{{', '.join(nodes)}}};"
+    sections = []
+    for number, section in enumerate(layout.sections):
+        name = f"section_{index}_{number}"
+        yield _bytes(name, b"".join(read.packed() for read in section.reads))
+        sections.append(
+            f"{{{{(const void *){name}}}, {len(section.reads)}, {section.first_slot}, {section.slot_count}}}"
+        )
+    yield f"static const struct section sections_{index}[] = {{{', '.join(sections)}}};"
     defaults = ", ".join(f"[{slot}] = {_value(value)}" for slot, value in layout.defaults.items())
     yield f"static const struct value defaults_{index}[{layout.slot_count}] = {{{defaults or '{.size = 0}'}}};"
     closed = []
@@ -109,10 +111,10 @@ def _value(value: float | bytes) -> str:
 
 def _row(index: int, program: Program) -> str:
     layout, each = program.layout, program.for_each or ForEach([], 0, NONE, NONE)
-    arrays = ", ".join(f"{name}_{index}" for name in ("nodes", "defaults", "closed", "literals"))
+    arrays = ", ".join(f"{name}_{index}" for name in ("sections", "defaults", "closed", "literals"))
     codes = {"condition": program.condition, "message": program.message, "list": each.code}
     code = ", ".join(_code(f"{name}_{index}", code) for name, code in codes.items())
-    of_each = f"{int(each.stored)}, {each.node}, {each.item}"
+    of_each = f"{int(each.stored)}, {each.section}, {each.item}"
     return (
         f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}, {int(program.has_envelope)}}}"
     )

@@ -9,11 +9,11 @@ static const int64_t TIMEOUT = 1000000000;
 int LLVMFuzzerInitialize(int *count, char ***arguments);
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
 
-#define FIELD(of, in) {.number = of, .type = TYPE_INT64, .slot = in, .presence = NONE, .node = NONE, .choice = NONE, .closed = NONE}
-static const struct node_field fields[] = {FIELD(1, BY), FIELD(2, COUNT), FIELD(3, PLACE)};
-static const struct node nodes[] = {[NODE_PAYLOAD] = {.fields = fields, .count = 3}, [NODE_ENVELOPE] = {.count = 0}};
+#define FIELD(of, in) {.number = of, .type = TYPE_INT64, .slot = in, .presence = NONE, .section = NONE, .choice = NONE, .closed = NONE}
+static const struct wanted_field fields[] = {FIELD(1, BY), FIELD(2, COUNT), FIELD(3, PLACE)};
+static const struct section sections[] = {[SECTION_PAYLOAD] = {.fields = fields, .count = 3}, [SECTION_ENVELOPE] = {.count = 0}};
 static const struct value defaults[SLOTS], sources[2];
-static const struct layout layout = {.nodes = nodes, .defaults = defaults, .slot_count = SLOTS};
+static const struct layout layout = {.sections = sections, .defaults = defaults, .slot_count = SLOTS};
 #define LOADS(name, from) static const struct operation name[] = {{.kind = OP_LOAD, .slot = from}}
 LOADS(by, BY);
 LOADS(count, COUNT);

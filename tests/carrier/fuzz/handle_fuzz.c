@@ -22,11 +22,11 @@ static const struct target published = {
     .topic = &topic, .waiting = WAITING, .filtered = FILTERED, .dropped = {[LOSS_QUEUE_FULL] = QUEUE_FULL}};
 static struct sender nowhere = {.fd = -1};
 /* A condition on the first field that every payload may have. */
-static const struct node_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .node = NONE,
+static const struct wanted_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .section = NONE,
                                             .choice = NONE, .closed = NONE}};
-static const struct node nodes[] = {[NODE_PAYLOAD] = {.fields = fields, .count = 1}, [NODE_ENVELOPE] = {.count = 0}};
+static const struct section sections[] = {[SECTION_PAYLOAD] = {.fields = fields, .count = 1}, [SECTION_ENVELOPE] = {.count = 0}};
 static const struct value defaults[3], sources[COLUMNS];
-static const struct layout layout = {.nodes = nodes, .defaults = defaults, .slot_count = 3};
+static const struct layout layout = {.sections = sections, .defaults = defaults, .slot_count = 3};
 static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6}, {.kind = OP_LOAD, .slot = 2},
                                              {.kind = OP_DIVIDE}};
 
@@ -46,7 +46,7 @@ static const struct route only = {
     .publishes = {.targets = &published, .count = 1},
     .last_message = LAST_MESSAGE, .duration = DURATION};
 static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
-static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
+static const struct choice choices[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];
 static struct listener listeners[LISTENERS];
 static struct program program = {.generation = 1, .listener_count = LISTENERS, .unknown_case = UNHANDLED_CASES,
@@ -70,7 +70,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
     }
     for (uint32_t index = 0; index < LISTENERS; index++) {
         uint32_t first = index * OF_LISTENER;
-        listeners[index] = (struct listener){.fd = -1, .repairs = index, .peers = peers, .entries = entries, .peer_count = 3,
+        listeners[index] = (struct listener){.fd = -1, .repairs = index, .peers = peers, .choices = choices, .peer_count = 3,
                                              .columns = COLUMNS, .received = first, .received_bytes = first + 1,
                                              .padded = first + 2};
         for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 3 + reason;

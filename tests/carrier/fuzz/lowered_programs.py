@@ -14,7 +14,7 @@ from router.compiler.expressions import Scope, check
 from router.compiler.expressions.kinds import UINT32, ListKind
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget, lower_table
-from router.compiler.lowering.operations import Code
+from router.compiler.lowering.operations import Routine
 from router.compiler.mapping import build
 from router.errors import Located
 from router.rehearsal.cdr import serialize
@@ -157,7 +157,7 @@ def _lowered(route: CheckedRoute, envelope: Any) -> Lowered:
 def _of(
     lowered: Lowered, seeds: Callable[[str], Seeds], noise: random.Random, source: MessageType | None = None
 ) -> Iterator[Fuzzed]:
-    for routes in (lowered.conditions, lowered.topics):
+    for routes in (lowered.to_destinations, lowered.to_topics):
         for name, route in routes.items():
             for target in route.targets.values():
                 yield Fuzzed(_program(route, target), seeds(name))
@@ -197,37 +197,39 @@ def _program(route: LoweredRoute | LoweredFeed, target: LoweredTarget) -> Progra
     for_each = None
     if isinstance(route, LoweredFeed) and route.for_each is not None:
         each = route.for_each
-        for_each = ForEach(_code(each.code), each.scalar, each.node, each.item)
-    return Program(_layout(route), _code(target.condition), _code(target.message), for_each, not route.layout.is_cdr)
+        for_each = ForEach(_routine(each.routine), each.scalar, each.section, each.item)
+    return Program(
+        _layout(route), _routine(target.condition), _routine(target.message), for_each, not route.layout.is_cdr
+    )
 
 
-def _code(code: Code) -> list[evaluating.Operation]:
+def _routine(routine: Routine) -> list[evaluating.Operation]:
     return [
         evaluating.Operation(
             f"OP_{kind.name}", slot if isinstance(slot, int) else slot.index, flag, size, number, data or None
         )
-        for kind, slot, flag, size, number, data in code
+        for kind, slot, flag, size, number, data in routine
     ]
 
 
 def _layout(route: LoweredRoute | LoweredFeed) -> evaluating.Layout:
     made = route.layout
-    nodes = [
-        evaluating.Node([_entry(entry) for entry in node.entries], node.first_slot, node.slot_count)
-        for node in made.nodes
+    sections = [
+        evaluating.Section([_read(read) for read in section.reads], section.first_slot, section.slot_count)
+        for section in made.sections
     ]
     defaults = {index: value for index, value in enumerate(made.defaults) if value is not None}
-    return evaluating.Layout(nodes, len(made.defaults), made.closed, made.is_cdr, defaults)
+    return evaluating.Layout(sections, len(made.defaults), made.closed, made.is_cdr, defaults)
 
 
-def _entry(entry: Any) -> evaluating.NodeField | evaluating.Step:
-    if hasattr(entry, "kind"):
+def _read(read: Any) -> evaluating.WantedField | evaluating.Step:
+    if hasattr(read, "kind"):
         return evaluating.Step(
-            f"READ_{entry.kind.name}", entry.slot, entry.size, f"SCALAR_{_scalar(entry.type)}", entry.elements
+            f"READ_{read.kind.name}", read.slot, read.size, f"SCALAR_{_scalar(read.type)}", read.elements
         )
-    cleared = entry.cleared, entry.cleared_count
-    return evaluating.NodeField(entry.number, f"TYPE_{entry.type.name}", entry.slot, entry.is_repeated, entry.presence,
-                                entry.node, entry.choice, cleared, entry.closed)  # fmt: skip
+    cleared = read.cleared, read.cleared_count
+    return evaluating.WantedField(read.number, f"TYPE_{read.type.name}", read.slot, read.is_repeated, read.presence,
+                                read.section, read.choice, cleared, read.closed)  # fmt: skip
 
 
 def _scalar(scalar: Any) -> str:

@@ -60,39 +60,39 @@ static int make_for_each(const struct fuzzed *chosen) {
     if (outcome != EVALUATED) return outcome;
     for (cell_count = machine.cell_count; list.size; machine.cell_count = cell_count) {
         struct value element = list_next(&machine, &list, chosen->stored);
-        if (chosen->node == NONE) machine.slots[chosen->item] = element;
-        else if (!machine_enter(&machine, chosen->node, &element)) return LOSS_MAPPING_ERROR;
+        if (chosen->section == NONE) machine.slots[chosen->item] = element;
+        else if (!machine_enter(&machine, chosen->section, &element)) return LOSS_MAPPING_ERROR;
         outcome = make(chosen);
     }
     return outcome;
 }
 
 /* Read and evaluate as the threads do. Return the outcome. */
-static int run(const struct fuzzed *chosen, uint16_t node, const uint8_t *data, size_t size) {
+static int run(const struct fuzzed *chosen, uint16_t section, const uint8_t *data, size_t size) {
     machine.output.size = 0;
     machine_begin(&machine, &chosen->layout);
     memset(machine.slots + chosen->layout.slot_count, 0xa5, sizeof *machine.slots); /* nobody is to use it */
     machine.slots[RECEIVED_AT].integer = 1700000000123456789;
     machine.slots[SOURCE] = (struct value){.bytes = (const uint8_t *)"a board", .size = 7};
-    if (!machine_read(&machine, node, data, size)) return LOSS_MAPPING_ERROR;
+    if (!machine_read(&machine, section, data, size)) return LOSS_MAPPING_ERROR;
     return chosen->list.count ? make_for_each(chosen) : make(chosen);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     if (size < 3 || size > MAX_DATAGRAM) return -1;
     const struct fuzzed *chosen = &programs[(input[0] + 256 * input[1]) % PROGRAM_COUNT];
-    uint16_t node = input[2] % 2 && chosen->has_envelope;
+    uint16_t section = input[2] % 2 && chosen->has_envelope;
     size -= 3;
     uint8_t *data = malloc(size ? size : 1); /* of the exact size: the sanitizer sees what is read behind it */
     memcpy(data, input + 3, size);
-    int outcome = run(chosen, node, data, size);
+    int outcome = run(chosen, section, data, size);
     note_outcome(&outcome, sizeof outcome);
     if (outcome == EVALUATED) {
         size_t made = machine.output.size;
         note_outcome(machine.output.data, made);
         uint8_t *first = malloc(made ? made : 1);
         memcpy(first, machine.output.data, made);
-        demand(run(chosen, node, data, size) == EVALUATED && machine.output.size == made);
+        demand(run(chosen, section, data, size) == EVALUATED && machine.output.size == made);
         demand(!memcmp(first, machine.output.data, made));
         free(first);
     }

@@ -15,10 +15,10 @@ from tests.carrier.evaluating import (
     CDR_HEADER,
     C,
     Layout,
-    Node,
-    NodeField,
     Operation,
+    Section,
     Step,
+    WantedField,
     integer,
     load,
     real,
@@ -43,17 +43,17 @@ _TEXTS = [b"", b"a", "ä€".encode(), b"text\0with", b"\xff", b"x" * 40]
 
 @dataclass(frozen=True)
 class Listed:
-    """A list in a slot: of what, how it is stored, and the node of its elements if these are messages."""
+    """A list in a slot: of what, how it is stored, and the section of its elements if these are messages."""
 
     slot: int
     element: str
     stored: int = IN_CELLS
-    node: int = NONE
+    section: int = NONE
 
 
 @dataclass
 class Fields:
-    """What a node has in its slots."""
+    """What a section has in its slots."""
 
     values: list[tuple[int, str]] = field(default_factory=list)
     lists: list[Listed] = field(default_factory=list)
@@ -68,7 +68,7 @@ class ForEach:
 
     code: Code
     stored: int
-    node: int
+    section: int
     item: int
 
 
@@ -79,7 +79,7 @@ class Program:
     message: Code
     for_each: ForEach | None = None
     has_envelope: bool = False
-    """The second node is the envelope around the message."""
+    """The second section is the envelope around the message."""
 
 
 class _Layouts:
@@ -87,30 +87,33 @@ class _Layouts:
 
     def __init__(self, noise: random.Random, *, is_cdr: bool) -> None:
         self.noise, self.is_cdr = noise, is_cdr
-        self.nodes: list[Node | None] = []
+        self.sections: list[Section | None] = []
         self.fields: list[Fields] = []
         self.slots = FIRST_OF_FIELDS
-        self.node(0)
+        self.section(0)
         self.layout = Layout(
-            nodes=[node for node in self.nodes if node], slot_count=MOST_SLOTS, is_cdr=is_cdr, closed=([-5, 0, 1, 7],)
+            sections=[section for section in self.sections if section],
+            slot_count=MOST_SLOTS,
+            is_cdr=is_cdr,
+            closed=([-5, 0, 1, 7],),
         )
 
     def slot(self) -> int:
         self.slots += 1
         return self.slots - 1
 
-    def node(self, depth: int, into: Fields | None = None) -> int:
-        """A new node; `into` are the fields of the message that it is a part of, if it is no element."""
-        index, first = len(self.nodes), self.slots
-        self.nodes.append(None)
+    def section(self, depth: int, into: Fields | None = None) -> int:
+        """A new section; `into` are the fields of the message that it is a part of, if it is no element."""
+        index, first = len(self.sections), self.slots
+        self.sections.append(None)
         self.fields.append(into or Fields())
-        entries = self._steps(index, depth) if self.is_cdr else self._node_fields(index, depth)
-        self.nodes[index] = Node(entries, first_slot=first, slot_count=self.slots - first)
+        reads = self._steps(index, depth) if self.is_cdr else self._wanted_fields(index, depth)
+        self.sections[index] = Section(reads, first_slot=first, slot_count=self.slots - first)
         return index
 
     # protobuf
 
-    def _node_fields(self, index: int, depth: int) -> list[NodeField]:
+    def _wanted_fields(self, index: int, depth: int) -> list[WantedField]:
         noise, fields, made = self.noise, self.fields[index], []
         of_one = noise.random() < 0.5
         choice = self.slot() if of_one else NONE
@@ -121,17 +124,17 @@ class _Layouts:
         numbers = sorted(noise.sample([*range(1, 20), 100, 3000], noise.randint(members, 6)))
         for position, number in enumerate(numbers):
             is_member = position < members
-            made.append(self._node_field(number, fields, depth, choice if is_member else NONE))
+            made.append(self._wanted_field(number, fields, depth, choice if is_member else NONE))
         count = self._last_of_members - cleared if of_one else 0
         return [self._clearing(each, cleared, count) for each in made]
 
     _last_of_members = 0
 
     @staticmethod
-    def _clearing(made: NodeField, first: int, count: int) -> NodeField:
-        return made if made.choice == NONE else NodeField(**{**made.__dict__, "cleared": (first, count)})
+    def _clearing(made: WantedField, first: int, count: int) -> WantedField:
+        return made if made.choice == NONE else WantedField(**{**made.__dict__, "cleared": (first, count)})
 
-    def _node_field(self, number: int, fields: Fields, depth: int, choice: int) -> NodeField:
+    def _wanted_field(self, number: int, fields: Fields, depth: int, choice: int) -> WantedField:
         noise = self.noise
         kind = "GROUP" if choice != NONE and noise.random() < 0.1 else noise.choice(_PROTOBUF_SCALARS)
         is_message = depth < 3 and noise.random() < 0.3
@@ -148,19 +151,19 @@ class _Layouts:
 
     def _message_field(
         self, number: int, kind: str, fields: Fields, depth: int, is_repeated: bool, presence: int, choice: int
-    ) -> NodeField:
+    ) -> WantedField:
         if is_repeated:
             slot = self.slot()
-            fields.lists.append(Listed(slot, "message", node=self.node(depth + 1)))
-            return NodeField(number, f"TYPE_{kind}", slot, True)
-        node = self.node(depth + 1, fields)
-        return NodeField(number, f"TYPE_{kind}", presence=presence, node=node, choice=choice)
+            fields.lists.append(Listed(slot, "message", section=self.section(depth + 1)))
+            return WantedField(number, f"TYPE_{kind}", slot, True)
+        section = self.section(depth + 1, fields)
+        return WantedField(number, f"TYPE_{kind}", presence=presence, section=section, choice=choice)
 
     def _scalar_field(
         self, number: int, kind: str, fields: Fields, depth: int, is_repeated: bool, presence: int, choice: int
-    ) -> NodeField:
+    ) -> WantedField:
         if kind == "GROUP":
-            return NodeField(number, "TYPE_GROUP", presence=presence, choice=choice)
+            return WantedField(number, "TYPE_GROUP", presence=presence, choice=choice)
         slot = self.slot() if self.noise.random() < 0.9 else NONE
         closed = 0 if kind == "CLOSED_ENUM" else NONE
         of = {"BOOL": TRUTH, "BYTES": TEXT, "FLOAT": REAL, "DOUBLE": REAL}.get(kind, INTEGER)
@@ -168,7 +171,7 @@ class _Layouts:
             fields.lists.append(Listed(slot, of))
         elif slot != NONE:
             fields.values.append((slot, of))
-        return NodeField(number, f"TYPE_{kind}", slot, is_repeated, presence, choice=choice, closed=closed)
+        return WantedField(number, f"TYPE_{kind}", slot, is_repeated, presence, choice=choice, closed=closed)
 
     # CDR
 
@@ -207,12 +210,12 @@ class _Layouts:
         if depth >= 3:
             return [Step("READ_SKIP", size=1, count=1)]
         slot = self.slot() if self.noise.random() < 0.8 else NONE
-        node = self.node(depth + 1)
+        section = self.section(depth + 1)
         if slot != NONE:
-            fields.lists.append(Listed(slot, "message", node=node))
-        skipped = self.nodes[node]
+            fields.lists.append(Listed(slot, "message", section=section))
+        skipped = self.sections[section]
         assert skipped is not None
-        return [self._each(slot), *_unwanted(skipped.entries), Step("READ_AGAIN")]  # type: ignore[arg-type]
+        return [self._each(slot), *_unwanted(skipped.reads), Step("READ_AGAIN")]  # type: ignore[arg-type]
 
     def _each(self, slot: int) -> Step:
         if self.noise.random() < 0.7:
@@ -428,9 +431,9 @@ class _Expressions:
         """Execute what `body` gives for each message of a list, with its fields."""
 
         def entered(_: int) -> Code:
-            fields, outer = self.layouts.fields[listed.node], self.fields
+            fields, outer = self.layouts.fields[listed.section], self.fields
             self.fields = Fields([*outer.values, *fields.values], [*outer.lists, *fields.lists])
-            made = [Operation("OP_ENTER", listed.node), *body()]
+            made = [Operation("OP_ENTER", listed.section), *body()]
             self.fields = outer
             return made
 

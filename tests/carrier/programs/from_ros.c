@@ -14,9 +14,9 @@ enum { MESSAGES = 2000, RECEIVED = 0, LAST, SENT, BYTES, LOST, DURATION, COUNTER
 
 static const uint8_t MESSAGE[] = {0, 1, 0, 0, 7, 0, 0, 0};
 static const struct read_operation STEPS[] = {{.kind = READ_SCALAR, .type = SCALAR_UINT32, .slot = 2}};
-static const struct node NODE = {.steps = STEPS, .count = 1};
+static const struct section NODE = {.steps = STEPS, .count = 1};
 static const struct value DEFAULTS[3];
-static const struct layout LAYOUT = {.nodes = &NODE, .defaults = DEFAULTS, .slot_count = 3, .is_cdr = 1};
+static const struct layout LAYOUT = {.sections = &NODE, .defaults = DEFAULTS, .slot_count = 3, .is_cdr = 1};
 static const struct operation OPERATIONS[] = {{.kind = OP_LOAD, .slot = 2}, {.kind = OP_WRITE_VARINT, .size = 8}};
 
 struct source {

@@ -22,13 +22,13 @@ enum { COUNTERS = TOPIC + TOPICS * OF_TOPIC };
 struct made {
     struct program program;
     struct listener listener;
-    struct entry entry;
+    struct choice choice;
     struct payload_case only;
     struct route route;
     struct target targets[TOPICS];
     struct topic topics[TOPICS];
-    struct node_field of_payload, of_envelope;
-    struct node nodes[2];
+    struct wanted_field of_payload, of_envelope;
+    struct section sections[2];
     struct value defaults[SLOTS], source;
     struct operation operations[3];
     struct layout layout;
@@ -111,24 +111,24 @@ static void make_target(struct made *made, int index) {
 static struct made *make(const struct round *stage, uint32_t generation) {
     struct made *made = calloc(1, sizeof *made);
     check(made, "memory");
-    made->of_payload = (struct node_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .node = NONE,
+    made->of_payload = (struct wanted_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .section = NONE,
                                            .choice = NONE, .closed = NONE};
-    made->of_envelope = (struct node_field){.number = 1, .type = TYPE_MESSAGE, .slot = NONE, .presence = NONE,
-                                            .node = NODE_PAYLOAD, .choice = NONE, .closed = NONE};
-    made->nodes[NODE_PAYLOAD] = (struct node){&made->of_payload, 1, 0, 0};
-    made->nodes[NODE_ENVELOPE] = (struct node){&made->of_envelope, 1, 0, 0};
+    made->of_envelope = (struct wanted_field){.number = 1, .type = TYPE_MESSAGE, .slot = NONE, .presence = NONE,
+                                            .section = SECTION_PAYLOAD, .choice = NONE, .closed = NONE};
+    made->sections[SECTION_PAYLOAD] = (struct section){&made->of_payload, 1, 0, 0};
+    made->sections[SECTION_ENVELOPE] = (struct section){&made->of_envelope, 1, 0, 0};
     made->operations[0] = (struct operation){.kind = OP_KNOWN, .size = sizeof header, .slot = 1};
     made->operations[1] = (struct operation){.kind = OP_LOAD, .slot = NUMBER};
     made->operations[2] = (struct operation){.kind = OP_PUT, .slot = 4};
-    made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .literals = header,
+    made->layout = (struct layout){.sections = made->sections, .defaults = made->defaults, .literals = header,
                                    .slot_count = SLOTS};
     for (int index = 0; index < TOPICS; index++) make_target(made, index);
     struct targets publishes = {.ttl = generation % 2 ? 0 : 5000000, .layout = &made->layout, .sources = &made->source,
                                 .targets = made->targets, .count = TOPICS};
     made->route = (struct route){.publishes = publishes, .last_message = LAST, .duration = DURATION};
     made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
-    made->entry = (struct entry){0, ACCEPTED};
-    made->listener = (struct listener){.fd = stage->socket, .entries = &made->entry, .columns = 1, .received = RECEIVED,
+    made->choice = (struct choice){0, ACCEPTED};
+    made->listener = (struct listener){.fd = stage->socket, .choices = &made->choice, .columns = 1, .received = RECEIVED,
                                        .received_bytes = BYTES, .padded = PADDED};
     for (int reason = 0; reason < REASONS; reason++) made->listener.rejected[reason] = (uint32_t)(REJECTED + reason);
     made->program = (struct program){.generation = generation, .listener_count = 1, .case_count = 1,

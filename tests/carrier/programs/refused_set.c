@@ -13,9 +13,9 @@ enum { RECEIVED, LAST, DURATION, COUNTERS = 64 };
 
 static const uint8_t MESSAGE[] = {0, 1, 0, 0};
 static const struct read_operation STEPS[1];
-static const struct node NODE = {.steps = STEPS};
+static const struct section NODE = {.steps = STEPS};
 static const struct value DEFAULTS[2];
-static const struct layout LAYOUT = {.nodes = &NODE, .defaults = DEFAULTS, .slot_count = 2, .is_cdr = 1};
+static const struct layout LAYOUT = {.sections = &NODE, .defaults = DEFAULTS, .slot_count = 2, .is_cdr = 1};
 
 static int take(const void *subscription, void *message, void *info, void *allocation) {
     return middleware_take((struct subscription *)subscription, message, info, allocation);

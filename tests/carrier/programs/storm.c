@@ -32,12 +32,12 @@ enum { ACTIVE, TRIPS, BRAKES, BRAKE_ERRORS, DEADMAN_COUNTERS };
 struct made {
     struct program program;
     struct listener listeners[LISTENERS];
-    struct entry entries[ROUTES * 2]; /* columns: the known peer, strangers */
+    struct choice choices[ROUTES * 2]; /* columns: the known peer, strangers */
     struct peer peer;
     struct payload_case cases[ROUTES + 1];
     struct route routes[ROUTES];
     struct target destinations[ROUTES][DESTINATIONS];
-    struct node nodes[2]; /* of which no field is wanted */
+    struct section sections[2]; /* of which no field is wanted */
     struct value defaults[SLOT_SOURCE + 1], sources[2];
     struct layout layout;
     struct operation condition;
@@ -116,7 +116,7 @@ static uint32_t destination_counter(int route, int destination, int which) {
 
 static struct listener make_listener(const struct made *made, int index) {
     struct listener listener = {.fd = listening[index], .id = (uint32_t)index, .repairs = 1, .peers = &made->peer,
-                                .entries = made->entries, .peer_count = 1, .columns = 2,
+                                .choices = made->choices, .peer_count = 1, .columns = 2,
                                 .received = listener_counter(index, RECEIVED),
                                 .received_bytes = listener_counter(index, BYTES),
                                 .padded = listener_counter(index, PADDED)};
@@ -151,8 +151,8 @@ static void make_route(struct made *made, int index) {
                                          .last_message = route_counter(index, LAST),
                                          .duration = route_counter(index, LAST + 1)};
     made->cases[index] = (struct payload_case){.number = (uint32_t)index + 1, .row = index, .unhandled = UNHANDLED_CASE};
-    made->entries[2 * index] = (struct entry){index, route_counter(index, KNOWN)};
-    made->entries[2 * index + 1] = (struct entry){index ? -1 : 0, route_counter(index, STRANGERS)};
+    made->choices[2 * index] = (struct choice){index, route_counter(index, KNOWN)};
+    made->choices[2 * index + 1] = (struct choice){index ? -1 : 0, route_counter(index, STRANGERS)};
 }
 
 static struct deadman *open_deadman(void) {
@@ -166,7 +166,7 @@ static struct made *make(uint32_t generation) {
     check(made, "memory");
     made->topic.wanted = &wanted;
     made->feed.deadman = open_deadman();
-    made->layout = (struct layout){.nodes = made->nodes, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
+    made->layout = (struct layout){.sections = made->sections, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
     made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
     made->peer = (struct peer){0x7f000002, 0, 0, SEEN, 0};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};

@@ -1,6 +1,6 @@
-"""Nodes: which fields of a message programs use, and the slots that hold them.
+"""Sections: which fields of a message routines use, and the slots that hold them.
 
-Expressions ask the node of a message for its fields. What nothing asks for is not read.
+Expressions ask the section of a message for its fields. What nothing asks for is not read.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Wanted:
     member: Member
     value: Slot | None = None
     presence: Slot | None = None
-    node: Node | None = None
+    section: Section | None = None
 
 
 @dataclass(eq=False, slots=True)
-class Node:
+class Section:
     """A message at one place: the source message, a message in it, or an element of a list.
 
     `descriptor` is None for a ROS message. `path` is what stands in front of the names of its fields: `motors[].`.
@@ -54,20 +54,20 @@ class Node:
         assert self.descriptor is not None  # noqa: S101 - said by the caller
         return self.descriptor.fields_by_name[member.name]
 
-    def inner(self, member: Member) -> Node:
-        """A new node for the message in a field, or for the elements of a list."""
+    def inner(self, member: Member) -> Section:
+        """A new section for the message in a field, or for the elements of a list."""
         is_list = isinstance(member.type, List)
         declared = member.type.element if isinstance(member.type, List) else member.type
         assert isinstance(declared, MessageType)  # noqa: S101 - said by the caller
         descriptor = None if self.is_cdr else message_of(self.declared(member))
-        return Node(declared, descriptor, f"{self.path}{member.name}{'[]' * is_list}.")
+        return Section(declared, descriptor, f"{self.path}{member.name}{'[]' * is_list}.")
 
-    def message(self, member: Member) -> Node:
+    def message(self, member: Member) -> Section:
         """The message in a field that is no list."""
         wanted = self._field(member)
-        if wanted.node is None:
-            wanted.node = self.inner(member)
-        return wanted.node
+        if wanted.section is None:
+            wanted.section = self.inner(member)
+        return wanted.section
 
     def value(self, member: Member) -> Slot:
         """A scalar, text or bytes, or a list."""
@@ -93,7 +93,7 @@ class Node:
         return self.is_cdr or member.is_unchecked
 
     def depth(self) -> int:
-        return 1 + max((each.node.depth() for each in self.wanted.values() if each.node), default=0)
+        return 1 + max((each.section.depth() for each in self.wanted.values() if each.section), default=0)
 
     def _default(self, member: Member) -> int | float | bytes | None:
         if isinstance(member.type, (List, MessageType)):

@@ -1,4 +1,4 @@
-"""The programs of a table, as the carrier executes them (`native/operations.h`)."""
+"""The routines of a table, as the carrier executes them (`native/operations.h`)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from router.compiler.lowering.layout import Layout
-from router.compiler.lowering.operations import Code
+from router.compiler.lowering.operations import Routine
 from router.declared import Scalar
 
 
 @dataclass(frozen=True, slots=True)
 class LoweredTarget:
-    """The programs of a target: `condition` for its `when`, and `message`, which writes what it gets.
+    """The routines of a target: `condition` for its `when`, and `message`, which writes what it gets.
 
     Without a `when` the condition is empty. A destination from UDP gets the envelope as it was received: its `message`
     is empty. `places` are the places of the table where a message may be refused, by `enum place` in `native/events.h`:
@@ -21,22 +21,22 @@ class LoweredTarget:
     """
 
     label: str
-    condition: Code
-    message: Code
+    condition: Routine
+    message: Routine
     places: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class LoweredCollect:
-    """`collect`: programs that name the frame of a datagram, its size, and the place of the datagram in it.
+    """`collect`: routines that name the frame of a datagram, its size, and the place of the datagram in it.
 
     All give integers, but `by` a text if `is_text`. `signs` says whether `count` and `order` are unsigned. A complete
     frame goes to the slots `items` and `counted`, NONE for one that is not used.
     """
 
-    by: Code
-    count: Code
-    order: Code
+    by: Routine
+    count: Routine
+    order: Routine
     is_text: bool
     signs: int
     items: int
@@ -54,14 +54,14 @@ class LoweredRoute:
 
 @dataclass(frozen=True, slots=True)
 class LoweredElements:
-    """`for_each`: `code` leaves a list on the stack, which is stored as `scalar` says.
+    """`for_each`: `routine` leaves a list on the stack, which is stored as `scalar` says.
 
-    Each element is read into `node` if it is a message, else it is put into the slot `item`; NONE for what is not used.
+    Each element is read into `section` if it is a message, else put into the slot `item`; NONE for what is not used.
     """
 
-    code: Code
+    routine: Routine
     scalar: Scalar
-    node: int
+    section: int
     item: int
     index: int
     count: int
@@ -69,7 +69,7 @@ class LoweredElements:
 
 @dataclass(frozen=True, slots=True)
 class LoweredFeed:
-    """The programs of a route for the messages of one topic. They are urgent if they expire, feed or disarm a deadman.
+    """The routines of a route for the messages of one topic. They are urgent if they expire, feed or disarm a deadman.
 
     `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
     """
@@ -86,7 +86,7 @@ class LoweredFeed:
 class LoweredCondition:
     """A condition on a payload, and the fields that it reads. Slots are those of a LoweredRoute."""
 
-    code: Code
+    routine: Routine
     layout: Layout
 
 
@@ -94,10 +94,10 @@ class LoweredCondition:
 class Lowered:
     """All that the carrier runs for a table.
 
-    By route: `conditions` of its destinations from UDP that have one, and its `topics`. `from_ros` by topic, in the
-    order of the table.
+    By route: `to_destinations` has those of datagrams that have a condition, `to_topics` its topics. `from_ros` by
+    topic, in the order of the table.
     """
 
-    conditions: Mapping[str, LoweredRoute]
-    topics: Mapping[str, LoweredRoute]
+    to_destinations: Mapping[str, LoweredRoute]
+    to_topics: Mapping[str, LoweredRoute]
     from_ros: Mapping[str, tuple[LoweredFeed, ...]]
