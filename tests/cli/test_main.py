@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import subprocess
@@ -36,24 +35,6 @@ def test_alone_it_prints_help_with_every_verb_and_imports_none(
     rows = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if len(line.split()) > 1)
     for verb, summary in VERBS.items():
         assert rows[verb] == summary
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_has_its_module_and_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert importlib.import_module(f"router.cli.{verb}")
-    with pytest.raises(SystemExit) as caught:
-        main([verb, "--help"])
-    assert caught.value.code == 0
-    assert capsys.readouterr().out.startswith(f"usage: router {verb}")
-
-
-@pytest.mark.parametrize("verb", ["doctor", "status", "top", "sim"])
-def test_a_table_as_an_argument_of_a_verb_that_takes_none_names_the_option(
-    verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        main([verb, "routes/sim.yaml"])
-    assert "\nhelp: the table is named by -t routes/sim.yaml\n" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", ["--help", "--version", "--completion bash", "status --url http://127.0.0.1:1"])

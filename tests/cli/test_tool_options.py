@@ -2,43 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import math
 import sys
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import pytest
 from rich.progress import ProgressColumn, TextColumn
 
-from router.cli.tool_options import add_table, hertz, progress, seconds, speed, table_path
-
-
-def parsed(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    add_table(parser, is_subject=True)
-    return parser.parse_args(words)
-
-
-@pytest.mark.parametrize(
-    ("words", "environment", "table"),
-    [
-        ((), "", "routes/rover.yaml"),
-        ((), "of_environment.yaml", "of_environment.yaml"),
-        (("-t", "option.yaml"), "of_environment.yaml", "option.yaml"),
-        (("subject.yaml",), "of_environment.yaml", "subject.yaml"),
-        (("subject.yaml", "--table", "./subject.yaml"), "", "subject.yaml"),
-    ],
-)
-def test_the_table_is_typed_or_of_the_environment_or_the_default(
-    words: tuple[str, ...], environment: str, table: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("routes").mkdir()
-    Path("routes/rover.yaml").touch()
-    monkeypatch.setenv("ROUTER_TABLE", environment)
-    assert table_path(parsed(*words)) == Path(table)
+from router.cli.tool_options import hertz, progress, seconds, speed
 
 
 @pytest.mark.parametrize(

@@ -285,20 +285,6 @@ def test_a_silent_operator_is_said_before_the_deadmen_that_act(running: FakeRunn
         assert "▲ silent" in page.evaluate(f"{box(key)}.innerText")
 
 
-def test_a_deadman_whose_commands_stopped_says_who_sends_them(running: FakeRunning, page: Page) -> None:
-    running.count("deadman_active", "drive_motor", to=1)
-    until_said(page, "Commands of drive_motor stopped coming", "warn")
-    assert page.text("#todo").startswith("router explain says who sends them. Do they come often enough")
-    page.click("#show")
-    page.until("document.querySelector('#facts').innerText.includes('the deadman sends')")
-
-
-def test_a_board_that_cannot_be_stopped_comes_before_its_reasons(running: FakeRunning, page: Page) -> None:
-    running.count("deadman_active", "manual_drive", to=1)
-    running.count("deadman_send_errors", "manual_drive", "driving_board", to=9)
-    until_said(page, "driving_board does not get what the deadman of manual_drive sends", "bad")
-
-
 def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: FakeHealth, page: Page) -> None:
     for endpoint in running.program.table.endpoints:
         running.count("endpoint_last_seen_timestamp_seconds", endpoint, to=0)
@@ -306,11 +292,6 @@ def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: F
     health._began -= 60 * 10**9
     until_said(page, "was never heard since the router started", "")
     assert page.text("#todo").startswith("All endpoints are silent: check this computer's network")
-
-
-def test_a_stuck_thread_is_said(running: FakeRunning, page: Page) -> None:
-    running.is_stuck = True
-    until_said(page, "The receive thread is stuck", "bad")
 
 
 def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning, page: Page) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.errors import Code
-from router.table.addresses import ADDRESSES, Address, BadAddressError, parse_address
+from router.table.addresses import ADDRESSES, BadAddressError, parse_address
 from router.table.schema import table_schema
 from tests.table.tables import load, references
 
@@ -19,10 +19,6 @@ PATTERN = table_schema()["definitions"]["address"]["pattern"]
 
 octets = st.one_of(st.integers(0, 400).map(str), st.sampled_from(["01", "", "0", "255", "256", "x"]))
 ports = st.one_of(st.integers(0, 70000).map(str), st.sampled_from(["", "08", "65535", "65536", "8 ", "x"]))
-
-
-def test_an_address_is_four_octets_and_a_port() -> None:
-    assert parse_address("192.168.0.30:8") == Address("192.168.0.30", 8)
 
 
 @pytest.mark.parametrize(
@@ -82,10 +78,6 @@ def outside(folder: Path, text: str) -> list[str]:
     return [f"{found.message}; {found.hint}" for found in findings]
 
 
-def test_a_table_that_stays_in_its_networks_has_no_finding(tmp_path: Path) -> None:
-    assert outside(tmp_path, LOCAL) == []
-
-
 @pytest.mark.parametrize(
     ("address", "moved"),
     [
@@ -117,18 +109,6 @@ def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: s
 def test_no_address_of_the_schema_is_left_out() -> None:
     found = {path for path, definition in references(table_schema()) if definition == "address"}
     assert found == {pattern for pattern in ADDRESSES if "zenoh" not in pattern}
-
-
-def test_what_is_inherited_is_blamed_where_it_is_and_mended_where_the_networks_are(tmp_path: Path) -> None:
-    base = LOCAL.replace("networks: [127.0.0.0/8]\n", "").replace("127.0.0.30:8", "192.168.0.30:8")
-    (tmp_path / "base.yaml").write_text(base)
-    (tmp_path / "near.yaml").write_text("extends: base.yaml\nnetworks: [127.0.0.0/8]\n")
-    _, [found] = load(tmp_path, "extends: near.yaml\n")
-    assert found.span.file.endswith("base.yaml")
-    assert found.span.line == 6
-    assert "near.yaml:2 (127.0.0.0/8)" in found.message
-    assert found.hint.endswith("near.yaml, such as endpoints: {board: {address: 127.168.0.30:8}}")
-    assert outside(tmp_path, "extends: near.yaml\nendpoints: {board: {address: 127.168.0.30:8}}\n") == []
 
 
 def test_the_networks_of_an_extended_table_hold_until_others_replace_them(tmp_path: Path) -> None:

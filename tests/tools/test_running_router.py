@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import socket
-
 import pytest
 
-from router.errors import TransportError, UsageError
+from router.errors import UsageError
 from router.observe.snapshot import Snapshot
 from router.tools.running_router import metrics
-from tests.ports import free_port
 from tests.tools.answering import COLLECTED_AT, answering
 
 
@@ -18,14 +15,6 @@ def test_metrics_are_asked_for_at_the_router_and_no_proxy(monkeypatch: pytest.Mo
     found = Snapshot(COLLECTED_AT, {"kernel_drops": {("rover",): 3.0}})
     with answering('router_kernel_drops_total{listener="rover"} 3\n') as url:
         assert metrics(url) == metrics(url.removeprefix("http://")) == found
-
-
-def test_where_no_router_answers_is_a_network_fault() -> None:
-    says = r"no router answers at .*; is it running\? -t TABLE or --url names another router"
-    with pytest.raises(TransportError, match=says):
-        metrics(f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")
-    with answering("starting", status=503) as url, pytest.raises(TransportError, match=r"/metrics: 503 starting"):
-        metrics(url)
 
 
 @pytest.mark.parametrize(

@@ -47,24 +47,6 @@ def test_peers_are_named_by_their_address(table: RouteTable) -> None:
     assert name_of(("127.0.0.1", 12345)) == "127.0.0.1:12345"
 
 
-@pytest.mark.parametrize(
-    ("resolve", "text", "complaint"),
-    [
-        (udp.destination, "boart", "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'"),
-        (udp.destination, "127.0.0.1:0", "'0' is not a UDP port; ports are 1 to 65535"),
-        (udp.destination, "127.0.0.1:70000", "'70000' is not a UDP port; ports are 1 to 65535"),
-        (udp.listening, "127.0.0.1", "'127.0.0.1' is neither [HOST:]PORT nor a name of the route table; known: "),
-        (udp.origin, "statio", "'statio' is neither HOST[:PORT] nor a name of the route table; did you"),
-    ],
-)
-def test_a_place_that_is_none_is_explained(
-    table: RouteTable, resolve: Callable[[str, RouteTable], Address], text: str, complaint: str
-) -> None:
-    with pytest.raises(UsageError) as caught:
-        resolve(text, table)
-    assert str(caught.value).startswith(complaint)
-
-
 def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
         first.bind(("127.0.0.1", 0))
@@ -76,15 +58,6 @@ def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> Non
 
 
 HERE = Address("127.0.0.1", 0)
-
-
-def test_every_datagram_arrives_and_is_counted() -> None:
-    with open_udp(HERE, "receiver") as receiver, open_udp(HERE, "sender") as sender:
-        sent = Sent()
-        send(sender, Address(*receiver.getsockname()), b"hello", 5, 1000, sent)
-        assert [receiver.recv(100) for _ in range(5)] == [b"hello"] * 5
-        assert (sent.count, sent.refused) == (5, 0)
-        assert sent.seconds > 0
 
 
 def test_a_port_where_nobody_listens_is_noticed_and_does_not_stop_the_sending() -> None:

@@ -161,20 +161,6 @@ message Envelope {
 SPAN = SourceSpan("table.yaml", 9, 5, 14)
 
 
-def test_each_field_without_a_bound_is_a_finding_with_its_path(load: Load) -> None:
-    schema = load({"parts.proto": PROTO})
-    findings = board_findings(find_envelope(schema, ONEOF).cases["parts"], schema, 1000, SPAN)
-    assert [str(finding) for finding in findings] == [
-        f"table.yaml:9:5: error[board-payload]: a board cannot take {path}: it {why}; "
-        f"see parts.proto:{place}; bound it in an .options file beside the .proto, as nanopb does"
-        for path, why, place in [
-            ("parts.first.name", "is a string without a max_size", "3:10"),
-            ("parts.first.values", "is repeated without a max_count", "4:18"),
-            ("parts.raw", "is bytes without a max_size", "8:9"),
-        ]
-    ]
-
-
 def test_bounded_payload_is_measured_with_its_envelope(load: Load) -> None:
     options = "Part.name max_size:16\nPart.values max_count:4\nParts.raw max_size:8"
     schema = load({"parts.proto": PROTO, "parts.options": options})
@@ -195,8 +181,3 @@ def test_field_held_by_callback_and_recursion_are_findings(load: Load) -> None:
         "a board cannot take parts.first.more: it contains itself",
         "a board cannot take parts.raw: it is held by pointer or callback",
     ]
-
-
-def test_boards_can_take_every_case_of_the_rover(rover_schema: ProtoSchema, rover_envelope: Envelope) -> None:
-    for case in rover_envelope.cases.values():
-        assert board_findings(case, rover_schema, rover_envelope.max_size, SPAN) == []

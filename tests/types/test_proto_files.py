@@ -6,18 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import Code, Located, SourceSpan, TableError
+from router.errors import Code, SourceSpan, TableError
 from router.types.proto_files import read_folder
 from router.types.protobuf import load_protos
 from tests.types.conftest import Refused, Write, refusal, settings
-
-
-def test_missing_folder_is_blamed_on_whoever_names_it(tmp_path: Path) -> None:
-    blame = SourceSpan("table.yaml", 3, 11, 20)
-    with pytest.raises(TableError) as caught:
-        load_protos(Located(tmp_path / "nowhere", blame), Located("A", blame))
-    (finding,) = caught.value.diagnostics
-    assert (finding.code, finding.span) == (Code.BAD_FILE, blame)
 
 
 def test_folder_without_protos_is_a_finding(write: Write) -> None:
