@@ -208,8 +208,10 @@ static int64_t clock_now(struct stage *stage) {
     return boottime_ns();
 }
 
+/* The age was checked in `deliver`; it is checked again only where the lock of deadmen is waited for. */
 static int send_by_socket(struct stage *stage, const struct target *target, const uint8_t *data, size_t size,
                           int64_t expires) {
+    if (!target->feed_count) return sender_send(target->sender, data, size);
     return command_send(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
 }
 
