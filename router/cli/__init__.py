@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TextIO, TypeAlias
 
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
@@ -129,14 +129,6 @@ class _MainParser(_Parser):
         return "\n".join([*lines, ""])
 
 
-class _VerbParser(_Parser):
-    """Takes `--for -1s` for a value that its option can refuse, not for an unknown option."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        self._negative_number_matcher = re.compile(r"-[0-9]")
-
-
 class _Help(argparse.HelpFormatter):
     """Fills paragraphs to the terminal's width, except those with indented lines: examples."""
 
@@ -229,7 +221,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = _MainParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
-    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_VerbParser)
+    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_Parser)
     if "_ARGCOMPLETE" in os.environ:
         _complete(parser, subparsers)
     chosen = _verb(arguments)
@@ -245,12 +237,6 @@ def _run(arguments: Sequence[str]) -> int:
     if module is None:
         parser.print_help()
         return OK
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        what = f"router {chosen}: the working directory was deleted"
-        print(with_help(what, "change to one that exists"), file=sys.stderr)
-        return BAD_TABLE
     try:
         code: int = module.run(args)
     except TableError as error:

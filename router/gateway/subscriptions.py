@@ -14,6 +14,7 @@ from router.compiler.lookup import layout
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
 from router.gateway.publishers import Selection, select
+from router.gateway.transport.base import PER_TURN
 from router.threads import DaemonThread
 from router.types.model import MessageType
 from router.types.ros import RosInterfaces
@@ -23,9 +24,6 @@ if TYPE_CHECKING:  # which imports rclpy
 
 DEPTH = 100
 """Messages that wait on a topic of which every one is wanted; the oldest are dropped first."""
-
-READ_PER_TURN = 32
-"""Messages of one topic that are handled before other work of the loop has its turn."""
 
 
 class TopicSubscription:
@@ -146,7 +144,7 @@ class TopicSubscription:
 
     def _serve(self) -> None:
         """Take messages; of those counted by now, what is not there to take was lost."""
-        if self._take(READ_PER_TURN) == READ_PER_TURN:
+        if self._take(PER_TURN) == PER_TURN:
             self._turn = self._loop.call_soon(self._on_turn)
         elif self._is_synchronised:
             self.missed = max(self.missed, self._arrived - self._taken)

@@ -18,12 +18,9 @@ from router.gateway.encoding import Sample
 from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import TopicSubscription
-from router.gateway.transport.base import Frame
+from router.gateway.transport.base import PER_TURN, Frame
 from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
-
-SERVED_PER_TURN = 32
-"""Topics that are served before other work of the loop has its turn."""
 
 MOST_TURNS = 20
 """Parts of a period over which topics are spread where each packet is a datagram: receivers with the kernel's default
@@ -188,7 +185,7 @@ class Topics:
                 self._sender.poll(served, frames)
             except Exception as error:  # noqa: BLE001 reported; other topics are served all the same
                 self._failed(error)
-            if number % SERVED_PER_TURN == 0:
+            if number % PER_TURN == 0:
                 self._clients.send(frames)
                 frames = []
                 await asyncio.sleep(0)

@@ -156,6 +156,16 @@ def port_taken(protocol: str, port: int) -> tuple[str, str]:
     return f"{_described(process)} has the port", "stop it, or choose another port"
 
 
+def why_not_bound(protocol: str, port: int, error: OSError) -> tuple[str, str]:
+    """Return why a socket cannot be bound, and the remedy or "". `protocol` is udp or tcp."""
+    if error.errno == errno.EADDRINUSE:
+        return port_taken(protocol, port)
+    if error.errno == errno.EACCES:
+        return "ports below 1024 need a privilege", "choose a higher port, or grant CAP_NET_BIND_SERVICE"
+    is_absent = error.errno == errno.EADDRNOTAVAIL
+    return "this machine has no such address" if is_absent else error.strerror or str(error), ""
+
+
 def port_holder(protocol: str, port: int) -> str:
     """Return `python (pid 4711)`, or "another process" if /proc does not show it. `protocol` is udp or tcp."""
     return _described(_process(protocol, port))

@@ -16,11 +16,11 @@ from router.net.kernel import (
     ask_for_receive_buffer,
     bound_interface,
     drops,
-    port_taken,
     receive_buffer,
     refuse_input,
     report_sending_errors,
     send_arrivals,
+    why_not_bound,
 )
 from router.table import model
 from router.table.addresses import Address, not_one_machine
@@ -234,14 +234,9 @@ class Listener:
 
 
 def _refused(settings: model.Listener, error: OSError) -> StartError:
-    known = {
-        errno.EPERM: ("before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"),
-        errno.EACCES: ("ports below 1024 need a privilege", "choose a higher port, or grant CAP_NET_BIND_SERVICE"),
-    }
-    if error.errno == errno.EADDRINUSE:
-        why, hint = port_taken("udp", settings.address.value.port)
-    else:
-        why, hint = known.get(error.errno or 0, (error.strerror or str(error), ""))
+    why, hint = why_not_bound("udp", settings.address.value.port, error)
+    if error.errno == errno.EPERM:
+        why, hint = "before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"
     what = f"listener '{settings.name}' cannot use {settings.bound_to}"
     return StartError(f"{settings.address.span}: {what}: {why}", hint)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from router.compiler.network import recognisers
 from router.errors import TransportError, UsageError, did_you_mean
-from router.net.kernel import interface_address
+from router.net.kernel import interface_address, why_not_bound
 from router.table.addresses import Address
 from router.table.model import Listener, RouteTable
 
@@ -91,18 +91,9 @@ def open_udp(address: Address, purpose: str) -> socket.socket:
         opened.bind(address)
     except OSError as error:
         opened.close()
-        raise UsageError(f"{purpose}: cannot bind {address}: {_bind_hint(error)}") from error
+        why, remedy = why_not_bound("udp", address.port, error)
+        raise UsageError(f"{purpose}: cannot bind {address}: {why}", remedy) from error
     return opened
-
-
-def _bind_hint(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "another process has this port (see `ss -lunp`)"
-    if error.errno == errno.EADDRNOTAVAIL:
-        return "this machine has no such address"
-    if error.errno == errno.EACCES:
-        return "ports below 1024 need root"
-    return error.strerror or str(error)
 
 
 def _named(text: str, table: RouteTable | None) -> Address | None:

@@ -59,7 +59,7 @@ async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_the
         assert resident_kib() - before < 100_000
         transport.write_all(events.clients[50:], [data(b"next")])
         assert await peer.hear() == b"next"
-        assert events.eased == [events.clients[50]]
+        assert set(events.eased) == {events.clients[50]}
         await transport.close()  # at once, though they do not answer
         for each in (peer, *still):
             each.leave()

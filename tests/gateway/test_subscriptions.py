@@ -23,7 +23,8 @@ from router.gateway.json_codec import UnreadableError
 from router.gateway.json_types import Style
 from router.gateway.packets import decompress
 from router.gateway.publishers import Selection
-from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
+from router.gateway.subscriptions import Subscriptions, TopicSubscription
+from router.gateway.transport.base import PER_TURN
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
 from tests.ros.opening import HELLO, STRING, cdr, open_ros, padded, string_topic
@@ -156,7 +157,7 @@ async def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher
         peer.await_receipt()  # while the loop stands still, so that they all wait
         turn()
         await until(lambda: samples == texts)
-        assert max(after - before for before, after in pairwise(turns)) <= READ_PER_TURN
+        assert max(after - before for before, after in pairwise(turns)) <= PER_TURN
         assert subscription.arrived == len(texts)
         assert latest(subscription) == texts[-1]
 

@@ -7,7 +7,7 @@ import asyncio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.gateway.transport.stream import READ_PER_TURN
+from router.gateway.transport.base import PER_TURN
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.stream_peers import MOST, framed, join, served
 from tests.gateway.transport_events import data
@@ -49,10 +49,10 @@ async def test_one_that_sends_without_end_does_not_keep_others_waiting() -> None
     async with served("lines") as (transport, events):
         flood, other = [await join("lines", transport) for _ in range(2)]
         await until(lambda: len(events.clients) == 2)
-        flood.writer.write(b"\n" * 20 * READ_PER_TURN)
+        flood.writer.write(b"\n" * 20 * PER_TURN)
         other.writer.write(b"me too\n")
         await until(lambda: b"me too" in events.said)
-        await until(lambda: len(events.said) == 20 * READ_PER_TURN + 1)
+        await until(lambda: len(events.said) == 20 * PER_TURN + 1)
         flood.leave()
         other.leave()
 

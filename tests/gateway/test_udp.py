@@ -162,7 +162,7 @@ async def test_a_burst_is_paced_and_goes_out_in_order(headset: socket.socket) ->
         await until(lambda: events.eased)
         assert client.backlog() < LOW_WATER
         assert await reading == [frame.data for frame in frames]
-        assert events.eased == [client]
+        assert set(events.eased) == {client}
         assert events.failures == []
 
 

@@ -5,6 +5,7 @@ Everything here is called in the thread of the gateways' event loop.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
@@ -12,7 +13,10 @@ HIGH_WATER = 256 * 1024
 """Bytes waiting for a client from which on nothing more is written to it."""
 
 LOW_WATER = 64 * 1024
-"""Bytes below which a client that had reached HIGH_WATER is reported as drained."""
+"""Bytes below which a client that had to wait is reported as drained."""
+
+PER_TURN = 32
+"""Messages of one client, or topics, that are handled before other work of the loop has its turn."""
 
 
 class Frame(NamedTuple):
@@ -51,7 +55,7 @@ class Events(Protocol):
     def left(self, client: Client) -> None: ...
 
     def drained(self, client: Client) -> None:
-        """The backlog fell below LOW_WATER after it had reached HIGH_WATER."""
+        """The client took what was waiting for it, down to less than LOW_WATER. May be repeated."""
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
         """A client sent one packet or document. `arrived_ns` is wall-clock time."""
@@ -70,6 +74,12 @@ class Events(Protocol):
 
     def snapshot(self) -> Sequence[Frame]:
         """Return all schemas and latest values, schemas first."""
+
+
+def report_fault(where: str, error: Exception) -> None:
+    """Report an exception that nobody else sees: a fault of the router itself."""
+    what = {"message": f"a fault in the router itself {where}", "exception": error}
+    asyncio.get_running_loop().call_exception_handler(what)
 
 
 class Transport(Protocol):

@@ -9,8 +9,9 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
 from router.errors import StartError
+from router.gateway.transport.base import report_fault
 from router.log import logger
-from router.net.kernel import port_taken
+from router.net.kernel import why_not_bound
 from router.table.addresses import Address
 
 RETRY_SECONDS = 1.0
@@ -38,7 +39,7 @@ class Binding:
             await self._attempt()
         except OSError as error:
             if error.errno != errno.EADDRNOTAVAIL:
-                raise StartError(self._why_not(error)) from error
+                raise self._refusal(error) from error
             logger.warning("no network interface has this address yet: waiting for it", address=str(self._address))
             self._retrying = asyncio.get_running_loop().create_task(self._retry())
 
@@ -57,21 +58,16 @@ class Binding:
             except OSError as error:
                 if error.errno not in (None, errno.EADDRNOTAVAIL, reported):
                     reported = error.errno
-                    logger.error("this address cannot be used: trying on", why=self._why_not(error))
+                    logger.error("this address cannot be used: trying on", why=str(self._refusal(error)))
             except Exception as error:  # noqa: BLE001 - a fault of the router is reported, and no reason to give up
-                what = {"message": f"a fault in the router itself kept {self._address} closed", "exception": error}
-                asyncio.get_running_loop().call_exception_handler(what)
+                report_fault(f"kept {self._address} closed", error)
             else:
                 logger.info("the address is here now, and used", address=str(self._address))
                 return
 
-    def _why_not(self, error: OSError) -> str:
-        what = f"{self._address} cannot be used"
-        if error.errno == errno.EADDRINUSE:
-            return f"{what}: {'; '.join(port_taken(self._protocol, self._address.port))}"
-        if error.errno == errno.EACCES:
-            return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
-        return f"{what}: {error.strerror}"
+    def _refusal(self, error: OSError) -> StartError:
+        why, remedy = why_not_bound(self._protocol, self._address.port, error)
+        return StartError(f"{self._address} cannot be used: {why}", remedy)
 
 
 def listen_at(address: Address) -> socket.socket:

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any, NamedTuple, Union
 
 from router.gateway.transport.arrival import LoopClock
-from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
+from router.gateway.transport.base import LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
 from router.log import FloodLog, logger
 from router.table.addresses import Address
@@ -31,9 +31,6 @@ MESSAGE_SECONDS = 10.0
 
 WATCH_SECONDS = 1.0
 """Between two checks of that deadline."""
-
-READ_PER_TURN = 32
-"""Messages of one client that are handled before other work of the loop has its turn."""
 
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before other work of the loop has its turn."""
@@ -85,7 +82,6 @@ class StreamClient:
         self._is_open = is_open
         self._pieces: deque[Piece] = deque()
         self._waiting = 0
-        self._was_high = False
         self._writing: asyncio.Task[None] | None = None
         _configure(connection)
 
@@ -101,7 +97,6 @@ class StreamClient:
             self._write_now()
             if self.backlog():
                 self._writing = asyncio.get_running_loop().create_task(self._write_later())
-        self._was_high = self._was_high or self.backlog() >= HIGH_WATER
 
     def backlog(self) -> int:
         return self._waiting + self._connection.get_write_buffer_size()
@@ -132,8 +127,7 @@ class StreamClient:
                     if not self.can_write():
                         return
                     self._write_now()
-                    if self._was_high and self.backlog() < LOW_WATER:
-                        self._was_high = False
+                    if self.backlog() < LOW_WATER:
                         self._owner.events.drained(self)
         finally:
             self._writing = None

@@ -8,16 +8,8 @@ import struct
 from collections.abc import Sequence
 from time import monotonic
 
-from router.gateway.transport.base import Events, Frame
-from router.gateway.transport.stream import (
-    ACCEPTED_PER_TURN,
-    PIECE,
-    READ_PER_TURN,
-    Encoded,
-    Limits,
-    StreamClient,
-    StreamTransport,
-)
+from router.gateway.transport.base import PER_TURN, Events, Frame, report_fault
+from router.gateway.transport.stream import ACCEPTED_PER_TURN, PIECE, Encoded, Limits, StreamClient, StreamTransport
 from router.table.addresses import Address
 
 LENGTH = struct.Struct("<I")
@@ -76,8 +68,7 @@ class TcpTransport(StreamTransport):
         except (asyncio.IncompleteReadError, OSError):
             pass  # the client left
         except Exception as error:  # noqa: BLE001 - a fault of the router, reported; it ends this client alone
-            what = {"message": "a fault in the router itself ended a TCP connection", "exception": error}
-            asyncio.get_running_loop().call_exception_handler(what)
+            report_fault("ended a TCP connection", error)
         finally:
             client.close()
             self.leave(client)
@@ -85,7 +76,7 @@ class TcpTransport(StreamTransport):
     async def _read(self, client: StreamClient, reader: asyncio.StreamReader) -> None:
         read_rest = self._read_packet if self._prefixed else self._read_line
         while True:
-            for _ in range(READ_PER_TURN):
+            for _ in range(PER_TURN):
                 first = await reader.readexactly(1)
                 client.unfinished_since = monotonic()
                 data = await read_rest(reader, first)

@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from collections.abc import Iterable, Sequence
 
-from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
+from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
 from router.gateway.transport.binding import Binding
 from router.net.kernel import arrivals, ask_for_receive_buffer, drops
 from router.table.addresses import Address
@@ -26,9 +26,6 @@ BURST = 64
 BURST_BYTES = 128 * 1024
 PAUSE_SECONDS = 0.001
 """Datagrams and bytes sent at once, and the pause before more: a receiver with a default buffer keeps up with that."""
-
-READ_PER_TURN = 32
-"""Datagrams that are read before other work of the loop has its turn."""
 
 
 class UdpTransport:
@@ -88,7 +85,7 @@ class UdpTransport:
         self._events.joined(self._client)
 
     def _receive(self, opened: socket.socket, client: UdpClient) -> None:
-        for _ in range(READ_PER_TURN):
+        for _ in range(PER_TURN):
             try:
                 data, sender = opened.recvfrom(LARGEST_DATAGRAM)
             except BlockingIOError:
@@ -113,7 +110,6 @@ class UdpClient:
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[bytes] = deque()
         self._backlog = 0
-        self._was_high = False
         self._is_open = True
         self._resume: asyncio.TimerHandle | None = None
         self._burst_ends = 0.0  # by the loop's clock
@@ -127,7 +123,6 @@ class UdpClient:
         self._backlog += sum(len(frame.data) for frame in frames)
         if self._resume is None:
             self._send_burst()
-        self._was_high = self._was_high or self._backlog >= HIGH_WATER
 
     def backlog(self) -> int:
         return self._backlog
@@ -144,7 +139,7 @@ class UdpClient:
 
     def _send_burst(self) -> None:
         """Send what may be sent now, and the rest later. Of several errors in a burst, the last one is reported."""
-        self._resume = None
+        has_waited, self._resume = self._resume is not None, None
         now = self._loop.time()
         if now >= self._burst_ends:
             self._burst_ends = now + PAUSE_SECONDS
@@ -166,8 +161,7 @@ class UdpClient:
             self._resume = self._loop.call_at(self._burst_ends, self._send_burst)
         if failure is not None:
             self._events.failed(self, failure, lost)
-        if self._was_high and self._backlog < LOW_WATER:
-            self._was_high = False
+        if has_waited and self._backlog < LOW_WATER:
             self._loop.call_soon(self._tell_drained)
 
     def _tell_drained(self) -> None:

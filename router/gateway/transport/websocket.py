@@ -21,12 +21,11 @@ from websockets.http11 import Request, Response
 from websockets.protocol import State
 
 from router.assets import page_policy
-from router.gateway.transport.base import HIGH_WATER, Events, Frame
+from router.gateway.transport.base import HIGH_WATER, PER_TURN, Events, Frame, report_fault
 from router.gateway.transport.stream import (
     ACCEPTED_PER_TURN,
     MESSAGE_SECONDS,
     PIECE,
-    READ_PER_TURN,
     Encoded,
     Limits,
     StreamClient,
@@ -122,8 +121,7 @@ class WebsocketTransport(StreamTransport):
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.events.refused("too_large")
         except Exception as error:  # noqa: BLE001 - a fault of the router, which the library would only log
-            what = {"message": "a fault in the router itself ended a websocket", "exception": error}
-            asyncio.get_running_loop().call_exception_handler(what)
+            report_fault("ended a websocket", error)
         finally:
             self.leave(client)
 
@@ -131,7 +129,7 @@ class WebsocketTransport(StreamTransport):
         """Raises ConnectionClosed in the end."""
         client = connection.client
         while True:
-            for _ in range(READ_PER_TURN):
+            for _ in range(PER_TURN):
                 data = await connection.recv(decode=False)
                 if client.unfinished_since is not None:  # by the next message
                     client.unfinished_since = monotonic()

@@ -17,7 +17,7 @@ import zenoh
 
 from router.errors import StartError, TransportError
 from router.gateway.transport.arrival import LoopClock
-from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
+from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
 from router.gateway.transport.binding import RETRY_SECONDS
 from router.gateway.transport.zenoh_session import (
     Owner,
@@ -48,9 +48,6 @@ CONNECTIONS_SECONDS = 1.0
 
 MOST_OTHERS = 100
 """Other owners of its key that a gateway remembers."""
-
-RECEIVED_PER_TURN = 32
-"""Samples that are handed on before other work of the loop has its turn."""
 
 MOST_RECEIVED = 1000
 MOST_RECEIVED_BYTES = 64 << 20
@@ -335,7 +332,7 @@ class Inbox:
         if self._client is None:
             return
         try:
-            for _ in range(min(len(self._waiting), RECEIVED_PER_TURN)):
+            for _ in range(min(len(self._waiting), PER_TURN)):
                 data, arrived = self._waiting.popleft()
                 self._handed_bytes += len(data)
                 self._events.received(self._client, data, arrived)
@@ -379,7 +376,6 @@ class ZenohClient:
         self._events = events
         self._waiting: list[Frame] = []
         self._backlog = 0
-        self._was_high = False
         self._is_putting = False
         self._is_open = True
 
@@ -388,7 +384,6 @@ class ZenohClient:
             return
         self._waiting.extend(frames)
         self._backlog += sum(len(frame.data) for frame in frames)
-        self._was_high = self._was_high or self._backlog >= HIGH_WATER
         if not self._is_putting:
             self._put()
 
@@ -418,8 +413,7 @@ class ZenohClient:
             self._events.failed(self, error, 1)
         if self._waiting:
             self._put()
-        if self._was_high and self._backlog < LOW_WATER:
-            self._was_high = False
+        if self._backlog < LOW_WATER:
             self._events.drained(self)
 
 
