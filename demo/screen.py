@@ -14,7 +14,6 @@ from demo.expected import active_routes
 from demo.verdict import Said, arrival_count, topic_count
 from router.table.model import RouteTable
 from router.tools.top import Order, RouteRow, View
-from router.tools.top_table import Column
 from router.tools.top_table import RouteTable as Routes
 from router.tools.top_view import summary_line
 
@@ -92,8 +91,7 @@ class _Terminal:
         legend = Text(style="dim").append("destinations", style="cyan").append(", ").append("ROS topics", style="green")
         legend.append("; on ROS, on UDP: what has really arrived there")
         room = self._console.height - 3 - len(changes)
-        columns = (Column("on ROS", on_ros), Column("on UDP", on_udp))
-        table = Routes(view, Order.DROPS, room, columns)
+        table = Routes(view, Order.DROPS, room, columns={"on ROS": on_ros, "on UDP": on_udp})
         self._live.update(Group(title, table, *changes, legend), refresh=True)
 
 

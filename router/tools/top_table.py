@@ -18,6 +18,8 @@ from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered
 from router.values import age_text, rate_text, shortened
 
+Cell = Callable[[RouteRow], Text]
+
 LATENCIES_FROM = 100
 """Columns of a terminal from which on latencies are shown."""
 
@@ -26,31 +28,40 @@ _SHORTEST = 4
 """Letters that are left of the name of a target at least, of several and of the only one shown."""
 
 
+_LATENCIES: dict[str, Cell] = {
+    "p50": lambda row: Text(latency_text(row.median)),
+    "p99": lambda row: Text(latency_text(row.slowest)),
+}
+_AGE: dict[str, Cell] = {"age": lambda row: Text(age_text(row.age), style="dim" if row.age is None else "")}
+
+
 @dataclass(frozen=True, slots=True)
 class RouteTable:
-    """At most `height` lines with the routes in this order, from number `first` (counted from 0) on."""
+    """At most `height` lines with the routes in this order, from number `first` (counted from 0) on.
+
+    `columns` are further ones; without any, latencies where there is room, and ages.
+    """
 
     view: View
     order: Order
     height: int
     first: int = 0
+    columns: Mapping[str, Cell] | None = None
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        with_latencies = options.max_width >= LATENCIES_FROM
+        columns = self.columns or (_LATENCIES if options.max_width >= LATENCIES_FROM else {}) | _AGE
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("route", "in/s", "endpoints", "topics", *("p50", "p99") * with_latencies, "age", "drops"):
-            is_number = title in ("in/s", "p50", "p99", "age")
+        for title in ("route", "in/s", "endpoints", "topics", *columns, "drops"):
+            is_number = title == "in/s" or title in columns
             header = Text(title, no_wrap=True, overflow="ellipsis")
             table.add_column(header, justify="right" if is_number else "left", no_wrap=is_number)
         for row in ordered(self.view.routes, self.order)[self.shown.start : self.shown.stop]:
-            latencies = (latency_text(row.median), latency_text(row.slowest)) * with_latencies
             table.add_row(
                 _Fitted(partial(_name, row)),
                 _rate(row.rate),
                 _Fitted(partial(targets_text, [target for target in row.targets if not target.is_topic])),
                 _Fitted(partial(targets_text, [target for target in row.targets if target.is_topic])),
-                *latencies,
-                Text(age_text(row.age), style="dim" if row.age is None else ""),
+                *(cell(row) for cell in columns.values()),
                 _drops(row),
             )
         yield table

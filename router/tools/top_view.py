@@ -164,6 +164,11 @@ def _heard(name: str, age: float | None, is_silent: bool) -> Text:
     return text.append(f"{age_text(age):>5}", style="dim" if age is None else "cyan" if not is_silent else "")
 
 
+def summary_line(view: View) -> str:
+    """The whole router in one line."""
+    return ", ".join(_summary_parts(view))
+
+
 def _summary_parts(view: View) -> tuple[str, str]:
     """What flows, and what is lost."""
     delivered = sum(target.delivered for row in view.routes for target in row.targets)
