@@ -1,8 +1,8 @@
-"""Messages between CDR bytes and JSON text, by functions that are generated for each message type.
+"""Messages between CDR bytes and JSON text, by functions that are made for each message type.
 
 `encoder` makes functions from CDR to JSON: the code reads the CDR fields in declared order and builds dictionaries with
 sorted keys, which orjson writes. `decoder` makes functions from JSON to CDR: msgspec checks and reads the text into
-Structs, and generated code writes their fields.
+Structs, whose fields are written one after the other, since clients send little.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ import msgspec
 import numpy as np
 import orjson
 
-from router.compiler.cdr import write_message
-from router.compiler.cdr.primitives import CDR_LE, scalar_format
+from router.compiler.cdr.primitives import (
+    CDR_LE,
+    HEADER,
+    put_length,
+    put_numbers,
+    put_text,
+    put_wide_text,
+    scalar_format,
+)
 from router.compiler.cdr.reading import LENGTH, Loop, ReadingCode, Step, Stretch, Take
-from router.compiler.expressions.kinds import IntKind, StringKind, kind_of
-from router.compiler.expressions.tree import Call, Constant, Element, Node, Read, Variable
-from router.compiler.namespace import NAMESPACE
-from router.compiler.plan import Each, Leaf, Plan, Record
 from router.compiler.source import Source
-from router.errors import MappingError, SourceSpan
+from router.errors import SourceSpan
 from router.gateway.json_types import PLACEHOLDER, Style
-from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
 Encode = Callable[[bytes], bytes]
 """From CDR bytes with their header to UTF-8 JSON. Raises UnreadableError."""
@@ -41,15 +44,6 @@ class UnreadableError(ValueError):
 
 class InvalidMessageError(ValueError):
     """A client's text is no JSON, or no message of the type. The text of the error is short and printable."""
-
-
-def _function(out: Source, name: str, file: str, namespace: dict[str, object]) -> Any:
-    """Compile `out`, which defines the function `name`. Tracebacks show its lines as those of `file`."""
-    text = out.text()
-    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
-    scope = {**namespace, **out.constants}
-    exec(compile(text, file, "exec"), scope)  # noqa: S102 - generated here; names are rosidl's identifiers
-    return scope[name]
 
 
 # -- CDR to JSON ------------------------------------------------------------------------------------------------------
@@ -80,7 +74,11 @@ def encoder(message: MessageType, style: Style) -> Encode:
             out.line(f"return dumps({expression}, None, NUMPY)", span)
         with out.block("except DAMAGED as error:", span):
             out.line("raise UnreadableError(str(error)) from error", span)
-    function: Encode = _function(out, "encode", file, _ENCODING)
+    text = out.text()
+    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)  # for tracebacks
+    scope: dict[str, Any] = {**_ENCODING, **out.constants}
+    exec(compile(text, file, "exec"), scope)  # noqa: S102 - generated here; names are rosidl's identifiers
+    function: Encode = scope["encode"]
     return function
 
 
@@ -219,20 +217,16 @@ def decoder(message: MessageType, style: Style) -> Decode:
 
     Nothing is converted: 3.0 is no integer, and 1 is no bool. An integer is a float where one is wanted.
     """
-    file = f"<message from json of {message.name}>"
-    span = SourceSpan(file)
-    writing = _Writing(style, span)
+    writing = _Writing(style)
     read: Callable[[bytes], Any] = msgspec.json.Decoder(writing.struct(message)).decode
-    out = Source()
-    with out.block("def write(it):", span):
-        out.line(f"return {write_message(out, writing.whole(message, 'it'), 'message')}", span)
-    write = _function(out, "write", file, _DECODING)
 
     def decode(text: bytes) -> bytes:
+        data = bytearray()
         try:
-            return bytes(write(read(text)))
-        except (msgspec.DecodeError, UnicodeError, RecursionError, MappingError, struct.error) as error:
+            writing.write(data, message, read(text), "")
+        except (msgspec.DecodeError, UnicodeError, RecursionError, InvalidMessageError) as error:
             raise InvalidMessageError(shown(str(error))) from None
+        return HEADER + data
 
     return decode
 
@@ -244,13 +238,11 @@ def shown(text: str) -> str:
 
 
 class _Writing:
-    """The Structs that msgspec reads messages into, and plans that write their fields."""
+    """The Structs that msgspec reads messages into, and how their fields are written."""
 
-    def __init__(self, style: Style, span: SourceSpan) -> None:
+    def __init__(self, style: Style) -> None:
         self._is_wrapped = style is Style.WRAPPED
-        self._span = span
         self._structs: dict[MessageType, type] = {}
-        self._items = count(1)
 
     def struct(self, message: MessageType) -> type:
         """The Struct of a message. Its attributes are `f0`, `f1` ..., since fields may be called as Python keywords."""
@@ -279,7 +271,7 @@ class _Writing:
                 return self.struct(declared)
             case Bool():
                 return bool
-            case Int(bits=64, signed=False):  # msgspec has no bound above int64: `uint64` checks it
+            case Int(bits=64, signed=False):  # msgspec has no bound above int64: `struct` has
                 return Annotated[int, msgspec.Meta(ge=0)]
             case Int():
                 return Annotated[int, msgspec.Meta(ge=declared.low, le=declared.high)]
@@ -299,77 +291,52 @@ class _Writing:
             case _:
                 raise TypeError(f"ROS has no type {declared}")
 
-    def whole(self, message: MessageType, variable: str) -> Record:
-        """The plan of a message that is read from the Struct in a variable."""
-        return self._record(message, Variable(kind_of(message), self._span, variable), "")
-
-    def _record(self, message: MessageType, holder: Node, path: str) -> Record:
-        """`path` names the message in errors."""
-        members = []
-        for index, field in enumerate(message.fields):
-            value: Node = Read(kind_of(field.type), self._span, holder, Field(f"f{index}", field.type))
-            if self._is_wrapped and not isinstance(field.type, List):
-                value = Element(value.kind, self._span, value, 0)
-            members.append((field, self._plan(field.type, value, f"{path}.{field.name}".lstrip("."))))
-        return Record(message, tuple(members), self._span)
-
-    def _plan(self, declared: Type, value: Node, path: str) -> Plan:
+    def write(self, data: bytearray, declared: Type, value: Any, path: str) -> None:  # noqa: C901 - a case a type
+        """Append what msgspec has read. `path` names it in errors. Raises InvalidMessageError, UnicodeError."""
         match declared:
+            case MessageType(fields=()):
+                data.append(0)
             case MessageType():
-                return self._record(declared, value, path)
-            case List():
-                item = Variable(kind_of(declared.element), self._span, f"item{next(self._items)}")
-                element = self._plan(declared.element, item, f"{path}[]")
-                return Each(declared, ((item.name, value),), element, self._span)
-            case String(wide=True) if self._is_wrapped:  # msgspec has checked its bound
-                return Leaf(declared, self._checked("wide_text_of_units", value, path), self._span)
+                for field, member in zip(declared.fields, msgspec.structs.astuple(value), strict=True):
+                    is_bare = isinstance(field.type, List) or not self._is_wrapped
+                    inner = f"{path}.{field.name}" if path else field.name
+                    self.write(data, field.type, member if is_bare else member[0], inner)
+            case List(element=element):
+                if declared.length is None:
+                    put_length(data, len(value), None)
+                if isinstance(element, (MessageType, String)):
+                    for each in value:
+                        self.write(data, element, each, f"{path}[]")
+                else:
+                    _put_scalars(data, element, value, f"{path}[]")
+            case String(wide=True):
+                text = _wide_text_of_units(value, path) if self._is_wrapped else value
+                _check_size(len(text.encode("utf-16-le")) // 2, "characters", declared.bound, path)
+                put_wide_text(data, text)
             case String():
-                check = "wide_text" if declared.wide else "text"
-                return Leaf(declared, self._checked(check, value, path, declared.bound), self._span)
-            case Int(bits=64, signed=False):
-                return Leaf(declared, self._checked("uint64", value, path), self._span)
+                if "\0" in value:
+                    raise InvalidMessageError(f"{path}: a string of ROS holds no NUL")
+                _check_size(len(value.encode()), "bytes", declared.bound, path)
+                put_text(data, value)
             case _:
-                return Leaf(declared, value, self._span)
-
-    def _checked(self, check: str, value: Node, path: str, bound: int | None = None) -> Node:
-        """The call of one of the functions below; without a bound where there is none."""
-        given = [Constant(StringKind(), self._span, path)]
-        if bound is not None:
-            given.append(Constant(IntKind(bound, bound), self._span, bound))
-        return Call(value.kind, self._span, f"checked_{check}", (value, *given))
+                _put_scalars(data, declared, (value,), path)
 
 
-def _checked_text(value: str, path: str, bound: int | None = None) -> str:
-    if "\0" in value:
-        raise InvalidMessageError(f"{path}: a string of ROS holds no NUL")
-    if bound is not None and (size := len(value.encode())) > bound:
-        raise InvalidMessageError(f"{path}: {size} bytes are more than {bound}")
-    return value
+def _check_size(size: int, unit: str, bound: int | None, path: str) -> None:
+    if bound is not None and size > bound:
+        raise InvalidMessageError(f"{path}: {size} {unit} are more than {bound}")
 
 
-def _checked_wide_text(value: str, path: str, bound: int | None = None) -> str:
-    if bound is not None and (size := len(value.encode("utf-16-le")) // 2) > bound:
-        raise InvalidMessageError(f"{path}: {size} characters are more than {bound}")
-    return value
+def _put_scalars(data: bytearray, declared: Type, values: Sequence[Any], path: str) -> None:
+    letter = scalar_format(declared)
+    try:
+        put_numbers(data, letter, struct.calcsize(letter), values)
+    except struct.error:  # msgspec has checked all others
+        raise InvalidMessageError(f"{path}: {max(values)} is outside of {declared}") from None
 
 
-def _checked_wide_text_of_units(units: Sequence[int], path: str) -> str:
+def _wide_text_of_units(units: Sequence[int], path: str) -> str:
     try:
         return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
     except UnicodeDecodeError:
         raise InvalidMessageError(f"{path}: the string has half of a surrogate pair") from None
-
-
-def _checked_uint64(value: int, path: str) -> int:
-    if value >> 64:
-        raise InvalidMessageError(f"{path}: {value} is outside of uint64")
-    return value
-
-
-_DECODING: dict[str, object] = {
-    **NAMESPACE,
-    "checked_text": _checked_text,
-    "checked_wide_text": _checked_wide_text,
-    "checked_wide_text_of_units": _checked_wide_text_of_units,
-    "checked_uint64": _checked_uint64,
-}
