@@ -104,11 +104,12 @@ def _listen_to_gateway(args: argparse.Namespace) -> None:
     from router.table.model import GatewayFormat
     from router.tools.gateway_client import GatewayClient, topic_filter
     from router.tools.gateway_messages import Message
-    from router.tools.gateway_sources import open_source, remote
+    from router.tools.gateway_sources import open_source
+    from router.tools.udp import destination
 
     client = GatewayClient(topic_filter(args.topics or ()))
     form = GatewayFormat(args.format) if args.format else None
-    gateway = remote(args.ask) if args.ask else None
+    gateway = destination(args.ask, None) if args.ask else None
     show = _printer(args.json)
     with _recorder(args.record) as record, closing(open_source(args.place, form, gateway, say)) as source:
         say(f"listening: {source.place}; Ctrl-C ends it")

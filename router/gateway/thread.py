@@ -100,7 +100,16 @@ class GatewayThread:
         `feed` has what feeds a deadman, by the deadman's route. A gateway that is the same as before keeps its clients.
         One that has changed loses them here: its socket has to be closed before the new one can be opened.
         """
-        return self._call(self._prepare(program, _outputs(self._ros, self._library, feed, self._report)))
+        outputs = InboundOutputs(
+            library=self._library,
+            publish=self._ros.publish,
+            publish_errors=self._ros.publish_errors,
+            feed_deadman=feed,
+            report=self._report,
+            clock_ns=boottime_ns,
+            wall_ns=wall_ns,
+        )
+        return self._call(self._prepare(program, outputs))
 
     async def _prepare(self, program: Program, outputs: InboundOutputs) -> GatewayChange:
         kept = {
@@ -251,20 +260,3 @@ def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
         return True
     wanted = {where.value for where in (other.address, other.receive) if where}
     return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
-
-
-def _outputs(
-    ros: RouterNode,
-    library: ctypes.CDLL,
-    feed: Mapping[str, Callable[[int], None]],
-    report: Callable[[Report], None],
-) -> InboundOutputs:
-    return InboundOutputs(
-        library=library,
-        publish=ros.publish,
-        publish_errors=ros.publish_errors,
-        feed_deadman=feed,
-        report=report,
-        clock_ns=boottime_ns,
-        wall_ns=wall_ns,
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import select
 import socket
 import struct
@@ -302,29 +301,16 @@ def open_source(text: str, form: GatewayFormat | None, gateway: Address | None, 
     scheme, _, rest = text.partition("://")
     match scheme:
         case "udp":
-            return UdpSource(_local(rest), gateway, say)
+            return UdpSource(udp.listening(rest, None), gateway, say)
         case "tcp":
-            return TcpSource(remote(rest), form, say)
+            return TcpSource(udp.destination(rest, None), form, say)
         case "ws":
-            return WebsocketSource(remote(rest.removesuffix("/")), say)
+            return WebsocketSource(udp.destination(rest.removesuffix("/"), None), say)
         case "zenoh":
             from router.tools.zenoh_source import ZenohSource
 
             return ZenohSource(_zenoh(rest), say)
     raise UsageError(f"'{text}' is not {_FORMS}")
-
-
-def remote(text: str) -> Address:
-    """`HOST:PORT`. Raises UsageError."""
-    if not re.fullmatch(r".+:[0-9]+", text):
-        raise UsageError(f"'{text}' is not HOST:PORT")
-    return udp.destination(text, None)
-
-
-def _local(text: str) -> Address:
-    if not re.fullmatch(r"(?:.+:)?[0-9]+", text):
-        raise UsageError(f"'{text}' is not {_FORMS}")
-    return udp.listening(text, None)
 
 
 def _zenoh(text: str) -> ZenohSettings:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,8 @@ from router.types.model import Bool, Enum, Float, MessageType, Type
 from router.types.protobuf import find_envelope, load_protos
 
 _WIDEST = 120
+_LONGEST_FIELD = 60
+"""Characters that are kept free for the last field on a line."""
 _SECTION_WIDTH = 115
 _COMMENT_GAP = 3
 
@@ -361,51 +362,38 @@ def _test(message: NewMessage, site: Site) -> Iterator[str]:
     yield "  given:"
     yield f"    case: {message.case}"
     yield f"    from: {message.board}"
-    fields = _flow({field.name: _sample(field.type, place, site) for place, field in enumerate(message.fields)})
-    yield from _wrapped(f"    fields: {fields}", " " * 13)
+    fields = {field.name: _sample(field.type, place, site) for place, field in enumerate(message.fields)}
+    yield from _flow("    fields: ", fields)
     yield "  expect:"
     if receivers:
         yield f"    sent: {receivers[0] if len(receivers) == 1 else '[' + ', '.join(receivers) + ']'}"
     yield f"    published: {{{message.case}: unchanged}}"
 
 
-def _wrapped(text: str, indent: str) -> list[str]:
-    """On several lines if it is long; a name and its value stay on one."""
-    lines = textwrap.wrap(
-        text.replace(": ", ":\0"),
-        _WIDEST - 2,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return [line.replace("\0", " ") for line in lines]
+def _flow(key: str, values: object) -> list[str]:
+    """A key and its value in braces, on several lines if they are long."""
+    text = yaml.safe_dump(values, default_flow_style=True, sort_keys=False, width=_WIDEST - _LONGEST_FIELD)
+    first, *others = text.splitlines()
+    return [key + first, *(" " * (len(key) + 1) + other.strip() for other in others)]
 
 
-def _flow(values: Mapping[str, str]) -> str:
-    return f"{{{', '.join(f'{name}: {value}' for name, value in values.items())}}}"
-
-
-def _sample(type_name: str, place: int, site: Site) -> str:
+def _sample(type_name: str, place: int, site: Site) -> object:
     """A value that no field has by default, and mostly another one for each."""
     if type_name in SCALARS:
         return _scalar(type_name == "bool", type_name in ("float", "double"), place)
-    if type_name in site.schema.enums:
-        return _value(site.schema.enums[type_name], place)
-    return _value(site.schema.messages[type_name], place)
+    return _value(site.schema.enums.get(type_name) or site.schema.messages[type_name], place)
 
 
-def _value(kind: Type, place: int) -> str:
+def _value(kind: Type, place: int) -> object:
     if isinstance(kind, Enum):
         return next((name for name, number in kind.values if number), kind.values[0][0])
     if isinstance(kind, MessageType):
-        return _flow({field.name: _value(field.type, index) for index, field in enumerate(kind.fields, place)})
+        return {field.name: _value(field.type, index) for index, field in enumerate(kind.fields, place)}
     return _scalar(isinstance(kind, Bool), isinstance(kind, Float), place)
 
 
-def _scalar(is_bool: bool, is_float: bool, place: int) -> str:
-    if is_bool:
-        return "true"
-    return f"{place + 1}.5" if is_float else str(place + 1)
+def _scalar(is_bool: bool, is_float: bool, place: int) -> object:
+    return is_bool or place + (1.5 if is_float else 1)
 
 
 def _protos(table: RouteTable) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import time
 from collections.abc import Iterable, Iterator
@@ -24,8 +23,6 @@ from router.tools import udp
 from router.types.protobuf import Envelope
 
 MOST_SOCKETS = 256
-
-_RATE = re.compile(r"([0-9]*\.?[0-9]+)x?")
 
 
 class TapRecording:
@@ -136,7 +133,7 @@ class Replayer:
         try:
             self.resent.refused += udp.send_once(sender, found.data)
         except OSError as error:
-            raise TransportError(f"cannot send to {Address(*sender.getpeername())}: {error.strerror}") from error
+            raise udp.cannot_send(Address(*sender.getpeername()), error) from error
         self.resent.datagrams += 1
 
     def close(self) -> None:
@@ -149,11 +146,10 @@ class Replayer:
     def _open(self, found: Recorded) -> socket.socket:
         to, sender = self._destination(found.listener), self._bound(found)
         try:
-            sender.setblocking(True)
-            sender.connect(to)
-        except OSError as error:
+            udp.connect(sender, to)
+        except TransportError:
             sender.close()
-            raise TransportError(f"cannot send to {to}: {error.strerror}") from error
+            raise
         return sender
 
     def _destination(self, listener: str) -> Address:

@@ -104,8 +104,10 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
 
 
 def _not_a_place(text: str, table: RouteTable | None, form: str) -> UsageError:
-    names = () if table is None else (*table.endpoints, *table.listeners)
-    return UsageError(f"'{text}' is neither {form} nor a name of the route table", did_you_mean(text, names))
+    if table is None:
+        return UsageError(f"'{text}' is not {form}")
+    hint = did_you_mean(text, (*table.endpoints, *table.listeners))
+    return UsageError(f"'{text}' is neither {form} nor a name of the route table", hint)
 
 
 def _resolve(host: str) -> str:
@@ -118,7 +120,7 @@ def _resolve(host: str) -> str:
 
 def _port(text: str, lowest: int) -> int:
     if not text.isdigit() or not lowest <= int(text) <= 65535:
-        raise UsageError(f"'{text}' is not a UDP port", f"ports are {lowest} to 65535")
+        raise UsageError(f"'{text}' is not a port", f"ports are {lowest} to 65535")
     return int(text)
 
 
@@ -155,19 +157,31 @@ def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rat
 
     The caller owns `sent` and has it after an interrupt, too. Raises TransportError.
     """
+    connect(sender, to)
     try:
-        sender.setblocking(True)
-        sender.connect(to)
         for elapsed in paced(count, rate):
             sent.refused += send_once(sender, data)
             sent.count += 1
             sent.seconds = elapsed
     except OSError as error:
-        is_away = error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH)
-        remedy = "is it switched on, and this computer in its network?" if is_away else ""
-        raise TransportError(f"cannot send to {to}: {error.strerror}", remedy) from error
+        raise cannot_send(to, error) from error
     if sender.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
         sent.refused += 1
+
+
+def connect(sender: socket.socket, to: Address) -> None:
+    """Connect a socket of `open_udp`, which blocks from then on. Raises TransportError."""
+    try:
+        sender.setblocking(True)
+        sender.connect(to)
+    except OSError as error:
+        raise cannot_send(to, error) from error
+
+
+def cannot_send(to: Address, error: OSError) -> TransportError:
+    is_away = error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH)
+    remedy = "is it switched on, and this computer in its network?" if is_away else ""
+    return TransportError(f"cannot send to {to}: {error.strerror}", remedy)
 
 
 def send_once(sender: socket.socket, data: bytes) -> int:
