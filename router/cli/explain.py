@@ -10,17 +10,26 @@ from router.cli.tool_options import add_for, add_table, good_table, table_path
 from router.compiler.checked import CheckedRoute
 from router.compiler.lookup import Definitions
 from router.errors import UsageError, did_you_mean
-from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
+from router.tools.explain import (
+    diff,
+    explained_gateway,
+    explained_route,
+    ignored_gateway,
+    known_topics,
+    seen_topics,
+    tried_route,
+)
 from router.tools.listing import listed_route
 
 _DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
 mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
-with their places in the table. Of a gateway, show what it sends how often, and what it lets in: with a ~ in front each
-topic that its patterns match, of those that the table names, or with --live of all that there are. With --diff, say
-what one table does otherwise than another, and nothing else."""
+with their places in the table, and with --given what each target gets of one payload. Of a gateway, show what it sends
+how often, and what it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or
+with --live of all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
+    "router explain imu_info --given accel_x=1.5 state=SENSOR_OPERATING",
     "router explain dashboard --live",
     "router explain --diff routes/legacy.yaml routes/rover.yaml",
 )
@@ -37,6 +46,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
     )
     parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
+    given = "show what each target gets of a payload with these fields, from the route's first source"
+    parser.add_argument("--given", nargs="*", metavar="FIELD=VALUE", help=given)
     parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
     add_for(parser, f"look for them for so long, as 5s (default: {_LIVE:g}s)")
 
@@ -44,7 +55,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.live:
         raise UsageError("--for belongs to --live")
-    if args.diff is not None and (args.names or args.table or args.code or args.live):
+    if args.diff is not None and (args.names or args.table or args.code or args.live or args.given is not None):
         raise UsageError("--diff compares its two tables, whole; nothing else goes with it")
     return _diff(*args.diff) if args.diff is not None else _explain(args)
 
@@ -61,11 +72,14 @@ def _explain(args: argparse.Namespace) -> int:
     for name in args.names:
         if name not in known:
             raise UsageError(f"{path} has no route or gateway '{name}'", did_you_mean(name, known))
+    if args.given is not None and (len(args.names) != 1 or args.names[0] not in routes):
+        raise UsageError("--given takes the fields of one payload case", "name it: router explain CASE --given x=1")
     topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
             code = listed_route(route, program) if args.code else ()
-            print(*explained_route(route, checked), *code, sep="\n", end="\n\n")
+            given = () if args.given is None else tried_route(route, program, args.given)
+            print(*explained_route(route, checked), *code, *given, sep="\n", end="\n\n")
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:

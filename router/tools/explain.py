@@ -14,11 +14,15 @@ from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.program import GatewayPlan, InboundPlan
+from router.compiler.program import GatewayPlan, InboundPlan, Program
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
-from router.errors import StartError, plural, shown_path
+from router.datagrams import Wire
+from router.errors import StartError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
+from router.rehearsal.cdr import deserialize
+from router.rehearsal.fields import shown
+from router.rehearsal.rehearsal import Collected, Dropped, Filtered, Published, Rehearsal, Sent
 from router.ros.environment import check_environment, ros_remedy
 from router.table.keys import flat, phrases
 from router.table.model import (
@@ -37,9 +41,11 @@ from router.table.model import (
     ZenohSettings,
 )
 from router.table.units import duration
+from router.tools.udp import LOOPBACK, origin
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.boards import framed_size
 from router.types.protobuf import PayloadCase
+from router.values import payload
 
 _WIDEST_CELL = 48
 
@@ -74,6 +80,37 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
         for served in feed.targets:
             yield ""
             yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
+
+
+def tried_route(checked: CheckedRoute, program: Program, words: Sequence[str]) -> Iterator[str]:
+    """What becomes of one payload with these `field=value` words from the first source, on a router that just started.
+
+    Raises UsageError for a route that takes no datagrams, and for words that do not fit.
+    """
+    route, case, wire, table = checked.route, checked.case, Wire(program.envelope), program.table
+    if not route.sources:
+        raise UsageError(f"{route.name} takes no datagrams, of which one could be given")
+    message, source = payload(case, words), route.sources[0].value
+    endpoint = table.endpoints.get(source)
+    listener = endpoint.listener.value if endpoint and endpoint.listener else next(iter(table.listeners))
+    rehearsal = Rehearsal(program)
+    rehearsal.datagram(listener, origin(source if endpoint else LOOPBACK, table), wire.encode(case, message))
+    types = {served.label: served.type for served in checked.targets}
+    yield ""
+    yield f"  given {shown(case.type, message)} from {source}:"
+    for event in rehearsal.events:
+        match event:
+            case Sent(target=target, data=data):
+                sent = wire.decode(data)
+                yield f"    {target} gets {sent.case.name} {shown(sent.case.type, sent.message)}"
+            case Published(target=target, data=data) if (kind := types[target]) is not None:
+                yield f"    {target} gets {shown(kind, deserialize(kind, data))}"
+            case Dropped(target=target, reason=reason, detail=detail):
+                yield f"    {target} gets nothing: {reason}{f', {detail}' if detail else ''}"
+            case Filtered(target=target):
+                yield f"    {target} gets nothing: `when` withholds it"
+            case Collected(target=target):
+                yield f"    {target} waits for the rest of the frame"
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
