@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import queue
 from collections.abc import Sequence
 
 import zenoh
 
-from router.compiler.zenoh_config import is_default, library_config, reason
-from router.errors import TransportError, UsageError
+from router.compiler.zenoh_config import library_config, reason
+from router.errors import StartError, TransportError, UsageError
+from router.gateway.transport.zenoh_session import session_config
 from router.table.model import ZenohSettings
 from router.tools.gateway_sources import Arrival, Say
 
@@ -77,19 +77,14 @@ def _arrival(sample: zenoh.Sample) -> Arrival:
 
 
 def _session(settings: ZenohSettings) -> zenoh.Session:
-    """Open a session; without `connect` and `listen`, Zenoh discovers others by multicast."""
+    """Open a session as gateways do; without `connect` and `listen`, Zenoh discovers others by multicast."""
     try:
-        config = library_config(settings.config)
-        if settings.config is None:
-            config.insert_json5("mode", json.dumps(settings.mode))
-            config.insert_json5("connect/endpoints", json.dumps(settings.connect))
-            config.insert_json5("listen/endpoints", json.dumps(settings.listen))
-        names_locators = not (is_default(config, "connect/endpoints") and is_default(config, "listen/endpoints"))
-        if names_locators and is_default(config, "scouting/multicast/enabled"):
-            config.insert_json5("scouting/multicast/enabled", "false")
+        config = session_config(settings) if settings.config is None else library_config(settings.config)
+    except StartError as error:
+        raise UsageError(f"zenoh: {error}") from error
     except zenoh.ZError as error:
-        where = f"{settings.config.path}: {reason(error)}" if settings.config else error
-        raise UsageError(f"zenoh: {where}") from None  # the library's error may quote passwords
+        where = settings.config.path if settings.config is not None else None
+        raise UsageError(f"zenoh: {where}: {reason(error)}") from None  # the library's error may quote passwords
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
