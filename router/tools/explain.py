@@ -89,7 +89,7 @@ def tried_route(checked: CheckedRoute, program: Program, words: Sequence[str]) -
     """
     route, case, wire, table = checked.route, checked.case, Wire(program.envelope), program.table
     if not route.sources:
-        raise UsageError(f"{route.name} takes no datagrams, of which one could be given")
+        raise UsageError(f"{route.name} has no 'source'", "--given is for routes that take datagrams")
     message, source = payload(case, words), route.sources[0].value
     endpoint = table.endpoints.get(source)
     listener = endpoint.listener.value if endpoint and endpoint.listener else next(iter(table.listeners))
