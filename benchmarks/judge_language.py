@@ -1,4 +1,4 @@
-"""Random mappings and conditions by the million, on random messages: a plane gives what the oracle gives.
+"""Random mappings and conditions by the million, on random messages: the carrier gives what the oracle gives.
 
     python -m benchmarks.judge_language --count 1000000 --seed 1
 
@@ -13,7 +13,6 @@ import random
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -21,7 +20,7 @@ from tempfile import mkdtemp
 from router.carrier.build import build
 from tests.carrier.answering import carrier_plane
 from tests.carrier.delivering import delivering
-from tests.compiler.judging import Misfit, Plane, disagreement, is_about_values, python_plane, question
+from tests.compiler.judging import Misfit, Plane, disagreement, is_about_values, question
 from tests.compiler.language import some_language
 
 
@@ -31,7 +30,6 @@ def carrier() -> Plane:
     return carrier_plane(delivering(folder / "delivering.so", build(folder / "libcarrier.so"), is_sanitized=False))
 
 
-PLANES: dict[str, Callable[[], Plane]] = {"python": lambda: python_plane, "carrier": carrier}
 MESSAGES = 10
 """Of each mapping."""
 
@@ -41,7 +39,6 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--wild", action="store_true", help="expressions that are not well-typed as well")
-    parser.add_argument("--plane", choices=PLANES, default="python")
     parser.add_argument("--stop", type=int, default=20, help="end after so many kinds of problems")
     arguments = parser.parse_args()
     outcomes: Counter[str] = Counter()
@@ -50,7 +47,7 @@ def main() -> int:
         noise = random.Random(f"{arguments.seed} {number}")
         asked = question(noise, some_language(noise, is_wild=arguments.wild))
         try:
-            found = disagreement(asked, PLANES[arguments.plane](), noise)
+            found = disagreement(asked, carrier(), noise)
             outcomes["judged" if found is None else "disagreed"] += 1
             if found is not None:
                 _keep(problems, f"disagreement {number}", found)

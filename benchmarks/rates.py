@@ -25,7 +25,7 @@ from pathlib import Path
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS
 from tests.acceptance.site import ROOT, RouterProcess, site
-from tests.oracles.python_engine.pacing import BURST
+from tests.oracles.held_back import BURST
 
 NS = 1_000_000_000
 INPUT_HERTZ = (20, 29, 31, 45, 100, 500, 2000)

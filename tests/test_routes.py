@@ -10,14 +10,14 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.rehearsal.rehearsal import Dropped, Published, Rehearsal
 from router.table.model import Route, RouteTable, Transport
-from tests.oracles.python_engine.rig import Rig
+from tests.small_tables import SENSOR_BOARD
 from tests.tables import ROUTES
 
 Publish = Callable[..., dict[str, bytes]]
 EPHEMERAL = 32_768
 """From this port on, Linux hands them out by itself."""
-WALL_NS = 1_700_000_000_123_456_789
 
 # As the system's list of payload cases has it: H a hardware board, R ROS on the rover, B the basestation.
 DIRECTIONS = """
@@ -161,12 +161,11 @@ def published(rover: Program) -> Publish:
     """A function that routes one payload and gives what was published, CDR bytes by topic."""
 
     def route(case: str, **values: object) -> dict[str, bytes]:
-        rig = Rig(rover)
-        rig.now = WALL_NS - Rig.WALL
+        rehearsal = Rehearsal(rover)
         envelope = rover.envelope.message_class(**{case: values})
-        rig.receive(envelope.SerializeToString(), listener="rover")
-        assert rig.reports == []
-        return dict(rig.published)
+        rehearsal.datagram("rover", SENSOR_BOARD, envelope.SerializeToString())
+        assert not any(isinstance(event, Dropped) for event in rehearsal.events)
+        return {event.target: event.data for event in rehearsal.events if isinstance(event, Published)}
 
     return route
 

@@ -115,6 +115,7 @@ class Delivering:
             collect = native_collect(lowered.collect, routines, range(1 + len(others)))
             collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
+            self._arrays.append(collector)
         self._targets.layout = routines.layout()
         if self._route is not None:
             self._route.targets = self._targets

@@ -19,8 +19,8 @@ from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
-from tests.oracles.python_engine.rig import Rig
-from tests.small_tables import Ledger, program
+from tests.carrier.staged import START, Staged
+from tests.small_tables import program
 
 ROUTES = """\
   drive_motor:
@@ -132,31 +132,28 @@ def of(datagram: bytes) -> float:
     return distance
 
 
-# ---- against the engine in Python
+# ---- beside the stage
 
 Messages = Mapping[str, list[tuple[Callable[[int], bytes], int]]]
 """By topic: messages made with the wall clock, and how long ago (ns) they were sent."""
 
 
 def compare(commanding: Commanding, messages: Messages) -> None:
-    """Both engines serve the messages: the same counts and the same datagrams."""
-    rig = Rig(commanding.program)
-    rig.now = SECOND * 1000
+    """The threads count and send what the stage does."""
+    staged = Staged(commanding.program)
     for topic, sent in messages.items():
         for make, age in sent:
             now = wall_ns()
             commanding.subscriptions[topic].put(make(now), now - age)
-            rig.arrived_before = age
-            rig.take(topic, make(rig.WALL + rig.now))
-            last = Ledger(commanding.program, rig.counts).total("messages_received")
+            staged.stage.message(topic, make(START), START - age)
+            last = staged.ledger().total("messages_received")
         wait_until(lambda: commanding.ledger().total("messages_received") == last)  # noqa: B023 - at once
     counted = ("messages_", "datagrams_", "sent_")
-    assert commanding.ledger().counted(*counted) == rig.counted(*counted)
+    assert commanding.ledger().counted(*counted) == staged.ledger().counted(*counted)
     for endpoint, board in commanding.boards.items():
-        assert board.received() == [datagram for name, datagram in rig.sent if name == endpoint]
+        assert board.received() == staged.to(endpoint)
     assert list(commanding.ledger().imbalances()) == []
-    losses = [(route, target) for route, target, *_ in commanding.losses()]
-    assert losses == [(report.place, report.target) for report in rig.reports]
+    assert [(route, target) for route, target, *_ in commanding.losses()] == staged.losses
     topics_of: dict[str, set[str]] = {}
     for topic, plans in commanding.program.outbound.items():
         for plan in plans:
@@ -173,7 +170,7 @@ def compare(commanding: Commanding, messages: Messages) -> None:
         assert abs(wall_ns() - last) < 60 * SECOND if timed else last == 0
 
 
-def test_messages_come_to_what_they_come_to_in_python(opened: Open) -> None:
+def test_messages_come_to_what_they_come_to_on_the_stage(opened: Open) -> None:
     compare(
         opened(),
         {

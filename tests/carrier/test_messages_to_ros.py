@@ -1,4 +1,4 @@
-"""From payloads to messages of topics: the carrier gives the bytes of the generated handlers, or refuses as they do."""
+"""From payloads to messages of topics: the carrier gives the bytes of the oracle, or refuses where it does."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import random
 import struct
 from collections.abc import Callable
 from ctypes import CDLL
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,23 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler import check_table
-from router.compiler.lookup import Definitions
-from router.compiler.program import Program, RoutePlan
+from router.compiler import Checked, check_table
+from router.compiler.checked import CheckedRoute
+from router.compiler.lookup import Definitions, nested_types
+from router.compiler.program import Program
+from router.rehearsal.cdr import deserialize
+from router.rehearsal.cdr import serialize as cdr
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
-from tests.carrier.delivering import FILTERED, Delivering
-from tests.carrier.messages import payloads, some_payloads
-from tests.carrier.planes import MAPPING_ERROR, Misfit, to_ros
-from tests.compiler.comparing import same as same_value
-from tests.compiler.compiling import AUTO, RECEIVED_AT, SOURCE, Published, chosen, field_map
+from tests.carrier.delivering import Delivering
+from tests.carrier.mappings import to_ros
+from tests.carrier.messages import payloads
+from tests.compiler.compiling import AUTO, RECEIVED_AT, SOURCE, chosen, context_of, field_map
 from tests.compiler.generated_types import EACH_TYPE, defaults
-from tests.compiler.payloads import Wire, made_wire, wire_of
+from tests.compiler.judging import Misfit, published, verdict
+from tests.compiler.payloads import Wire, made_wire, rover_wire, wire_of
+from tests.oracles.reference_kinds import MAPPING_ERROR
 from tests.tables import ROUTES
 
 MANY = settings(max_examples=6 * settings().max_examples, suppress_health_check=list(HealthCheck))
@@ -49,78 +53,48 @@ def target_of(**fields: Type) -> MessageType:
 
 
 @pytest.fixture(scope="module", params=["rover", "legacy", "own"])
-def program(request: pytest.FixtureRequest, definitions: Definitions) -> Program:
+def checked(request: pytest.FixtureRequest, definitions: Definitions) -> Checked:
     folder = BENCHMARKS if request.param == "own" else ROUTES
-    made = check_table(folder / f"{request.param}.yaml", {}, definitions).program
-    assert made is not None
-    return made
+    return check_table(folder / f"{request.param}.yaml", {}, definitions)
 
 
-def test_topics_of_tables_get_the_same_messages(delivering: CDLL, program: Program) -> None:
-    carried = 0
-    for number, handlers in program.inbound.items():
-        for handler in handlers:
-            if handler.route in program.lowered.to_topics:
-                _assert_same(delivering, program, number, handler)
-                carried += len(program.lowered.to_topics[handler.route].targets)
-    assert carried == sum(target.is_topic for handler in program.routes for target in handler.targets)
-    assert carried > 0
+def test_topics_of_tables_get_what_the_oracle_makes(delivering: CDLL, checked: Checked) -> None:
+    assert checked.program is not None
+    routes = [route for route in checked.routes if any(target.topic for target in route.targets)]
+    assert routes
+    for route in routes:
+        _assert_allowed(delivering, checked.program, route)
 
 
-def _assert_same(library: CDLL, program: Program, number: int, handler: RoutePlan) -> None:
-    serve = Published(program, handler)
-    carrier = Delivering(library, program.lowered.to_topics[handler.route], RECEIVED_AT, SOURCE)
-    parse = handler.case.message_class.FromString
+def _assert_allowed(library: CDLL, program: Program, route: CheckedRoute) -> None:
+    lowered, case, envelope = program.lowered.to_topics[route.route.name], route.case, program.envelope
+    topics = [target for target in route.targets if target.topic]
+    assert lowered.targets.keys() == {topic.label for topic in topics}
+    carrier, enums = Delivering(library, lowered, RECEIVED_AT, SOURCE), rover_wire()[0].enums.values()
 
-    def in_python(message: Any) -> dict[str, bytes | str]:
-        published = serve(message)
-        refused = {report.target: report.reason for report in serve.reports}
-        return {topic: published.get(topic) or refused.get(topic, FILTERED) for topic in carried}
-
-    def by_carrier(data: bytes, *, is_single: bool) -> dict[str, bytes | str]:
-        return {outcome.label: outcome.got for outcome in carrier.datagram(data, is_single=is_single)}
-
-    carried = program.lowered.to_topics[handler.route].targets
+    def check(data: bytes, message: Any, *, is_single: bool) -> None:
+        got = {outcome.label: outcome.got for outcome in carrier.datagram(data, is_single=is_single)}
+        for topic in topics:
+            assert topic.type is not None
+            assert topic.declared.fields is not None
+            context = context_of(message, case.type, [*enums], [*nested_types(topic.type)])
+            make = partial(published, topic.type, topic.declared.fields, context)
+            assert verdict(make, topic.declared.when, context).allows(got[topic.label])
 
     @EACH_TYPE
-    @given(payloads(handler.case), st.randoms())
-    def same(made: list[bytes], noise: random.Random) -> None:
+    @given(payloads(case), st.randoms())
+    def allowed(made: list[bytes], noise: random.Random) -> None:
         for payload in made:
-            expected = in_python(parse(payload))
-            assert by_carrier(payload, is_single=True) == expected
-            parts = [delimited(number, payload), delimited(number, noise.choice(made)), delimited(30, b"unknown")]
-            parts.append(delimited(noise.choice([*program.inbound]), b""))
+            check(payload, case.message_class.FromString(payload), is_single=True)
+            parts = [delimited(case.number, payload), delimited(case.number, noise.choice(made))]
+            parts += [delimited(30, b"unknown"), delimited(noise.choice([*program.inbound]), b"")]
             noise.shuffle(parts)
-            envelope = b"".join(parts)
-            parsed = program.envelope.message_class.FromString(envelope)
-            if parsed.WhichOneof(program.envelope.oneof) != handler.case.name:
-                continue
-            expected = in_python(getattr(parsed, handler.case.name))
-            assert by_carrier(envelope, is_single=False) == expected
+            whole = b"".join(parts)
+            parsed: Any = envelope.message_class.FromString(whole)
+            if parsed.WhichOneof(envelope.oneof) == case.name:
+                check(whole, getattr(parsed, case.name), is_single=False)
 
-    same()
-
-
-def test_rclpy_reads_of_them_what_it_reads_of_those_of_python(delivering: CDLL, definitions: Definitions) -> None:
-    pytest.importorskip("rclpy")
-    from tests.compiler.ros_objects import deserialized
-
-    checked = check_table(ROUTES / "rover.yaml", {}, definitions)
-    made = checked.program
-    assert made is not None
-    types = {target.label: target.type.name for route in checked.routes for target in route.targets if target.type}
-    for handlers in made.inbound.values():
-        for handler in handlers:
-            if handler.route not in made.lowered.to_topics:
-                continue
-            carrier = Delivering(delivering, made.lowered.to_topics[handler.route], RECEIVED_AT, SOURCE)
-            serve = Published(made, handler)
-            for payload in some_payloads(handler.case, seed=handler.case.number):
-                carried = {outcome.label: outcome.got for outcome in carrier.datagram(payload, is_single=True)}
-                for topic, expected in serve(handler.case.message_class.FromString(payload)).items():
-                    message = carried[topic]
-                    assert isinstance(message, bytes)
-                    assert same_value(deserialized(types[topic], message), deserialized(types[topic], expected))
+    allowed()
 
 
 # ---- random mappings
@@ -178,7 +152,7 @@ HARD = ["tree", "texts", "scalars", "old", "far"]
 
 @MANY
 @given(st.sampled_from([*((made_wire, case) for case in MADE), *((hard_wire, case) for case in HARD)]), st.data())
-def test_random_mappings_make_the_same_messages(
+def test_random_mappings_make_the_messages_of_the_oracle(
     delivering: CDLL, declared: tuple[Callable[[], Wire], str], data: st.DataObject
 ) -> None:
     wire = declared[0]()
@@ -186,14 +160,13 @@ def test_random_mappings_make_the_same_messages(
     target = data.draw(targets(case.type))
     assert isinstance(target, MessageType)
     try:
-        python, carrier = to_ros(delivering, wire, case, AUTO, target)
+        mapping = to_ros(delivering, wire, case, AUTO, target)
     except Misfit:
         event("nothing in common")
         return
     for payload in data.draw(payloads(case)):
-        expected = python(payload)
-        event(str(*expected) if isinstance(expected[0], str) else "published")
-        assert carrier(payload) == expected
+        (made,) = mapping.check(payload)
+        event(made if isinstance(made, str) else "published")
 
 
 # ---- what is lowered
@@ -253,18 +226,18 @@ LOWERED += [(SCALARS, field_map(it=f"float64({text})"), target_of(it=F64)) for t
 
 
 @pytest.mark.parametrize(("case", "fields", "target"), LOWERED)
-def test_what_is_lowered_makes_the_same_messages(
+def test_what_is_lowered_makes_the_messages_of_the_oracle(
     delivering: CDLL, case: str, fields: FieldMap, target: MessageType
 ) -> None:
     wire = made_wire()
     declared = wire[1].cases[case]
-    python, carrier = to_ros(delivering, wire, declared, fields, target, ros_types=(KINDS,))
+    mapping = to_ros(delivering, wire, declared, fields, target, ros_types=(KINDS,))
 
     @EACH_TYPE
     @given(payloads(declared))
     def same(made: list[bytes]) -> None:
         for payload in made:
-            assert carrier(payload) == python(payload)
+            mapping.check(payload)
 
     same()
 
@@ -273,21 +246,26 @@ def test_what_is_lowered_makes_the_same_messages(
 
 
 @pytest.mark.parametrize(
-    ("case", "it", "target"),
+    ("it", "target", "made"),
     [
-        ("scalars", " if flag else ".join(["i32"] * 50), I32),
-        ("scalars", "min(" + ", ".join(["i32"] * 1000) + ")", I32),
-        ("scalars", "max(" + ", ".join(["i32 // 2"] * 17_000) + ")", I32),
-        ("scalars", "[" + ", ".join(["i32"] * 1000) + "] if flag else [" + ", ".join(["2"] * 300) + "]", List(I32)),
-        ("many", "many[0]." * 20 + "numbers[0]", I32),
+        (" if flag else ".join(["i32"] * 50), I32, 7),
+        ("min(" + ", ".join(["i32"] * 1000) + ")", I32, 7),
+        ("max(" + ", ".join(["i32 // 2"] * 17_000) + ")", I32, 3),
+        ("[" + ", ".join(["i32"] * 1000) + "] if flag else [" + ", ".join(["2"] * 300) + "]", List(I32), [2] * 300),
     ],
 )
-def test_large_expressions_are_lowered(delivering: CDLL, case: str, it: str, target: Type) -> None:
+def test_large_expressions_are_lowered(delivering: CDLL, it: str, target: Type, made: object) -> None:
     wire = made_wire()
-    declared = wire[1].cases[case]
-    python, carrier = to_ros(delivering, wire, declared, field_map(it=it), target_of(it=target))
-    for payload in (b"", declared.message_class(**({"i32": 7} if case == "scalars" else {})).SerializeToString()):
-        assert carrier(payload) == python(payload)
+    case = wire[1].cases["scalars"]
+    mapping = to_ros(delivering, wire, case, field_map(it=it), target_of(it=target))
+    assert mapping.carrier(case.message_class(i32=7).SerializeToString()) == [cdr(target_of(it=target), {"it": made})]
+
+
+def test_a_long_path_is_lowered(delivering: CDLL) -> None:
+    wire = made_wire()
+    fields = field_map(it="many[0]." * 20 + "numbers[0]")
+    mapping = to_ros(delivering, wire, wire[1].cases["many"], fields, target_of(it=I32))
+    assert mapping.check(b"") == [MAPPING_ERROR]
 
 
 @pytest.mark.parametrize("text", [b"", b"a", b"\xff", b"\xed\xa0\x80", "é".encode()])
@@ -301,10 +279,9 @@ def test_text_that_protobuf_does_not_check_is_checked_where_it_is_used(
 ) -> None:
     wire = hard_wire()
     case = wire[1].cases["old"]
-    python, carrier = to_ros(delivering, wire, case, field_map(it=it), target_of(it=declared))
+    mapping = to_ros(delivering, wire, case, field_map(it=it), target_of(it=declared))
     payload = delimited(7, text) + delimited(8, b"first") + delimited(8, text)
-    assert carrier(payload) == python(payload)
-    assert (carrier(payload) == [MAPPING_ERROR]) == (text[:1] in (b"\xff", b"\xed") and it != "needed")
+    assert (mapping.check(payload) == [MAPPING_ERROR]) == (text[:1] in (b"\xff", b"\xed") and it != "needed")
 
 
 def test_hypot_differs_by_the_last_bit_at_most(delivering: CDLL) -> None:
@@ -312,16 +289,16 @@ def test_hypot_differs_by_the_last_bit_at_most(delivering: CDLL) -> None:
     wire = made_wire()
     declared = wire[1].cases["scalars"]
     fields, target = field_map(it="hypot(real, single)"), target_of(it=F64)
-    python, carrier = to_ros(delivering, wire, declared, fields, target)
+    mapping = to_ros(delivering, wire, declared, fields, target)
 
     @EACH_TYPE
     @given(payloads(declared))
     def same(made: list[bytes]) -> None:
         for payload in made:
-            ((found,), (expected,)) = carrier(payload), python(payload)
+            (found,), (expected,) = mapping.carrier(payload), mapping.oracle(payload)
             assert isinstance(found, bytes)
-            assert isinstance(expected, bytes)
-            (bits,), (others,) = struct.unpack_from("<q", found, 4), struct.unpack_from("<q", expected, 4)
+            assert expected.message is not None
+            (bits,), (others,) = struct.unpack_from("<q", found, 4), struct.unpack_from("<q", expected.message, 4)
             assert abs(bits - others) <= 1
 
     same()
@@ -333,11 +310,13 @@ def test_elements_are_read_as_often_as_they_are_used(delivering: CDLL) -> None:
     declared = wire[1].cases["many"]
     fields = {f"n{index}": f"many[0].numbers[{index}]" for index in range(40)}
     target = target_of(many=List(NESTED), again=List(NESTED), **dict.fromkeys(fields, I32))
-    python, carrier = to_ros(delivering, wire, declared, field_map(again="many", many="many", **fields), target)
-    payload = declared.message_class(many=[{"numbers": range(100)}, {"numbers": [1] * 15_000}]).SerializeToString()
-    for made in (payload, declared.message_class(many=[{"numbers": [2] * 16_000}]).SerializeToString()):
-        assert carrier(made) == python(made)
-        assert isinstance(python(made)[0], bytes)
+    mapping = to_ros(delivering, wire, declared, field_map(again="many", many="many", **fields), target)
+    for numbers in ([*range(100)], [2] * 16_000):
+        (made,) = mapping.carrier(declared.message_class(many=[{"numbers": numbers}]).SerializeToString())
+        assert isinstance(made, bytes)
+        message = deserialize(target, made)
+        assert [getattr(message, name) for name in fields] == numbers[:40]
+        assert message.again[0].numbers == message.many[0].numbers == numbers
 
 
 def test_long_texts_are_joined_or_refused(delivering: CDLL) -> None:
@@ -347,7 +326,7 @@ def test_long_texts_are_joined_or_refused(delivering: CDLL) -> None:
         field_map(it=" + ".join(["text"] * 10), short="text + text"),
         target_of(it=String(), short=String(9)),
     )
-    python, carrier = to_ros(delivering, wire, declared, fields, target)
+    mapping = to_ros(delivering, wire, declared, fields, target)
     for size in (0, 4, 5, 16_000):
         payload = declared.message_class(text="ä" * (size // 2) + "x" * (size % 2)).SerializeToString()
-        assert carrier(payload) == python(payload)
+        mapping.check(payload)

@@ -1,4 +1,4 @@
-"""The compiler's real path in small: one expression, one mapping, one handler, ready to be called."""
+"""The compiler's real path in small: one expression, one mapping, ready to be called."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from router.compiler.expressions.tree import Each as Computed
 from router.compiler.expressions.tree import Listed, Node, Variable
 from router.compiler.mapping import build
 from router.compiler.plan import Each, Items, Leaf, Record
-from router.compiler.program import Program, RoutePlan
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
@@ -30,9 +29,6 @@ from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.machine import FAILURES, machine
-from tests.oracles.python_engine.binding import bind
-from tests.oracles.python_engine.freshness import Born, Freshness
-from tests.oracles.python_engine.rig import Rig
 from tests.oracles.reference import fill
 from tests.oracles.reference_expressions import Context
 from tests.oracles.reference_kinds import View
@@ -40,8 +36,6 @@ from tests.oracles.reference_kinds import View
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
 RECEIVED_AT = 1_700_000_000_123_456_789
 SOURCE = "sensor_board"
-
-Handle = Callable[[Any, bytes, int, int, str], None]
 
 
 def written(text: str) -> Expression:
@@ -149,25 +143,3 @@ def outcome(make: Callable[[], Any]) -> Any:
         return make()
     except FAILURES:
         return FAILURES
-
-
-DATAGRAM = b"\x18\x01"
-"""What stands for the datagram of any message: an envelope with a field that nobody knows."""
-
-
-class Published:
-    """A handler of a program, whose targets are those of a rig: `reports` has its losses, `sent` what it sends."""
-
-    def __init__(self, program: Program, handler: RoutePlan) -> None:
-        rig = Rig(program)
-        self.topics = {target.label for target in handler.targets if target.is_topic}
-        self.reports, self.sent, self._published = rig.reports, rig.sent, rig.published
-        self._is_aged = handler.ttl is not None
-        self._handle = bind(program, handler, rig.context, Freshness())
-
-    def __call__(self, message: Any) -> dict[str, bytes]:
-        """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""
-        for made in (self.reports, self.sent, self._published):
-            made.clear()
-        self._handle(message, DATAGRAM, RECEIVED_AT, 1, SOURCE, *((Born(1, 1),) if self._is_aged else ()))
-        return dict(self._published)

@@ -15,30 +15,28 @@ from typing import Any, NamedTuple, Union
 
 from google.protobuf.message import DecodeError
 
-from router.compiler.cdr import CdrReads, write_message
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import UINT32, BoolKind, Kind, ListKind, MessageKind, element_of
 from router.compiler.expressions.lists import as_value
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable, paths_in
+from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
 from router.compiler.mapping import build
-from router.compiler.namespace import MAPPING_FAILURES, NAMESPACE
 from router.compiler.plan import Record, expressions
-from router.compiler.python import NO_VALUES, Values, render
-from router.compiler.source import Source
-from router.errors import Code, Diagnostic, NonFiniteError
+from router.errors import Code, Diagnostic
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.types.model import Enum, List, MessageType, Type
+from router.types.model import Enum, MessageType, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.messages import some_payloads
 from tests.compiler.comparing import same
-from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, written
+from tests.compiler.compiling import SPAN, context_of, written
 from tests.compiler.language import Language, as_written, language_wire, protobuf_fields, ros_message, ros_target
-from tests.oracles.python_engine.payload import write_envelope
+from tests.compiler.machine import FAILURES
+from tests.compiler.payloads import Wire
+from tests.compiler.reading import plain
 from tests.oracles.reference import fill, fill_given
 from tests.oracles.reference_expressions import Context, meaning_of
-from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Listing, Message, Refused, View, Whole
+from tests.oracles.reference_kinds import Listing, Message, Refused, View, Whole
 from tests.oracles.reference_protobuf import envelope_of
 
 FILTERED = "filtered"
@@ -207,11 +205,11 @@ def _numbered(payload: bytes, count: int, place: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What an answer may be: one message, or why there is none."""
+    """What an answer may be: one message, which `read` makes a tree of values, or why there is none."""
 
     message: bytes | None
-    reasons: frozenset[str]
-    declared: MessageType | None
+    reasons: frozenset[str] = frozenset()
+    read: Callable[[bytes], Any] | None = None
 
     def allows(self, answer: Answer) -> bool:
         if isinstance(answer, str):
@@ -224,12 +222,12 @@ class Verdict:
     def _is_same(self, answer: bytes) -> bool:
         """Whether it is equal but for the bits of a NaN, and for the entries of a map that others replace."""
         assert self.message is not None
-        if self.declared is None:
+        if self.read is None:
             return False
         try:
-            found, expected = _tree(answer, self.declared), _tree(self.message, self.declared)
-            return same(found, expected) and (len(answer) == len(self.message) or "pairs" in expected)
-        except (*MAPPING_FAILURES, DecodeError):
+            found, expected = self.read(answer), self.read(self.message)
+            return same(found, expected) and (len(answer) == len(self.message) or _has_map(expected))
+        except (*FAILURES, DecodeError):
             return False
 
 
@@ -250,7 +248,7 @@ def oracle(asked: Question) -> Callable[[Sent, View], list[Verdict]]:
         try:
             elements = meaning.give(context)
         except Refused as refused:
-            return [Verdict(None, refused.reasons, asked.target)]
+            return [Verdict(None, refused.reasons)]
         count = (len(elements), Whole(0, (1 << 32) - 1))
         return [
             _verdict(asked, message, replace(context, names={
@@ -262,26 +260,47 @@ def oracle(asked: Question) -> Callable[[Sent, View], list[Verdict]]:
 
 
 def _verdict(asked: Question, message: Sent, context: Context) -> Verdict:
-    schema, envelope = language_wire()
-    try:
-        if asked.when and not meaning_of(asked.when, context).give(context):
-            return Verdict(None, frozenset([FILTERED]), asked.target)
+    def make() -> Verdict:
         if asked.target is None:
             assert isinstance(message, bytes)
-            return Verdict(message, frozenset(), None)
+            return Verdict(message)
         if asked.language.is_ros:
-            payload = fill_given(asked.fields, asked.target, context)
-            return Verdict(envelope_of(schema, envelope, asked.case, payload), frozenset(), asked.target)
-        return Verdict(cdr(asked.target, fill(asked.fields, asked.target, context)), frozenset(), asked.target)
+            return sent(language_wire(), asked.case, asked.fields, context)
+        return published(asked.target, asked.fields, context)
+
+    return verdict(make, asked.when, context)
+
+
+def verdict(make: Callable[[], Verdict], when: Expression | None, context: Context) -> Verdict:
+    """What `make` returns, unless the condition filters or something refuses."""
+    try:
+        if when and not meaning_of(when, context).give(context):
+            return Verdict(None, frozenset([FILTERED]))
+        return make()
     except Refused as refused:
-        return Verdict(None, refused.reasons, asked.target)
+        return Verdict(None, refused.reasons)
 
 
-def _tree(message: bytes, declared: MessageType) -> Any:
-    if declared.name.startswith("made/"):
-        return _plain(deserialize(declared, message), declared)
-    payload: Any = language_wire()[1].message_class.FromString(message)
-    return _listed(payload.target)
+def published(target: MessageType, fields: FieldMap, context: Context) -> Verdict:
+    """The message of a topic."""
+    return Verdict(
+        cdr(target, fill(fields, target, context)), read=lambda data: plain(deserialize(target, data), target)
+    )
+
+
+def sent(wire: Wire, case: PayloadCase, fields: FieldMap, context: Context) -> Verdict:
+    """The envelope for an endpoint."""
+    message = envelope_of(*wire, case, fill_given(fields, case.type, context))
+    return Verdict(message, read=lambda data: _listed(wire[1].message_class.FromString(data)))
+
+
+class _Map(dict[Any, Any]):
+    """A map of protobuf."""
+
+
+def _has_map(tree: Any) -> bool:
+    inner = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    return isinstance(tree, _Map) or any(map(_has_map, inner))
 
 
 def _listed(value: Any) -> Any:
@@ -289,85 +308,8 @@ def _listed(value: Any) -> Any:
     if hasattr(value, "ListFields"):
         return {field.name: _listed(inner) for field, inner in value.ListFields()}
     if hasattr(value, "items"):
-        return dict(value)
+        return _Map({key: _listed(inner) for key, inner in value.items()})
     return [*map(_listed, value)] if hasattr(value, "append") else value
-
-
-def _plain(value: Any, declared: Type) -> Any:
-    match declared:
-        case MessageType():
-            return {field.name: _plain(getattr(value, field.name), field.type) for field in declared.fields}
-        case List():
-            return [_plain(each, declared.element) for each in value]
-        case _:
-            return value
-
-
-# ---- the Python plane
-
-
-def python_plane(asked: Question) -> Callable[[bytes], list[Answer]]:
-    checked, is_ros = asked.checked(), asked.language.is_ros
-    functions = _functions(asked, checked)
-    parse = language_wire()[1].cases["source"].message_class.FromString
-
-    def answer(*message: Any) -> Answer:
-        try:
-            made = functions["serve"](*message)
-        except MAPPING_FAILURES as error:
-            return _reason(error)
-        return FILTERED if made is None else bytes(made)
-
-    def answers(data: Any) -> list[Answer]:
-        if isinstance(data, tuple):
-            items = [parse(payload) for payload in data]
-            return [answer(items[0], SOURCE, RECEIVED_AT, None, 0, len(items), items)]
-        message = data if is_ros else parse(data), SOURCE, RECEIVED_AT
-        if asked.target is None:
-            return [data if answer(*message) == b"" else answer(*message)]
-        if checked.for_each is None:
-            return [answer(*message)]
-        try:
-            elements = [*functions["elements"](*message)]
-        except MAPPING_FAILURES as error:
-            return [_reason(error)]
-        return [answer(*message, element, index, len(elements)) for index, element in enumerate(elements)]
-
-    return answers
-
-
-def _functions(asked: Question, checked: Checked) -> dict[str, Any]:
-    """`elements` and `serve`, which return what a message gives."""
-    is_ros, out = asked.language.is_ros, Source()
-    given = f"{'cdr' if is_ros else 'm'}, source, received_at"
-    reads = CdrReads(asked.source, (path for node in checked.nodes() for path in paths_in(node))) if is_ros else None
-    values = reads.values if reads else NO_VALUES
-    with out.block(f"def elements({given}):", SPAN):
-        if reads is not None:
-            reads.write(out, SPAN)
-        out.line(f"return {out.expression(render(checked.for_each, values)) if checked.for_each else '[]'}", SPAN)
-    with out.block(f"def serve({given}, {ITEM}=None, {INDEX}=0, {COUNT}=0, {ITEMS}=()):", SPAN):
-        if reads is not None:
-            reads.write(out, SPAN)
-        if checked.condition is not None:
-            with out.block(f"if not {out.expression(render(checked.condition, values))}:", SPAN):
-                out.line("return None", SPAN)
-        out.line(f"return {_written(out, asked, checked.plan, values)}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return namespace
-
-
-def _written(out: Source, asked: Question, plan: Record | None, values: Values) -> str:
-    if plan is None:
-        return "b''"
-    return (
-        write_envelope(out, plan, asked.case, "it", values) if asked.language.is_ros else write_message(out, plan, "it")
-    )
-
-
-def _reason(error: BaseException) -> str:
-    return NON_FINITE if isinstance(error, NonFiniteError) else MAPPING_ERROR
 
 
 # ---- the judge

@@ -1,6 +1,5 @@
-"""The language of docs/reference/table.md: its examples, the oracle that was written from it, and the planes.
-
-`python -m benchmarks.judge_language` tries many more expressions than the tests here.
+"""The language of docs/reference/table.md: its examples, the oracle that was written from it, and the ranges that the
+compiler knows.
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, event, given, reject, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 
 from router.compiler.expressions import ExpressionError
 from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, Kind, StringKind
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.carrier.answering import carrier_plane
 from tests.compiler.comparing import same
 from tests.compiler.compiling import compiled, context_of, outcome, scope_of, written
 from tests.compiler.judging import (
@@ -29,14 +29,11 @@ from tests.compiler.judging import (
     Misfit,
     Question,
     disagreement,
-    is_about_values,
-    judged_findings,
     messages,
-    python_plane,
     question,
 )
 from tests.compiler.language import Language, language_wire, some_language
-from tests.compiler.machine import FAILURES
+from tests.compiler.machine import FAILURES, functions
 from tests.oracles.reference_expressions import Context, evaluate
 from tests.oracles.reference_kinds import MAPPING_ERROR, NON_FINITE, Refused
 
@@ -209,19 +206,10 @@ def test_of_two_reasons_each_may_be_given() -> None:
     assert refused.value.reasons == {MAPPING_ERROR, NON_FINITE}
 
 
-# ---- the planes
+# ---- the compiler and the judge
 
 noises = st.integers(0, (1 << 64) - 1).map(random.Random)
 """They do not shrink, but there can be many of them."""
-
-
-@MANY
-@given(noises)
-def test_mappings_give_in_python_what_the_oracle_gives(noise: random.Random) -> None:
-    asked = question(noise, some_language(noise))
-    findings = judged_findings(asked, python_plane, noise)
-    assert all(map(is_about_values, findings)), (str(asked), [*map(str, findings)])
-    event("refused" if findings else "judged")
 
 
 @MANY
@@ -257,16 +245,9 @@ def assert_of_kind(value: object, kind: Kind) -> None:
             raise TypeError(kind)
 
 
-@MANY
-@given(noises)
-def test_what_is_ill_typed_is_a_finding_and_the_rest_is_right(noise: random.Random) -> None:
-    for finding in judged_findings(question(noise, some_language(noise, is_wild=True)), python_plane, noise):
-        assert finding.span.line == 7
-
-
 def test_a_plane_that_is_wrong_by_one_bit_is_found() -> None:
     def wrong(asked: Question) -> Callable[[bytes], list[Answer]]:
-        serve = python_plane(asked)
+        serve = carrier_plane(functions())(asked)
 
         def answers(message: bytes) -> list[Answer]:
             return [

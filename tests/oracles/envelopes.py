@@ -40,7 +40,8 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     is_repaired = len(whole) != len(data)
     if name := parsed.WhichOneof(envelope.oneof):
         return Decision(None, envelope.cases[name].number, is_repaired)
-    unknown = [field.field_number for field in UnknownFieldSet(parsed)]
+    fields = UnknownFieldSet(parsed)
+    unknown = [fields[index].field_number for index in range(len(fields))]
     if not unknown:
         return Decision("no_payload", 0, is_repaired)
     cases = {case.number for case in envelope.cases.values()}

@@ -1,0 +1,35 @@
+"""The stage, beside which threads are compared: what it sends, publishes, counts and loses."""
+
+from __future__ import annotations
+
+from router.carrier.events import Told
+from router.carrier.library import library
+from router.carrier.rehearsal import Left, Stage
+from router.compiler.program import Program
+from tests.small_tables import Ledger
+
+START = 10**12
+
+
+class Staged:
+    """One run of a program. `left` is what it sent and published, `losses` the route and the target of each loss."""
+
+    def __init__(self, program: Program) -> None:
+        self.stage = Stage(library(), START)
+        self.stage.adopt(program)
+        self._program = program
+        self.left: list[tuple[str, bytes]] = []
+        self.losses: list[tuple[str, str]] = []
+
+    def ledger(self) -> Ledger:
+        """The counts by now."""
+        return Ledger(self._program, self.stage.counters(len(self._program.counters.fresh_counts())))
+
+    def to(self, target: str) -> list[bytes]:
+        """What was sent or published there."""
+        for record in self.stage.records():
+            if isinstance(record, Left):
+                self.left.append(record)
+            elif isinstance(record, Told):
+                self.losses.append((record.report.place, record.report.target))
+        return [data for name, data in self.left if name == target]
