@@ -180,6 +180,19 @@ class TableError(RouterError):
         super().__init__("\n".join(map(str, diagnostics)))
         self.diagnostics = tuple(diagnostics)
 
+    @classmethod
+    def of(cls, span: SourceSpan, code: Code, message: str, hint: str = "") -> TableError:
+        """The error with one finding."""
+        return cls([Diagnostic(span, code, message, hint)])
+
+
+class FindingError(RouterError):
+    """Ends the check of one part of a table with what is wrong in it."""
+
+    def __init__(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
+        self.diagnostic = Diagnostic(span, code, message, hint)
+        super().__init__(str(self.diagnostic))
+
 
 class OperatorError(RouterError):
     """What an operator can see to: `what` is one line that says what is wrong and why, `hint` what to do about it."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
+from router.compiler.program import DeadmanPlan
 from router.errors import SourceSpan
-from router.table.model import Deadman, Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
+from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -84,18 +85,6 @@ class CheckedCollect:
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedDeadman:
-    """The deadman of a route. `datagram` is the envelope that it sends, with its zeros.
-
-    `disarmed_by` are the names of routes, not the payload cases of the table.
-    """
-
-    settings: Deadman
-    datagram: bytes
-    disarmed_by: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class CheckedRoute:
     """A route whose payload case exists. If it has findings of severity error, no program is made of it.
 
@@ -107,4 +96,4 @@ class CheckedRoute:
     targets: tuple[CheckedTarget, ...] = ()
     subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
-    deadman: CheckedDeadman | None = None
+    deadman: DeadmanPlan | None = None

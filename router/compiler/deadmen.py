@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from router.compiler.checked import CheckedDeadman
 from router.compiler.constants import constant_envelope
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.lookup import Lookup
@@ -28,6 +27,7 @@ from router.table.model import (
 )
 from router.table.units import duration
 from router.types.board_limits import NON_FINITE
+from router.types.framing import trimmed
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -42,7 +42,7 @@ _NOTHING = MessageType("a deadman")
 """The source message of a deadman's payload: one without fields."""
 
 
-def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
+def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     """The deadman of a route, None if it has none or the payload is invalid."""
     deadman = route.deadman
     if deadman is None:
@@ -60,7 +60,9 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     datagram = _datagram(lookup, deadman, case)
     if datagram is None or (can_reach and _is_refused(lookup, deadman, datagram)):
         return None
-    return CheckedDeadman(deadman, datagram, disarmed_by)
+    trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
+    datagrams = [(to.value, trimmed(datagram) if to.value in trims else datagram) for to in deadman.to]
+    return deadman_plan(route.name, deadman, datagrams, disarmed_by)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -235,10 +237,14 @@ def _is_refused(lookup: Lookup, deadman: Deadman, datagram: bytes) -> bool:
     return False
 
 
-def deadman_plan(name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, bytes]]) -> DeadmanPlan:
-    return DeadmanPlan(
-        name, settings.timeout.value, settings.repeat.value, tuple(datagrams), at_start=settings.at_start
-    )
+def deadman_plan(
+    name: str,
+    settings: Deadman | InboundDeadman,
+    datagrams: Iterable[tuple[str, bytes]],
+    disarmed_by: tuple[str, ...] = (),
+) -> DeadmanPlan:
+    timeout, repeat = settings.timeout.value, settings.repeat.value
+    return DeadmanPlan(name, timeout, repeat, tuple(datagrams), settings.at_start, disarmed_by)
 
 
 def constant_plan(

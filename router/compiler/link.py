@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from router.compiler.checked import CheckedDeadman, CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.deadmen import deadman_plan
+from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.lookup import layout
 from router.compiler.metrics import Counters
-from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
+from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
 from router.compiler.series import open_series
 from router.compiler.topics import qos_of
 from router.table.model import ANY, Route, RouteTable, Topic
-from router.types.framing import trimmed
 from router.types.model import MessageType
 
 if TYPE_CHECKING:
@@ -38,7 +36,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
         for feed in route.subscriptions:
             topic = feed.topic.topic.value
             outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, frozenset(), feed))
-    deadmen = tuple(_route_deadman(each.route.name, each.deadman, table) for each in served if each.deadman)
+    deadmen = tuple(each.deadman for each in served if each.deadman)
     destinations = {to.endpoint.value for each in served for to in each.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     program = Program(
@@ -120,11 +118,3 @@ def _target_plan(target: CheckedTarget) -> TargetPlan:
         is_deferred=target.is_deferred,
         deadmen=target.deadmen,
     )
-
-
-def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable) -> DeadmanPlan:
-    datagrams = []
-    for to in checked.settings.to:
-        trims = table.endpoints[to.value].trim_trailing_zeros
-        datagrams.append((to.value, trimmed(checked.datagram) if trims else checked.datagram))
-    return deadman_plan(route, checked.settings, datagrams)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
+from typing import TYPE_CHECKING
 
-from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
 from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
+
+if TYPE_CHECKING:
+    from router.compiler.lowering import Lowered
 
 STRANGER = None
 """The source of a datagram whose sender is no endpoint of the table."""
@@ -78,7 +81,8 @@ class TargetPlan:
 class DeadmanPlan:
     """A route's deadman: what is sent to which endpoints when no fresh command was sent for `timeout` (all ns).
 
-    `at_start` says that it is sent when the router starts as well.
+    `at_start` says that it is sent when the router starts as well. `disarmed_by` are names of routes, not the payload
+    cases of the table.
     """
 
     route: str
@@ -86,6 +90,7 @@ class DeadmanPlan:
     repeat: int
     datagrams: tuple[tuple[str, bytes], ...]
     at_start: bool = True
+    disarmed_by: tuple[str, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)

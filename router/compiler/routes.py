@@ -111,10 +111,18 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
     return [(each, lookup.recipient(case, each.endpoint, sources)) for each in route.destinations]
 
 
-def _priority(route: Route, endpoint: Endpoint | None) -> Priority:
-    """Messages to a board are commands unless the route says something else."""
+def _destination(
+    lookup: Lookup, route: Route, destination: Destination, endpoint: Endpoint | None, scope: Scope
+) -> CheckedTarget:
+    """A destination without its plan. Messages to a board are commands unless the route says something else."""
     to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
-    return route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY)
+    return CheckedTarget(
+        destination,
+        endpoint=endpoint,
+        when=lookup.when(destination.when, scope),
+        priority=route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY),
+        deadmen=deadmen_of(lookup.table, route, destination),
+    )
 
 
 # from UDP
@@ -140,14 +148,7 @@ def _forward(
     if destination.fields is not None:
         message, hint = "a datagram is forwarded unchanged", "'fields' is for messages that come from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
-    when = lookup.when(destination.when, lookup.scope(case.type, route=route))
-    return CheckedTarget(
-        destination,
-        endpoint=endpoint,
-        when=when,
-        priority=_priority(route, endpoint),
-        deadmen=deadmen_of(lookup.table, route, destination),
-    )
+    return _destination(lookup, route, destination, endpoint, lookup.scope(case.type, route=route))
 
 
 def _publish(
@@ -219,22 +220,13 @@ def _subscription(
     own = any(destination.fields for destination, _ in found)  # then the route need not have any
     targets = []
     for destination, endpoint in found:
-        condition = lookup.when(destination.when, scope)
         fields = destination.fields or route.fields
         whole = scope.variable(ITEM, route.span) if for_each else None
         span = destination.span if own else route.span
         mapping = build(fields, case.type, scope, span, whole, _element_type(for_each) if for_each else ros_type)
         lookup.findings += mapping.findings
-        target = CheckedTarget(
-            destination,
-            endpoint=endpoint,
-            when=condition,
-            plan=mapping.plan,
-            rows=tuple(mapping.rows),
-            priority=_priority(route, endpoint),
-            deadmen=deadmen_of(lookup.table, route, destination),
-        )
-        targets.append(target)
+        target = _destination(lookup, route, destination, endpoint, scope)
+        targets.append(replace(target, plan=mapping.plan, rows=tuple(mapping.rows)))
     return CheckedSubscription(topic, ros_type, when, for_each, stamp, tuple(targets))
 
 

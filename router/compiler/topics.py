@@ -9,7 +9,8 @@ from itertools import product
 
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, Located, SourceSpan
-from router.table.model import InboundDeadman, NodeSettings, Route, RouteTable, Topic
+from router.table.keys import keys_of
+from router.table.model import InboundDeadman, NodeSettings, Qos, Route, RouteTable, Topic
 from router.types.protobuf import PayloadCase
 
 DEFAULT_DEPTH = 10
@@ -91,9 +92,8 @@ def qos_of(topic: Topic) -> QosPlan:
     """The complete QoS: the profile, what the table says beside it, and `queue_depth` as its depth."""
     given = topic.qos
     plan = PROFILES[given.profile.value if given and given.profile else "default"]
-    words = ("reliability", "durability", "history", "depth", "deadline", "lifespan", "liveliness",
-             "liveliness_lease_duration")  # fmt: skip
-    said = {word: getattr(given, word).value for word in words if given and getattr(given, word) is not None}
+    words = [key.name for key in keys_of(Qos) if key.name != "profile"]
+    said = {word: found.value for word in words if (found := getattr(given, word, None)) is not None}
     if topic.queue_depth is not None:
         said["depth"] = topic.queue_depth.value
     return replace(plan, **said)

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import STAMP_TYPES
-from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
+from router.errors import Code, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, is_text
@@ -131,7 +131,7 @@ FieldValue = Union[AnyValue, Scalar, Time, Fields, Elements]
 
 
 def invalid(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
-    return InvalidValueError(Diagnostic(span, code, message, hint))
+    return InvalidValueError(span, code, message, hint)
 
 
 # Reading them

@@ -283,7 +283,7 @@ def _network(node: Node) -> IPv4Network:
         return IPv4Network(written.value)
     except ValueError as error:  # not its form, which the schema has checked
         what = f"{written.value} is a host of the network {IPv4Network(written.value, strict=False)}"
-        raise InvalidValueError(Diagnostic(written.span, Code.BAD_VALUE, what, "write the network")) from error
+        raise InvalidValueError(written.span, Code.BAD_VALUE, what, "write the network") from error
 
 
 # routes
@@ -377,7 +377,7 @@ def _with_timeout(deadman: Entry) -> MappingNode:
     if settings.get("timeout") is None:
         hint = "say it here, or for all deadmen: `defaults: {deadman: {timeout: 500ms}}`"
         what = "'deadman' lacks the key 'timeout'"
-        raise InvalidValueError(Diagnostic(deadman.key.span, Code.MISSING_KEY, what, hint))
+        raise InvalidValueError(deadman.key.span, Code.MISSING_KEY, what, hint)
     return settings
 
 
@@ -482,7 +482,7 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
         what = f"'{written.value}' cannot be read: {why}"
         hint = f"looked for {shown_path(path)}" if isinstance(error, FileNotFoundError) else ""
-        raise InvalidValueError(Diagnostic(written.span, Code.BAD_FILE, what, hint)) from error
+        raise InvalidValueError(written.span, Code.BAD_FILE, what, hint) from error
 
 
 def _places(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:

@@ -217,7 +217,7 @@ class _Composer:
         return self._source.span(*_marks(event))
 
     def _fatal(self, span: SourceSpan, what: str, hint: str) -> TableError:
-        return TableError([Diagnostic(span, Code.BAD_YAML, what, hint)])
+        return TableError.of(span, Code.BAD_YAML, what, hint)
 
 
 def _marks(event: yaml.Event) -> tuple[int, int, int, int]:

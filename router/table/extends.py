@@ -104,7 +104,7 @@ def _root_mapping(root: Node) -> MappingNode:
     if isinstance(root, MappingNode):
         return root
     what = "a route table is a mapping of keys such as 'version', 'listen' and 'routes'"
-    raise TableError([Diagnostic(root.span, Code.WRONG_TYPE, what)])
+    raise TableError.of(root.span, Code.WRONG_TYPE, what)
 
 
 def _reference(root: MappingNode) -> ScalarNode | None:
@@ -116,7 +116,7 @@ def _reference(root: MappingNode) -> ScalarNode | None:
         raise TableError([])  # its own finding is in the list already
     if not isinstance(node, ScalarNode) or not isinstance(node.value, str) or not node.text:
         span = node.span if isinstance(node, ScalarNode) and node.text else entry.key.span
-        raise TableError([Diagnostic(span, Code.WRONG_TYPE, f"'{KEY}' must be the path of another table")])
+        raise TableError.of(span, Code.WRONG_TYPE, f"'{KEY}' must be the path of another table")
     return node
 
 
@@ -131,11 +131,11 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         what = f"'{reference.text}' cannot be extended: {found.message}"
         looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
         hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or looked
-        raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
+        raise TableError.of(reference.span, Code.BAD_EXTENDS, what, hint) from error
 
 
 def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:
     if (real := os.path.realpath(path)) in seen:
         names = " -> ".join(shown_path(Path(step)) for step in (*seen[seen.index(real) :], real))
         what = f"'{reference.text}' extends itself: {names}"
-        raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what)])
+        raise TableError.of(reference.span, Code.BAD_EXTENDS, what)

@@ -9,7 +9,7 @@ from typing import Any
 
 from router.errors import did_you_mean, nearest
 from router.table.compose import resolve
-from router.table.nodes import MAP, TEXT, MappingNode, Node, Path, ScalarNode, node_at, to_data
+from router.table.nodes import MAP, MappingNode, Node, Path, ScalarNode, node_at, to_data
 from router.table.schema import SchemaError, matches, table_schema
 from router.table.source import in_braces
 from router.table.units import meant_quantity
@@ -202,8 +202,6 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
     if "object" in error.limit:
         is_case = error.path[:-1] == ("routes",)
         return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
-    if name == TEXT:
-        return "write `{text: WORD}`"
     siblings = node_at(tree, error.path[:-1])
     if isinstance(siblings, MappingNode) and MAP in siblings.entries:
         return f"say what it becomes: `{name}: VALUE`"
@@ -228,8 +226,6 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
         return f"write `{text}`" if isinstance(error.path[-1], int) else f"write `{key}: {text}`"
     if error.limit == "array":
         return f"write `{name}: [{written}]`"
-    if name == "qos" and isinstance(value, int):
-        return f"write `qos: {{depth: {written}}}`"
     if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
         return f'quote it: "{written}"'
     return ""
@@ -254,9 +250,7 @@ def _for_collection(error: SchemaError, value: object) -> str:
         return "begin each of its items with '-'"
     if isinstance(value, list) and error.path in _BY_NAME:
         return "write a name and ':' in place of each '-'"
-    if not isinstance(value, list) or error.path[-1] != "topic":
-        return ""
-    return "write a list: [{topic: A}, {topic: B}]" if "source" in error.path else "several stand under 'topics'"
+    return ""
 
 
 def _is_at(path: Path, place: Path) -> bool:

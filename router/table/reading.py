@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from router.errors import Code, Diagnostic, Located, SourceSpan
+from router.errors import Code, FindingError, Located, SourceSpan
 from router.table.addresses import BadAddressError
 from router.table.nodes import MAP, TEXT, MappingNode, Node, ScalarNode, SequenceNode
 
@@ -18,12 +18,8 @@ V = TypeVar("V")
 R = TypeVar("R")
 
 
-class InvalidValueError(Exception):
-    """Carries the finding for a value that the schema cannot judge."""
-
-    def __init__(self, diagnostic: Diagnostic) -> None:
-        super().__init__(str(diagnostic))
-        self.diagnostic = diagnostic
+class InvalidValueError(FindingError):
+    """A value that the schema cannot judge."""
 
 
 def parsed(parse: Callable[[V], R], written: Located[V]) -> R:
@@ -31,9 +27,9 @@ def parsed(parse: Callable[[V], R], written: Located[V]) -> R:
     try:
         return parse(written.value)
     except BadAddressError as error:
-        raise InvalidValueError(Diagnostic(written.span, Code.BAD_ADDRESS, error.what, error.hint)) from error
+        raise InvalidValueError(written.span, Code.BAD_ADDRESS, error.what, error.hint) from error
     except ValueError as error:
-        raise InvalidValueError(Diagnostic(written.span, Code.BAD_VALUE, str(error))) from error
+        raise InvalidValueError(written.span, Code.BAD_VALUE, str(error)) from error
 
 
 def mapping(node: Node | None) -> MappingNode:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from router.assets import asset, is_installed
-from router.errors import Code, Diagnostic, SourceSpan, TableError, nearest, nearest_path, shown_path
+from router.errors import Code, SourceSpan, TableError, nearest, nearest_path, shown_path
 
 MAX_BYTES = 4 << 20
 _LINE_END = re.compile(r"\r\n|\r|\n")
@@ -46,14 +46,14 @@ def read_source(path: Path) -> Source:
         before = _LINE_END.split(data[: error.start].decode("utf-8"))
         span = SourceSpan(file, len(before), len(before[-1]) + 1, len(before[-1]) + 2)
         what = f"the byte 0x{data[error.start]:02x} is not UTF-8"
-        raise TableError([Diagnostic(span, Code.BAD_FILE, what, "save the file as UTF-8")]) from error
+        raise TableError.of(span, Code.BAD_FILE, what, "save the file as UTF-8") from error
     source = Source(path, file, data, text, tuple(_LINE_END.split(text)))
     if unusable := unusable_character(text):
         offset, name = unusable
         line = len(_LINE_END.split(text[:offset])) - 1
         column = offset - max(text.rfind("\n", 0, offset), text.rfind("\r", 0, offset)) - 1
         what = f"the character {name} has no place in a table"
-        raise TableError([Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, what)])
+        raise TableError.of(source.span(line, column, line, column + 1), Code.BAD_YAML, what)
     return source
 
 
@@ -92,7 +92,7 @@ def _read(path: Path, file: str) -> bytes:
                 hint += "; `router init` writes example tables there"
     except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
         what = f"the file cannot be read: {error}"
-    raise TableError([Diagnostic(SourceSpan(file), Code.BAD_FILE, what, hint)])
+    raise TableError.of(SourceSpan(file), Code.BAD_FILE, what, hint)
 
 
 _OPENING = "${"

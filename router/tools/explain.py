@@ -124,8 +124,7 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
             f"complete within {duration(collect.timeout.value)}"
         )
-    if deadman is not None:
-        settings = deadman.settings
+    if deadman is not None and (settings := route.deadman) is not None:
         sent = f"{settings.case.value} {settings.fields}" if settings.fields.entries else settings.case.value
         yield (
             f"  deadman: {sent} to {', '.join(to.value for to in settings.to)} when no command came for "

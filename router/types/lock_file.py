@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
+from router.errors import Code, SourceSpan, TableError, shown_path
 
 LOCK_NAME = "envelope.lock.json"
 
@@ -67,14 +67,14 @@ def read_lock(path: Path) -> Lock | None:
         span = SourceSpan(span.file, error.lineno, error.colno, error.colno + 1)
         if re.match("<{7}|={7}|>{7}", error.doc.split("\n")[error.lineno - 1]):
             hint = "take one side; `router validate` then says how to record what the other one had"
-            raise TableError([Diagnostic(span, Code.BAD_FILE, "an unresolved merge", hint)]) from None
+            raise TableError.of(span, Code.BAD_FILE, "an unresolved merge", hint) from None
         problem = error.msg
     except (OSError, ValueError, RecursionError) as error:
         problem = str(error)
     except (LookupError, TypeError, AttributeError):
         problem = "it has another structure"
     hint = "take the file from version control; without it nobody knows which numbers are taken"
-    raise TableError([Diagnostic(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)])
+    raise TableError.of(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)
 
 
 def lock_text(lock: Lock) -> str:
@@ -123,7 +123,7 @@ def write_lock(path: Path, lock: Lock) -> None:
     except OSError as error:
         scratch.unlink(missing_ok=True)
         message = f"cannot be written: {error.strerror}"
-        raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]) from None
+        raise TableError.of(SourceSpan(shown_path(path)), Code.BAD_FILE, message) from None
 
 
 def short_name(name: str) -> str:

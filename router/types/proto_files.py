@@ -67,16 +67,14 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
     What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
     """
     if not root.is_dir():
-        raise TableError(
-            [Diagnostic(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", _meant(root, blame))]
-        )
+        raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", _meant(root, blame))
     found = {
         name: path
         for path in walk(root)
         if path.suffix in (PROTO, OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
     }
     if not any(name.endswith(PROTO) for name in found):
-        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
+        raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")
     files = {}
     faults: dict[str, Sequence[Diagnostic]] = {}
     for name, path in sorted(found.items()):
@@ -227,7 +225,7 @@ def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], 
         files = " and ".join(file for file, _ in found)
         what = f"several files declare a message '{wanted}': {files}"
         hint = "remove all but one, or give its full name if they have packages"
-        raise TableError([Diagnostic(message.span, Code.DUPLICATE_MESSAGE, what, hint)])
+        raise TableError.of(message.span, Code.DUPLICATE_MESSAGE, what, hint)
     file, name = found[0]
     if (above := _folder_above(folder, file)) is not None:
         raise TableError([_too_deep(folder, protos, above, file)])

@@ -262,7 +262,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     if oneof is None:
         hint = did_you_mean(named.value, descriptor.oneofs_by_name)
         message = f"{name} has no oneof '{named.value}'"
-        raise TableError([Diagnostic(named.span, Code.BAD_VALUE, message, hint)])
+        raise TableError.of(named.span, Code.BAD_VALUE, message, hint)
     if scalars := [field for field in oneof.fields if field.message_type is None]:
         raise TableError([_scalar_finding(schema, field) for field in scalars])
     if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):

@@ -152,7 +152,7 @@ def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
         if status := _protoc_compiler.run_main([argument.encode() for argument in arguments]):
             message = f"protoc accepted these files at first, and then failed with status {status}"
             hint = "perhaps they changed meanwhile: try again"
-            raise TableError([Diagnostic(SourceSpan(shown_path(folder.root)), Code.BAD_PROTO, message, hint)])
+            raise TableError.of(SourceSpan(shown_path(folder.root)), Code.BAD_PROTO, message, hint)
         compiled = FileDescriptorSet.FromString(output.read_bytes())
     del compiled.file[-1]
     return compiled

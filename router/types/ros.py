@@ -78,7 +78,7 @@ def _read(path: Path, package: str) -> FoundDefinition:
         return FoundDefinition(shown_path(path), parse_msg(package, path.read_text(encoding="utf-8")))
     except MsgError as error:
         span = SourceSpan(shown_path(path), error.line, error.column, error.end_column)
-        raise TableError([Diagnostic(span, Code.BAD_FILE, error.message)]) from None
+        raise TableError.of(span, Code.BAD_FILE, error.message) from None
     except (OSError, UnicodeDecodeError) as error:
         finding = Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")
         raise TableError([finding]) from None
@@ -180,11 +180,11 @@ class RosInterfaces:
     def _nested(self, name: str, span: SourceSpan, inside: tuple[str, ...]) -> MessageType:
         if name in inside:
             chain = " > ".join([*inside[inside.index(name) :], name])
-            raise TableError([Diagnostic(span, Code.BAD_FILE, f"{name} contains itself: {chain}")])
+            raise TableError.of(span, Code.BAD_FILE, f"{name} contains itself: {chain}")
         nested = self._get(name, inside)
         if nested is None:
             message = f"there is no ROS message type '{name}'"
-            raise TableError([Diagnostic(span, Code.UNKNOWN_ROS_TYPE, message, did_you_mean(name, self.names()))])
+            raise TableError.of(span, Code.UNKNOWN_ROS_TYPE, message, did_you_mean(name, self.names()))
         return nested
 
 

@@ -57,8 +57,7 @@ def test_payload_is_known_before_the_start(check_text: CheckText, send: str, env
     (route,) = checked.routes
     assert not checked.has_errors
     assert route.deadman is not None
-    assert [to.value for to in route.deadman.settings.to] == ["board", "base"]
-    assert route.deadman.datagram.hex() == envelope
+    assert [(to, sent.hex()) for to, sent in route.deadman.datagrams] == [("board", envelope), ("base", envelope)]
 
 
 TURNS = """

@@ -8,16 +8,12 @@ from itertools import count
 
 from router.compiler.expressions.kinds import MessageKind, kind_of
 from router.compiler.expressions.tree import MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
-from router.errors import Code, Diagnostic, SourceSpan
+from router.errors import Code, FindingError, SourceSpan
 from router.types.model import Enum, Field, List, MessageType, String
 
 
-class ExpressionError(Exception):
-    """Ends the check of one expression with the first thing that is wrong in it."""
-
-    def __init__(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
-        super().__init__(message)
-        self.diagnostic = Diagnostic(span, code, message, hint)
+class ExpressionError(FindingError):
+    """The first thing that is wrong in an expression."""
 
 
 @dataclass(slots=True)

@@ -8,17 +8,16 @@ from typing import Union
 from router.compiler.lowering.operations import Flag, Slot
 from router.compiler.lowering.sections import Section
 from router.declared import MOST_TEXT
-from router.errors import Code, Diagnostic, SourceSpan
+from router.errors import Code, FindingError, SourceSpan
 
 Meaning = Union[Slot, Section]
 
 
-class TooLargeError(Exception):
-    """What the table asks for is more than a routine can do; the finding says what, and where."""
+class TooLargeError(FindingError):
+    """What the table asks for is more than a routine can do."""
 
     def __init__(self, span: SourceSpan, message: str, hint: str) -> None:
-        super().__init__(message)
-        self.diagnostic = Diagnostic(span, Code.TOO_LARGE, message, hint)
+        super().__init__(span, Code.TOO_LARGE, message, hint)
 
 
 @dataclass(slots=True)
