@@ -77,9 +77,9 @@ class Deadmen:
     def serve(self, now: int) -> None:
         for deadman in self.deadmen:
             if deadman.due is not None and deadman.due <= now:
-                self._serve(deadman, deadman.due, now)
+                self.serve_one(deadman, deadman.due, now)
 
-    def _serve(self, deadman: Deadman, due: int, now: int) -> None:
+    def serve_one(self, deadman: Deadman, due: int, now: int) -> None:
         if deadman.ends_when_due:
             self.end(deadman)
         elif not deadman.is_armed:

@@ -21,7 +21,7 @@ class Message:
     """`expires` is None for one that never does. `rank` is its place among the priorities, commands first."""
 
     number: int
-    target: int
+    target: object
     size: int = 0
     expires: int | None = None
     rank: int = 0
@@ -36,12 +36,16 @@ class Pacer:
         self._fate = fate
         self._waiting: list[Message] = []
         self._paid_at = -BURST
+        self.has_ended = False
         self.next_due: int | None = None
 
     def cost(self, size: int) -> int:
         return -(-size * NS // self._bandwidth)
 
     def offer(self, now: int, message: Message) -> None:
+        if self.has_ended:
+            self._fate(now, message, "stale" if message.is_stale(now) else "sent")
+            return
         self._limit_savings(now)
         self._waiting.append(message)
         self._send_affordable(now)
@@ -61,6 +65,12 @@ class Pacer:
         for each in sorted(filter(leaves, self._waiting), key=lambda each: each.rank):
             self._send(now, each)
         self._limit_savings(now)
+
+    def end(self, now: int) -> None:
+        """All that waits leaves, whatever the bandwidth."""
+        self.has_ended, self.next_due = True, None
+        for each in sorted(self._waiting, key=lambda each: each.rank):
+            self._send(now, each)
 
     def _first(self, rank: int) -> Message | None:
         return next((each for each in self._waiting if each.rank == rank), None)
@@ -92,7 +102,7 @@ class Pacer:
             self._fate(now, message, "sent")
 
 
-@dataclass
+@dataclass(eq=False)
 class Deferral:
     """`hertz` of `on_limit: latest`, None without; what passes goes to `pacer`, if there is one."""
 

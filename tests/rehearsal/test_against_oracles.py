@@ -2,126 +2,279 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import random
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from struct import pack
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
-from router.compiler.program import Program
-from router.rehearsal.rehearsal import START, DeadmanChanged, Dropped, Event, Rehearsal, Sent
-from tests.oracles.ages_and_rates import Freshness, RateLimit
-from tests.oracles.deadman import Deadman, Deadmen
-from tests.rehearsal.test_rehearsal import datagram
-from tests.small_tables import BASESTATION, HEAD, SENSOR_BOARD, program
+from router.compiler import Checked, check_table
+from router.compiler.lookup import Definitions
+from router.compiler.program import DeadmanPlan
+from router.rehearsal.cdr import deserialize
+from router.rehearsal.rehearsal import (
+    START,
+    Collected,
+    DeadmanChanged,
+    Dropped,
+    Event,
+    Filtered,
+    Published,
+    Received,
+    Rehearsal,
+    Sent,
+)
+from tests.oracles.frames import Part
+from tests.oracles.table import BULK, COMMAND, TELEMETRY, Happened, Model, Table, Target
 
 MS = 1_000_000
-TTL, RATE = 200 * MS, 20.0
-BRAKE = b"\xca\x01\x02\x08\x01"
+TTL, ORDERS_TTL = 150, 200
 
-ROUTES = """\
-  imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 20 Hz}], ttl: 200ms}
-  manual_drive:
-    source: basestation
-    destinations: [driving_board]
-    ttl: 200ms
-    deadman: {SETTINGS, send: {manual_brake: {brake: true}}, to: [driving_board], disarmed_by: [manual_arm]}
-  manual_arm: {source: basestation, destinations: [driving_board], ttl: 200ms, deadman: {none: not in this test}}
+PROTO = """\
+syntax = "proto3";
+message Sample { int32 number = 1; bytes filling = 2; }
+message Part { int32 frame = 1; int32 count = 2; int32 place = 3; string name = 4; }
+message PBEnvelope {
+  oneof payload {
+    Sample telemetry = 1; Sample bulk = 2; Sample drive = 3; Sample arm = 4; Sample orders = 5; Sample brake = 6;
+    Part part = 7;
+  }
+}
 """
-SETTINGS = ("timeout: 500ms, repeat: 100ms", "timeout: 300ms, repeat: 70ms", "timeout: 900ms, repeat: 400ms")
-PAYLOADS = {
-    "imu_info": datagram("imu_info"),
-    "manual_drive": datagram("manual_drive"),
-    "manual_arm": datagram("manual_arm"),
+TABLE = """\
+version: 1
+envelope: {{protos: ., message: PBEnvelope, oneof: payload}}
+listen: {{here: {{address: "127.0.0.1:5000"}}}}
+endpoints:
+  sensors: {{address: "192.168.0.30:8", kind: tool}}
+  wheels: {{address: "192.168.0.31:8", kind: board{wire}}}
+  operator: {{address: "192.168.0.10:9000", kind: basestation{radio}}}
+routes:
+  telemetry:
+    source: sensors
+    destinations: [{{endpoint: operator{telemetry}}}]
+    topics: [{{topic: latest, type: std_msgs/msg/Int32, fields: {{data: number}}{topic}}}]
+    {options}
+  bulk: {{source: sensors, priority: bulk, destinations: [{{endpoint: operator{bulk}}}]}}
+  drive:
+    source: operator
+    ttl: {ttl}ms
+    destinations: [{{endpoint: wheels{drive}}}]
+    deadman: {{timeout: {timeout}ms, repeat: {repeat}ms, send: {{brake: {{number: 1}}}}, disarmed_by: [arm],
+               to: [wheels], because: this is a test}}
+  arm: {{source: operator, ttl: {ttl}ms, destinations: [wheels], deadman: {{none: not in this test}}}}
+  part:
+    source: operator
+    collect: {{by: frame, count: count, order: place, timeout: {collect}ms}}
+    topics: [{{topic: frames, type: diagnostic_msgs/msg/DiagnosticArray, fields: {{status: items}}{frames}}}]
+  orders:
+    source: {{topic: orders, type: std_msgs/msg/Int32}}
+    fields: {{number: data}}
+    ttl: {ttl}ms
+    destinations: [{{endpoint: wheels{orders}}}]
+    deadman: {{none: not in this test}}
+"""
+MOST_TO_BOARD = 1400
+BRAKE = b"\x32\x02\x08\x01"
+PEERS = {"telemetry": ("192.168.0.30", 8), "bulk": ("192.168.0.30", 8)}
+OPERATOR = ("192.168.0.10", 9000)
+
+
+@dataclass(frozen=True)
+class To:
+    """How a target is delivered to."""
+
+    hertz: int | None = None
+    is_latest: bool = False
+    only_positive: bool = False
+
+    def __str__(self) -> str:
+        rate = "" if self.hertz is None else f", max_rate: {self.hertz} Hz"
+        condition = ", when: number > 0" if self.only_positive else ""
+        return rate + (", on_limit: latest" if self.is_latest else "") + condition
+
+
+RATES = [To(), To(20), To(7, is_latest=True), To(20, is_latest=True), To(50, is_latest=True)]
+CONDITIONS = [To(only_positive=True), To(20, is_latest=True, only_positive=True)]
+CHOICES: Mapping[str, list[Any]] = {
+    "telemetry": [*RATES, *CONDITIONS],
+    "bulk": [To(), To(), *RATES],
+    "topic": [*RATES, *CONDITIONS],
+    "drive": RATES,
+    "orders": RATES,
+    "frames": RATES,
+    "ttl": [None, None, TTL],
+    "rank": [COMMAND, TELEMETRY, TELEMETRY, BULK],
+    "radio": [None, 2_000, 20_000, 200_000],
+    "wire": [None, None, 2_000, 20_000],
+    "deadman": [(500, 100), (300, 70), (900, 400)],
+    "collect": [400, 1000],
 }
 
-AGES = st.one_of(st.just(0), st.integers(0, 400 * MS), st.sampled_from((TTL - 1, TTL, TTL + 1)))
-STEPS = st.one_of(st.integers(0, 30 * MS), st.integers(0, 1200 * MS), st.sampled_from((50 * MS, 300 * MS, 500 * MS)))
+
+@dataclass(frozen=True)
+class Setting:
+    """What may differ between two tables; bandwidths in bytes per second, times in ms."""
+
+    telemetry: To
+    bulk: To
+    topic: To
+    drive: To
+    orders: To
+    frames: To
+    ttl: int | None
+    rank: int
+    radio: int | None
+    wire: int | None
+    deadman: tuple[int, int]
+    collect: int
+
+    def text(self) -> str:
+        names = ("command", "telemetry", "bulk")
+        options = [f"priority: {names[self.rank]}", *([] if self.ttl is None else [f"ttl: {self.ttl}ms"])]
+        return TABLE.format(
+            **{name: value for name, value in vars(self).items() if isinstance(value, To)},
+            ttl=ORDERS_TTL,
+            options="\n    ".join(options),
+            radio="" if self.radio is None else f", bandwidth: {self.radio}B/s",
+            wire="" if self.wire is None else f", bandwidth: {self.wire}B/s",
+            timeout=self.deadman[0],
+            repeat=self.deadman[1],
+            collect=self.collect,
+        )
+
+    def model(self) -> Table:
+        def target(route: str, label: str, to: To, **more: Any) -> Target:
+            return Target(route, label, hertz=to.hertz, is_latest=to.is_latest, only_positive=to.only_positive, **more)
+
+        timeout, repeat = self.deadman
+        command: Any = {"is_board": True, "rank": COMMAND}
+        bandwidths = {"operator": self.radio, "wheels": self.wire}
+        ttl = {"drive": ORDERS_TTL, "arm": ORDERS_TTL, "orders": ORDERS_TTL, "telemetry": self.ttl}
+        return Table(
+            targets=(
+                target("telemetry", "operator", self.telemetry, rank=self.rank),
+                target("telemetry", "latest", self.topic, is_topic=True),
+                target("bulk", "operator", self.bulk, rank=BULK),
+                target("drive", "wheels", self.drive, feeds=("drive",), **command),
+                target("arm", "wheels", To(), feeds=("drive",), **command),
+                target("part", "frames", self.frames, is_topic=True),
+                target("orders", "wheels", self.orders, **command),
+            ),
+            ttl={route: ms * MS for route, ms in ttl.items() if ms is not None},
+            bandwidths={name: bandwidth for name, bandwidth in bandwidths.items() if bandwidth is not None},
+            timeouts={"part": self.collect * MS},
+            deadmen={"drive": DeadmanPlan("drive", timeout * MS, repeat * MS, (("wheels", BRAKE),))},
+        )
+
+
+def _settings() -> Iterator[Setting]:
+    """Some, each followed by others that differ from it in one thing."""
+    noise = random.Random(33)
+    for _ in range(6):
+        made = Setting(**{name: noise.choice(choices) for name, choices in CHOICES.items()})
+        yield made
+        for name in noise.sample([*CHOICES], 6):
+            yield replace(made, **{name: noise.choice(CHOICES[name])})
+
+
+SETTINGS = list(_settings())
+NUMBERS = st.integers(0, len(SETTINGS) - 1)
+AGES = st.one_of(st.just(0), st.integers(0, 400 * MS), st.sampled_from([(TTL + d) * MS for d in (-1, 0, 1)]))
+STEPS = st.one_of(st.integers(0, 30 * MS), st.integers(0, 1200 * MS), st.sampled_from((20 * MS, 50 * MS, 300 * MS)))
 AHEAD = st.one_of(st.integers(-600 * MS, 600 * MS), st.sampled_from((0, 3 * MS, 3600 * 1000 * MS)))
+SIZES = st.one_of(st.integers(0, 40), st.integers(0, 1500), st.sampled_from((0, 15_000)))
 
 
 @cache
-def table(number: int) -> Program:
-    """The table with these settings of the deadman; all of them count the same, so their counters are."""
-    with TemporaryDirectory() as folder:
-        made: Program = program(Path(folder), ROUTES.replace("SETTINGS", SETTINGS[number]), HEAD)
+def folder() -> TemporaryDirectory[str]:
+    """Of all tables: they have the same types, as before and after a reload."""
+    made = TemporaryDirectory()
+    (Path(made.name) / "own.proto").write_text(PROTO)
+    (Path(made.name) / "own.options").write_text(f"Sample.filling max_size:{MOST_TO_BOARD}\n")
     return made
 
 
-class Model:
-    """What the tables mean, by the oracles. `happened` is in the words of a rehearsal's events."""
-
-    def __init__(self, first: Program) -> None:
-        self.now, self.ahead = START, 0
-        self.happened: list[Event] = []
-        self._freshness, self._limit = Freshness(), RateLimit(RATE)
-        self._deadmen = Deadmen()
-        self._deadman = self._added(first)
-
-    def _added(self, of: Program) -> Deadman:
-        (plan,) = of.deadmen
-        return self._deadmen.add(plan)
-
-    def datagram(self, case: str, age: int) -> None:
-        wall = self.now + self.ahead
-        born = self._freshness.born(wall - age, wall, self.now)
-        target = "basestation" if case == "imu_info" else "driving_board"
-        if self.now > (born.youngest if case == "imu_info" else born.oldest) + TTL:
-            self._drop(case, target, "stale")
-        elif case == "imu_info" and not self._limit.may_pass(self.now):
-            self._drop(case, target, "rate_limited")
-        else:
-            feeds = [] if case == "imu_info" else [(self._deadman, case == "manual_arm")]
-            self._deadmen.command(self.now, feeds, target, PAYLOADS[case])
-            self._tell(case)
-
-    def advance(self, to: int) -> None:
-        while (due := self._deadmen.next_due) is not None and due <= to:
-            self.now = max(self.now, due)
-            self._deadmen.serve(self.now)
-            self._tell("manual_drive", by_deadman=True)
-        self.now = to
-
-    def reload(self, then: Program) -> None:
-        (plan,) = then.deadmen
-        if plan != self._deadman.plan:
-            earlier, self._deadman = self._deadman, self._added(then)
-            self._deadmen.replace(self._deadman, earlier)
-            self._tell("manual_drive", by_deadman=True)
-
-    def close(self) -> None:
-        for deadman in self._deadmen.deadmen:
-            self._deadmen.end(deadman)
-        self._tell("manual_drive", by_deadman=True)
-
-    def _drop(self, route: str, target: str, reason: str) -> None:
-        self.happened.append(Dropped(self.now, route, target, reason))
-
-    def _tell(self, route: str, *, by_deadman: bool = False) -> None:
-        """What the deadmen have noted."""
-        for target, data in self._deadmen.sent:
-            self.happened.append(Sent(self.now, route, target, data, by_deadman))
-        for what, name, _, _ in self._deadmen.events:
-            self.happened.append(DeadmanChanged(self.now, name, what == "tripped"))
-        self._deadmen.sent.clear()
-        self._deadmen.events.clear()
+@cache
+def checked(setting: Setting) -> Checked:
+    path = Path(folder().name) / "table.yaml"
+    path.write_text(setting.text())
+    made = check_table(path, {}, DEFINITIONS)
+    assert made.program is not None, "\n".join(map(str, made.diagnostics))
+    return made
 
 
-class AgesRatesAndDeadmen(RuleBasedStateMachine):
-    @initialize(number=st.integers(0, len(SETTINGS) - 1))
+DEFINITIONS = Definitions()
+
+
+def envelope(case: str, **payload: object) -> bytes:
+    schema = checked(SETTINGS[0]).envelope
+    assert schema is not None
+    data: bytes = schema.message_class(**{case: payload}).SerializeToString()
+    return data
+
+
+class Tables(RuleBasedStateMachine):
+    @initialize(number=NUMBERS)
     def start(self, number: int) -> None:
-        self.program = table(number)
-        self.stage, self.model = Rehearsal(self.program), Model(self.program)
+        self.setting = SETTINGS[number]
+        self.program = checked(self.setting).program
+        assert self.program is not None
+        self.stage, self.model = Rehearsal(self.program), Model(self.setting.model(), START)
+        self.count = 0
 
-    @rule(case=st.sampled_from((*PAYLOADS, "imu_info", "manual_drive")), age=AGES)
-    def receive(self, case: str, age: int) -> None:
-        peer = SENSOR_BOARD if case == "imu_info" else BASESTATION
-        now = self.stage.now + self.stage.ahead
-        self.stage.datagram("trimmed", peer, PAYLOADS[case], now - age)
-        self.model.datagram(case, age)
+    def next_number(self, sign: int) -> int:
+        """One that no other message has."""
+        self.count += 1
+        return sign * self.count
+
+    @rule(
+        case=st.sampled_from(("telemetry", "bulk", "drive", "telemetry", "drive", "arm")),
+        age=AGES,
+        sign=st.sampled_from((1, 1, -1)),
+        size=SIZES,
+        times=st.sampled_from((1, 1, 2, 5, 20)),
+    )
+    def receive(self, case: str, age: int, sign: int, size: int, times: int) -> None:
+        arrived = self.stage.now + self.stage.ahead - age
+        if case in {"drive", "arm"}:
+            size = min(size, MOST_TO_BOARD)
+        for _ in range(times):
+            number = self.next_number(sign)
+            data = envelope(case, number=number, filling=bytes(size))
+            self.stage.datagram("here", PEERS.get(case, OPERATOR), data, arrived)
+            self.model.datagram(case, data, number, arrived, {"latest": b"\0\1\0\0" + pack("<i", number)})
+        self.compare()
+
+    @rule(
+        frame=st.integers(1, 5),
+        count=st.sampled_from((1, 2, 2, 3, 3, 3)),
+        places=st.lists(st.integers(0, 2), min_size=1, max_size=4) | st.just([-1]) | st.permutations(range(3)),
+        age=AGES,
+    )
+    def receive_parts(self, frame: int, count: int, places: list[int], age: int) -> None:
+        arrived = self.stage.now + self.stage.ahead - age
+        for place in places:
+            name = f"{self.next_number(1)}"
+            data = envelope("part", frame=frame, count=count, place=place, name=name)
+            self.stage.datagram("here", OPERATOR, data, arrived)
+            self.model.part("part", Part(frame, count, place, name.encode()), arrived)
+        self.compare()
+
+    @rule(age=AGES, times=st.sampled_from((1, 1, 3)))
+    def take_from_ros(self, age: int, times: int) -> None:
+        sent = self.stage.now + self.stage.ahead - age
+        for _ in range(times):
+            number = self.next_number(1)
+            self.stage.ros("orders", b"\0\1\0\0" + pack("<i", number), sent)
+            self.model.ros("orders", envelope("orders", number=number), number, sent)
         self.compare()
 
     @rule(ns=STEPS)
@@ -135,11 +288,27 @@ class AgesRatesAndDeadmen(RuleBasedStateMachine):
         self.stage.set_clock(ahead)
         self.model.ahead = ahead
 
-    @rule(number=st.integers(0, len(SETTINGS) - 1))
+    @rule(number=NUMBERS)
     def reload(self, number: int) -> None:
-        self.stage.reload(table(number))
-        self.model.reload(table(number))
+        self.adopt(SETTINGS[number])
+
+    @rule(name=st.sampled_from(sorted(CHOICES)), choice=st.integers(0, 6))
+    def reload_with_one_change(self, name: str, choice: int) -> None:
+        choices = CHOICES[name]
+        self.adopt(replace(self.setting, **{name: choices[choice % len(choices)]}))
+
+    def adopt(self, setting: Setting) -> None:
+        assert self.program is not None
+        self.setting, self.program = setting, checked(setting).program_in(self.program.counters.continued())
+        assert self.program is not None
+        self.stage.reload(self.program)
+        self.model.reload(setting.model())
         self.compare()
+
+    @rule()
+    def restart(self) -> None:
+        self.stage.restart()
+        self.model = Model(self.setting.model(), START)
 
     def teardown(self) -> None:
         self.stage.close()
@@ -147,16 +316,45 @@ class AgesRatesAndDeadmen(RuleBasedStateMachine):
         self.compare()
 
     def compare(self) -> None:
-        happened = [event for event in self.stage.events if isinstance(event, (Sent, Dropped, DeadmanChanged))]
-        assert _by_kind(happened) == _by_kind(self.model.happened)
-        self.stage.events.clear()
-        self.model.happened.clear()
+        """By target, in order; what a deadman does it may report before or after its datagram."""
+        happened = [event for event in self.stage.events if not isinstance(event, (Received, DeadmanChanged))]
+        changes = [(each.at, each.route, each.active) for each in self.stage.events if isinstance(each, DeadmanChanged)]
+        assert _by_target(map(_happened, happened)) == _by_target(self.model.happened)
+        assert changes == self.model.changes
+        for events in (self.stage.events, self.model.happened, self.model.changes):
+            events.clear()
 
 
-def _by_kind(events: Sequence[Event]) -> Mapping[type[Event], list[Event]]:
-    """In order, but a deadman may say before or after its datagram what it does."""
-    return {kind: [event for event in events if isinstance(event, kind)] for kind in (Sent, Dropped, DeadmanChanged)}
+def _by_target(events: Iterable[Happened]) -> dict[tuple[str, str], list[Happened]]:
+    found: dict[tuple[str, str], list[Happened]] = {}
+    for each in events:
+        found.setdefault((each.route, each.target), []).append(each)
+    return found
 
 
-TestAgesRatesAndDeadmen = AgesRatesAndDeadmen.TestCase
-TestAgesRatesAndDeadmen.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+def _happened(event: Event) -> Happened:
+    match event:
+        case Sent():
+            return Happened(event.at, event.route, event.target, "braked" if event.by_deadman else "sent", event.data)
+        case Published():
+            return Happened(event.at, event.route, event.target, "published", _content(event))
+        case Dropped():
+            return Happened(event.at, event.route, event.target, event.reason)
+        case Filtered():
+            return Happened(event.at, event.route, event.target, "filtered")
+        case Collected():
+            return Happened(event.at, event.route, event.target, "collected")
+    raise AssertionError(event)
+
+
+def _content(event: Published) -> bytes:
+    """Of a frame the names of its parts."""
+    if event.target != "frames":
+        return event.data
+    (target,) = [each for route in checked(SETTINGS[0]).routes for each in route.targets if each.label == "frames"]
+    assert target.type is not None
+    return b"|".join(each.name.encode() for each in deserialize(target.type, event.data).status)
+
+
+TestTables = Tables.TestCase
+TestTables.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

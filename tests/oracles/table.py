@@ -1,0 +1,333 @@
+"""The oracle of a whole table, put together of the others: what its targets get, and what they miss.
+
+It knows the rules of docs/reference/table.md and docs/design/reload.md, and in which order timers are served that are
+due at the same time: what was added last, first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+from router.compiler.program import DeadmanPlan
+from tests.oracles.ages_and_rates import Freshness, RateLimit
+from tests.oracles.deadman import Deadman, Deadmen
+from tests.oracles.frames import COLLECTED, FILTERED, INCOMPLETE, MAPPING_ERROR, Frames, Part
+from tests.oracles.held_back import Deferral, Message, Pacer
+
+Key = Any
+COMMAND, TELEMETRY, BULK = range(3)
+
+
+class Happened(NamedTuple):
+    """`what` is sent, braked, published, filtered, collected, or why a message was dropped; `data` what has left."""
+
+    at: int
+    route: str
+    target: str
+    what: str
+    data: bytes = b""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One of a route; `only_positive` is its condition, of the number that messages have."""
+
+    route: str
+    label: str
+    is_topic: bool = False
+    is_board: bool = False
+    rank: int = TELEMETRY
+    hertz: int | None = None
+    is_latest: bool = False
+    only_positive: bool = False
+    feeds: tuple[str, ...] = ()
+    """The routes whose deadmen its messages feed, or disarm if it is another route's."""
+
+    @property
+    def place(self) -> tuple[str, str]:
+        return self.route, self.label
+
+
+@dataclass(frozen=True)
+class Table:
+    """`targets` are in the order of the table. `ttl`, `timeouts` of `collect` and deadmen are by route, in ns."""
+
+    targets: tuple[Target, ...]
+    ttl: Mapping[str, int]
+    bandwidths: Mapping[str, int]
+    timeouts: Mapping[str, int]
+    deadmen: Mapping[str, DeadmanPlan]
+
+    def of(self, route: str) -> list[Target]:
+        """Destinations come first."""
+        return sorted((each for each in self.targets if each.route == route), key=lambda each: each.is_topic)
+
+
+class Timer(Protocol):
+    @property
+    def next_due(self) -> int | None: ...
+
+    def serve(self, now: int) -> None: ...
+
+
+class Timers:
+    """Those that one thread serves, the one that was added last first."""
+
+    def __init__(self) -> None:
+        self.listed: list[Timer] = []
+
+    def add(self, timer: Timer) -> None:
+        if timer not in self.listed:
+            self.listed.insert(0, timer)
+
+    @property
+    def next_due(self) -> int | None:
+        return min((each.next_due for each in self.listed if each.next_due is not None), default=None)
+
+    def serve(self, now: int) -> None:
+        for each in [*self.listed]:
+            if each.next_due is not None and each.next_due <= now:
+                each.serve(now)
+
+
+@dataclass(eq=False)
+class _DeadmanTimer:
+    deadmen: Deadmen
+    deadman: Deadman
+    tell: Callable[[str, bool], None]
+
+    @property
+    def next_due(self) -> int | None:
+        return self.deadman.due
+
+    def serve(self, now: int) -> None:
+        assert self.deadman.due is not None
+        self.deadmen.serve_one(self.deadman, self.deadman.due, now)
+        self.tell(self.deadman.plan.route, True)
+
+    def end(self, now: int) -> None:
+        del now
+        self.deadmen.end(self.deadman)
+        self.tell(self.deadman.plan.route, True)
+
+
+@dataclass(eq=False)
+class _FramesTimer:
+    frames: Frames
+    tell: Callable[[Frames], None]
+
+    @property
+    def next_due(self) -> int | None:
+        return self.frames.next_due
+
+    def serve(self, now: int) -> None:
+        self.frames.tick(now)
+        self.tell(self.frames)
+
+    def end(self, now: int) -> None:
+        self.frames.end(now)
+        self.tell(self.frames)
+
+
+class Model:
+    """A table at work from `start` on. `happened` in order; `changes` are those of deadmen: whose, and to tripped."""
+
+    def __init__(self, table: Table, start: int) -> None:
+        self.now, self.ahead = start, 0
+        self.happened: list[Happened] = []
+        self.changes: list[tuple[int, str, bool]] = []
+        self.table = table
+        self._of_datagrams, self._of_ros = Freshness(), Freshness()
+        self._deadmen = Deadmen()
+        self._destinations, self._topics = Timers(), Timers()
+        self._messages: list[tuple[Target, bytes]] = []
+        self._kept: dict[Key, Any] = {}
+        self._deadman_timers: dict[str, _DeadmanTimer] = {}
+        self.reload(table)
+
+    # messages
+
+    def datagram(self, route: str, data: bytes, number: int, arrived: int, topics: Mapping[str, bytes]) -> None:
+        """`topics` are what they get of it."""
+        born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
+        for target in self.table.of(route):
+            oldest = born.oldest if target.is_board else born.youngest
+            self._deliver(target, topics[target.label] if target.is_topic else data, number, oldest)
+
+    def part(self, route: str, part: Part, arrived: int) -> None:
+        """A datagram of a route with `collect`, for its one topic; that gets the payloads."""
+        born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
+        (target,) = self.table.of(route)
+        timer: _FramesTimer = self._kept[_frames_key(self.table, route)]
+        made = timer.frames.offer(self.now, part)
+        timer.tell(timer.frames)
+        if made is not None:
+            self._deliver(target, b"|".join(made), 0, born.youngest)
+
+    def ros(self, route: str, data: bytes, number: int, sent: int) -> None:
+        born = self._of_ros.born(sent, self.now + self.ahead, self.now)
+        for target in self.table.of(route):
+            self._deliver(target, data, number, born.oldest if target.is_board else born.youngest)
+
+    def _deliver(self, target: Target, data: bytes, number: int, born: int) -> None:
+        ttl = self.table.ttl.get(target.route)
+        expires = None if ttl is None else born + ttl
+        self._messages.append((target, data))
+        message = Message(len(self._messages) - 1, target.place, len(data), expires, target.rank)
+        limit: RateLimit | None = self._kept.get(_limit_key(self.table, target))
+        deferral: Deferral | None = self._kept.get(_deferral_key(self.table, target))
+        if target.only_positive and number <= 0:
+            self._tell(target, "filtered")
+        elif message.is_stale(self.now):
+            self._tell(target, "stale")
+        elif limit is not None and not limit.may_pass(self.now):
+            self._tell(target, "rate_limited")
+        elif deferral is not None:
+            deferral.offer(self.now, message)
+        else:
+            self._fate(self.now, message, "sent")
+
+    def _fate(self, now: int, message: Message, fate: str) -> None:
+        assert now == self.now
+        target, data = self._messages[message.number]
+        if fate != "sent":
+            self._tell(target, fate)
+        elif target.is_topic:
+            self._tell(target, "published", data)
+        elif not target.feeds:
+            self._tell(target, "sent", data)
+        else:
+            feeds = [(self._deadman_timers[name].deadman, name != target.route) for name in target.feeds]
+            self._deadmen.command(now, feeds, target.label, data)
+            self._tell_deadmen(target.route, False)
+
+    def _tell(self, target: Target, what: str, data: bytes = b"") -> None:
+        self.happened.append(Happened(self.now, *target.place, what, data))
+
+    def _tell_deadmen(self, route: str, by_deadman: bool) -> None:
+        what = "braked" if by_deadman else "sent"
+        self.happened += [Happened(self.now, route, label, what, data) for label, data in self._deadmen.sent]
+        self.changes += [(self.now, name, what == "tripped") for what, name, _, _ in self._deadmen.events]
+        self._deadmen.sent.clear()
+        self._deadmen.events.clear()
+
+    def _tell_frames(self, target: Target, frames: Frames) -> None:
+        """What was lost gave way to the part that was counted last."""
+        for what in (MAPPING_ERROR, INCOMPLETE, FILTERED, COLLECTED):
+            self.happened += [Happened(self.now, *target.place, what)] * frames.counted[what]
+        frames.counted.clear()
+
+    # time
+
+    def advance(self, to: int) -> None:
+        groups = self._topics, self._destinations
+        while (due := min((each.next_due for each in groups if each.next_due is not None), default=to + 1)) <= to:
+            self.now = max(self.now, due)
+            for each in groups:
+                each.serve(self.now)
+        self.now = to
+
+    def close(self) -> None:
+        for group in (self._topics, self._destinations):
+            timers = [*reversed(group.listed)]
+            for each in timers:
+                if not isinstance(each, _DeadmanTimer):
+                    self._end(each)
+                    group.listed.remove(each)
+            for left in [*group.listed]:
+                self._end(left)
+
+    # reloads
+
+    def reload(self, table: Table) -> None:
+        """State of the same key goes along. What the next table does not hold leaves first, then what it changes."""
+        kept: dict[Key, Any] = {}
+        for key, make in self._state_of(table, kept):
+            kept[key] = self._kept[key] if key in self._kept else make()
+        replaced = self._replace_deadmen(table)
+        for group, is_topic in ((self._destinations, False), (self._topics, True)):
+            left = [each for key, each in self._kept.items() if key not in kept]
+            for each in [*left, *([] if is_topic else replaced)]:
+                if each in group.listed:
+                    self._end(each)
+                    group.listed.remove(each)
+            for key, each in kept.items():
+                if _is_of_topic(key) is is_topic:
+                    self._change(table, key, each, group)
+        self._kept, self.table = kept, table
+
+    def _state_of(self, table: Table, kept: Mapping[Key, Any]) -> Iterator[tuple[Key, Callable[[], Any]]]:
+        """The keys of what a table keeps, in the order in which timers are added, and what makes it."""
+        for endpoint, bandwidth in table.bandwidths.items():
+            yield ("pacer", endpoint, bandwidth), partial(Pacer, bandwidth, self._fate)
+        for target in table.targets:
+            if key := _deferral_key(table, target):
+                yield key, partial(Deferral, None, kept.get(_pacer_key(table, target)), self._fate)
+            if target.hertz is not None and (key := _limit_key(table, target)):
+                yield key, partial(RateLimit, target.hertz)
+            if key := _frames_key(table, target.route):
+                frames = Frames(table.timeouts[target.route])
+                yield key, partial(_FramesTimer, frames, partial(self._tell_frames, target))
+
+    def _change(self, table: Table, key: Key, kept: Any, group: Timers) -> None:
+        if isinstance(kept, Deferral):
+            (target,) = [each for each in table.targets if _deferral_key(table, each) == key]
+            kept.change(self.now, target.hertz if target.is_latest else None)
+            if kept.held is not None:
+                kept.held = replace(kept.held, rank=target.rank)
+        if not isinstance(kept, RateLimit):
+            group.add(kept)
+
+    def _replace_deadmen(self, table: Table) -> list[Timer]:
+        """Return those that end."""
+        ended: list[Timer] = []
+        for route, plan in table.deadmen.items():
+            earlier = self._deadman_timers.get(route)
+            if earlier is not None and earlier.deadman.plan == plan:
+                continue
+            made = self._deadmen.add(plan)
+            self._deadman_timers[route] = timer = _DeadmanTimer(self._deadmen, made, self._tell_deadmen)
+            self._destinations.add(timer)
+            if earlier is not None:
+                self._deadmen.replace(made, earlier.deadman)
+                self._tell_deadmen(route, True)
+                ended.append(earlier)
+        return ended
+
+    def _end(self, timer: Any) -> None:
+        timer.end(self.now)
+        if isinstance(timer, Deferral) and timer.pacer is not None:
+            (place,) = {key[1] for key, each in self._kept.items() if each is timer}
+            timer.pacer.release(self.now, lambda message: message.target == place)
+
+
+def _pacer_key(table: Table, target: Target) -> Key:
+    bandwidth = None if target.is_topic else table.bandwidths.get(target.label)
+    return None if bandwidth is None else ("pacer", target.label, bandwidth)
+
+
+def _deferral_key(table: Table, target: Target) -> Key:
+    """What waits goes to the same endpoint, by the same pacer."""
+    pacer = _pacer_key(table, target)
+    return ("deferral", target.place, target.is_topic, pacer) if pacer or target.is_latest else None
+
+
+def _limit_key(table: Table, target: Target) -> Key:
+    """Whatever is changed of a target but its condition, its limit begins anew."""
+    if target.hertz is None or target.is_latest:
+        return None
+    return "limit", replace(target, only_positive=False), _pacer_key(table, target) is not None
+
+
+def _frames_key(table: Table, route: str) -> Key:
+    """Likewise the frames of a route."""
+    if route not in table.timeouts:
+        return None
+    return "frames", route, table.timeouts[route], tuple(replace(each, only_positive=False) for each in table.of(route))
+
+
+def _is_of_topic(key: Any) -> bool:
+    return bool(key[0] == "frames" or (key[0] == "deferral" and key[2]))
