@@ -29,9 +29,10 @@ tools: setup
 install-service:  ## install the router as a systemd service and start it, with sudo; TABLE=... for another table
 	@deploy/install-service.sh $(TABLE)
 
-# By files, since the tests of one share what they start. Many of them wait: more processes than cores.
+# By files, since the tests of one share what they start, in the order of tests/conftest.py. Many of them wait: more
+# processes than cores.
 # If one dies the run ends there: pytest-xdist would wait for ever for what it had left (its issue 1378).
-PYTEST = .venv/bin/python -m pytest -n 4 --dist loadfile --max-worker-restart 0
+PYTEST = .venv/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # For tests of the carrier on a library that finds what C forgives. Python itself leaks on purpose.
 SANITIZED = CARRIER_TESTED_WITH_SANITIZERS=1 LD_PRELOAD=$$(gcc -print-file-name=libasan.so) \

@@ -6,7 +6,9 @@ import os
 import signal
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,17 @@ def _leave_to_the_team(event: str, arguments: tuple[object, ...]) -> None:
 
 
 sys.addaudithook(_leave_to_the_team)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mix files from both ends of the list, for workers that take one after the other: most of the first ones wait."""
+    if not hasattr(config, "workerinput"):
+        return
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    left, turns = deque(files.values()), cycle((deque.popleft, deque.pop))
+    items[:] = [item for _ in files for item in next(turns)(left)]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from time import sleep
 from typing import Any, NamedTuple
 
@@ -94,8 +93,9 @@ class Lidar(NamedTuple):
         return self.envelope.message_class(**payload)
 
 
-@pytest.fixture
-def lidar(tmp_path: Path) -> Iterator[Lidar]:
+@pytest.fixture(scope="module")
+def lidar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lidar]:
+    tmp_path = tmp_path_factory.mktemp("lidar")
     (tmp_path / "protos").mkdir()
     (tmp_path / "protos" / "lidar.proto").write_text(PROTO)
     port, listen = free_port(), free_port()

@@ -23,7 +23,6 @@ from structlog.testing import capture_logs
 from router.app import Router, reloading, watching
 from router.app.counts import ThreadCounts
 from router.app.plane import Plane
-from router.app.runtime import Runtime
 from router.app.watching import watched_files
 from router.compiler import check_table
 from router.compiler.metrics import Counters
@@ -395,39 +394,6 @@ def test_a_gateway_that_made_room_in_vain_is_opened_again(site: Site) -> None:
 
 def client_count(router: Router) -> int:
     return numbers(router).total("gateway_clients")
-
-
-def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    to = "{{endpoint: basestation, on_limit: latest, max_rate: {}}}"
-    held = f"  ph_info: {{{{source: sensor_board, destinations: [{to}]}}}}\n"
-    with site.router(held.format(0.001)) as router:
-        site.send(*map(numbered, range(2)))
-        wait_until(lambda: router.total("datagrams_received") >= 2)
-        finish = Runtime.finish
-
-        def finish_late(edges: Runtime, *args: object) -> None:
-            site.send(numbered(2))
-            wait_until(lambda: router.total("datagrams_received") >= 3)
-            finish(edges, *args)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(Runtime, "finish", finish_late)
-        site.write(held.format(1000))
-        assert router.reload().ok
-        assert [site.basestation.recv(1000) for _ in range(3)] == [numbered(number) for number in range(3)]
-
-
-def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> None:
-    board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, bandwidth: 1 kB/s}}\n'
-    others = "  pump_info: {source: sensor_board, destinations: [slow]}\n"
-    slow = PH.replace("basestation", "slow") + others
-    with Router(site.program(slow, board)) as router:
-        site.send(*map(numbered, range(200)))
-        wait_until(lambda: router.total("datagrams_received") >= 200)
-        site.write(others, endpoints=board)
-        assert router.reload().ok
-        assert router.total("datagrams_sent") == 200
-    site.take()
-    assert site.received == list(range(200))
 
 
 def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) -> None:

@@ -113,6 +113,14 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
     ]
 
 
+def test_what_a_deadman_sends_is_trimmed_for_who_asks_for_it(site: Site) -> None:
+    port = site.basestation.getsockname()[1]
+    trims = f'  old: {{address: "127.0.0.1:{port}", kind: tool, trim_trailing_zeros: true}}\n'
+    empty = "    deadman: {timeout: 1s, send: {manual_arm: {}}, to: [old]}\n"
+    with Router(site.program(TURNS.partition("    deadman:")[0] + empty, trims)):
+        assert site.basestation.recv(1000) == bytes.fromhex("d201")
+
+
 def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -312,17 +312,15 @@ def test_a_signal_that_ends_it_needs_no_router_that_routes(
     assert (process.returncode, said) == (code, "")
 
 
-@pytest.mark.parametrize("arguments", [("run", "table.yaml"), ("validate", "/table.yaml")])
-def test_a_working_directory_that_was_deleted_is_told(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+def test_a_working_directory_that_was_deleted_is_told(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
 
     def delete() -> None:
         gone.rmdir()
 
-    code, said = ended(*arguments, cwd=gone, preexec_fn=delete)
-    assert code == 78
-    assert said == [f"router {arguments[0]}: the working directory was deleted", "help: change to one that exists"]
+    said = ["router run: the working directory was deleted", "help: change to one that exists"]
+    assert ended("run", "table.yaml", cwd=gone, preexec_fn=delete) == (78, said)
 
 
 def may_map(mebibytes: int) -> Callable[[], None]:
@@ -346,26 +344,12 @@ def test_too_little_address_space_for_ros_is_told_before_ros_is_loaded(table: Pa
     assert said[0].startswith("router run: this process may map 300 MiB of memory (ulimit -v), and ROS 2 needs 1024")
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "told"),
-    [
-        ("ROS_DOMAIN_ID", "233", "ROS_DOMAIN_ID is '233'\nhelp: set it to a number from 0 to 232"),
-        ("ROS_DOMAIN_ID", "-5", "ROS_DOMAIN_ID is '-5'\nhelp: set it to a number from 0 to 232"),
-        (
-            "RMW_IMPLEMENTATION",
-            "rmw_dust",
-            "RMW_IMPLEMENTATION is 'rmw_dust', which is not installed here\nhelp: unset it, or set it to one",
-        ),
-    ],
-)
-def test_an_environment_that_ros_does_not_take_is_told(
-    table: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, told: str
-) -> None:
+def test_an_environment_that_ros_does_not_take_is_told(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     table.write_text(table.read_text() + TOPIC)
-    monkeypatch.setenv(name, value)
-    code, said = ended("run", table)
-    assert (code, "\n".join(said).startswith(f"router run: {told}")) == (78, True)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    told = ["router run: ROS_DOMAIN_ID is '233'", "help: set it to a number from 0 to 232"]
+    assert ended("run", table) == (78, told)
 
 
 @pytest.mark.parametrize("name", ["run", "doctor"])
@@ -375,20 +359,8 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
         pytest.skip("only root can have a /dev/shm of its own, by unshare")
     table.write_text(table.read_text() + TOPIC)
     full = f"mount -t tmpfs -o size=64k tmpfs {SHM} && head -c 64k /dev/zero > {SHM}/full"
-    command = [
-        "unshare",
-        "-m",
-        "sh",
-        "-c",
-        f'{full} && exec "$@"',
-        "sh",
-        sys.executable,
-        "-m",
-        "router",
-        name,
-        "-t",
-        str(table),
-    ]
+    within = ["unshare", "-m", "sh", "-c", f'{full} && exec "$@"', "sh"]
+    command = [*within, sys.executable, "-m", "router", name, "-t", str(table)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert answer.returncode == {"run": 78, "doctor": 1}[name]
     assert f"{SHM} has 0 KiB free, and ROS 2 needs" in answer.stdout + answer.stderr
@@ -397,9 +369,11 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
 def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) -> None:
     for domain in ("", "0", "7", "232"):
         assert list(obstacles({"ROS_DOMAIN_ID": domain})) == []
-    for domain in ("233", "1e2", "4294967296", " 5", "five"):
+    for domain in ("233", "-5", "1e2", "4294967296", " 5", "five"):
         [(what, _)] = obstacles({"ROS_DOMAIN_ID": domain})
         assert what == f"ROS_DOMAIN_ID is '{domain}'"
+    [(what, _)] = obstacles({"RMW_IMPLEMENTATION": "rmw_dust"})
+    assert what == "RMW_IMPLEMENTATION is 'rmw_dust', which is not installed here"
     transports = "FASTDDS_BUILTIN_TRANSPORTS"
     assert all(uses_shared_memory({transports: each}) for each in ("", "DEFAULT", "SHM", "LARGE_DATA?max_msg_size=1MB"))
     assert not any(uses_shared_memory({transports: each}) for each in ("UDPv4", "UDPv6", "TCPv4", "NONE"))
