@@ -32,7 +32,7 @@ SILENCE = 1.0
 """Seconds from the last command to the next one: the deadman's timeout, and as much again for a late brake."""
 
 ARRIVAL = np.dtype([("at", "<i8"), ("port", "<u4"), ("length", "<u4"), ("head", "u1", (48,))])
-"""As `receive.c` writes it."""
+"""As `carrier.c` writes it."""
 
 TELEMETRY, BOARD = 0, 1
 """The sources, in the order of `send --from`: who sends telemetry, and who commands."""

@@ -72,7 +72,7 @@ def test_any_bytes(sides: Mapping[str, Sides], schema: str, data: bytes, repairs
 
 
 @pytest.mark.parametrize("schema", SCHEMAS)
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", [*range(20), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(20, 100))])
 def test_a_thousand_of_each_seed(sides: Mapping[str, Sides], schema: str, seed: int) -> None:
     maker = Maker(sides[schema][0].envelope.message_class.DESCRIPTOR, random.Random(seed))  # type: ignore[arg-type]
     for _ in range(1000):

@@ -89,7 +89,7 @@ def _differ(headers: dict[str, str], folder: Path) -> bool:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
     made = folder / "check.so"
-    build.compile_c(["-shared", "-fPIC", f"-isystem{folder}", str(build.NATIVE / "rcl_check.c"), "-o", str(made)])
+    build.compile_c(["-shared", "-fPIC", f"-isystem{folder}", str(build.NATIVE / "library.c"), "-o", str(made)])
     return bool(ctypes.CDLL(str(made)).rcl_types_differ() & 0xFF)
 
 

@@ -1,19 +1,274 @@
-/* The carrier's threads: start, stop, and what other threads ask of them. */
-#include "carrier_internal.h"
+#include "carrier.h"
 
 #include <errno.h>
+#include <linux/sockios.h>
 #include <poll.h>
-#include <signal.h>
+#include <pthread.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #include "clock.h"
+#include "priority.h"
+#include "route.h"
+#include "threads.h"
 
 static const int64_t PYTHON_TIMEOUT = 30000000000; /* ns for which the watchdog is fed while Python is stuck */
 static const char ALIVE[] = "WATCHDOG=1";
+
+enum {
+    TURN_MS = 50,              /* the longest wait for a datagram */
+    MOST_DRAINED = 1 << 16,    /* datagrams: more than a receive buffer holds */
+    LISTENERS_PER_WAIT = 16,
+};
+
+struct carrier {
+    /* Of the receive thread alone: */
+    struct share share;
+    int epoll;
+    /* Shared: */
+    edition edition; /* of the counters */
+    _Atomic(struct ring *) mirror;
+    _Atomic uint32_t mirror_lost; /* counter */
+    _Atomic(const struct change *) next, adopted;
+    _Atomic bool is_stopping, is_closing;
+    _Atomic uint64_t turns;
+    _Atomic int64_t pulse; /* when Python was alive, monotonic */
+    /* Of the timer thread: */
+    _Atomic int notify; /* a socket, or -1 */
+    _Atomic int64_t interval;
+    int wake; /* eventfd */
+    uint64_t turns_seen;
+    pthread_t receiving, timing;
+    bool has_started, has_stopped;
+    struct routing routing; /* of the receive thread, too; last, as it is large */
+};
+
+/* ---- the mirror ---- */
+
+/* `reason`: why no route took it, or ROUTED. */
+static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
+    struct mirror_record *record = (struct mirror_record *)carrier->routing.record;
+    size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
+    *record = (struct mirror_record){.size = padded_to_word(sizeof *record + kept),
+                                     .listener = received->listener->id,
+                                     .at = received->received_at,
+                                     .address = received->address,
+                                     .port = received->port,
+                                     .length = (uint32_t)kept,
+                                     .reason = reason,
+                                     .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
+    memcpy(record + 1, carrier->routing.datagram, kept);
+    uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
+    if (!ring_put(to, record, record->size)) stage_count(&carrier->routing.stage, lost, 1);
+}
+
+/* ---- receiving ---- */
+
+static int64_t nanoseconds(struct timespec time) { return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec; }
+
+/* The time at which the kernel got the datagram that was just received, by the wall clock; 0 if it does not say. Where the
+ * time does not come with each datagram, as in qemu-user, the kernel is asked. */
+static int64_t arrival(int fd, struct msghdr *message) {
+    struct timespec stamp;
+    for (struct cmsghdr *each = CMSG_FIRSTHDR(message); each; each = CMSG_NXTHDR(message, each))
+        if (each->cmsg_level == SOL_SOCKET && each->cmsg_type == SCM_TIMESTAMPNS) {
+            memcpy(&stamp, CMSG_DATA(each), sizeof stamp);
+            return nanoseconds(stamp);
+        }
+    return ioctl(fd, SIOCGSTAMPNS, &stamp) ? 0 : nanoseconds(stamp);
+}
+
+/* As recvmsg, but errors about datagrams that were sent from the listener's port go to their senders, and keep no datagram
+ * waiting. While more of them arrive, each attempt may fail. */
+static ssize_t receive(int fd, struct msghdr *message, int flags) {
+    enum { ATTEMPTS = 3 };
+    ssize_t length = recvmsg(fd, message, flags);
+    if (length >= 0 || errno == EAGAIN || errno == EINTR) return length;
+    bool is_about_sent = sender_note_errors(fd);
+    for (int left = ATTEMPTS; left && length < 0 && errno != EAGAIN; left--)
+        length = recvmsg(fd, message, flags | MSG_DONTWAIT);
+    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* a fault: it is not to keep us busy */
+    return length;
+}
+
+/* There was nothing to receive: so what is still to come was not stamped under a setting of the clock that has passed. */
+static void found_empty(struct carrier *carrier) {
+    freshness_forget_past(&carrier->routing.freshness);
+    int64_t now = boottime_ns();
+    freshness_look(&carrier->routing.freshness, wall_ns(), now);
+}
+
+static void handle(struct carrier *carrier, struct received *received) {
+    edition_begin(&carrier->edition);
+    received->now = boottime_ns();
+    received->received_at = wall_ns();
+    int reason = route_datagram(&carrier->routing, received);
+    if (received->route)
+        count_duration(carrier->routing.stage.counters, received->route->duration, boottime_ns() - received->now);
+    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
+    if (observed) mirror(carrier, observed, received, reason);
+    edition_end(&carrier->edition);
+}
+
+enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
+
+/* Receive and handle a datagram if there is one. */
+static enum outcome receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
+    struct sockaddr_in sender;
+    union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct timespec))]; } control;
+    struct iovec into = {carrier->routing.datagram, MAX_DATAGRAM + 1};
+    struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
+                             .msg_control = &control, .msg_controllen = sizeof control};
+    ssize_t length = receive(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
+    if (length < 0) return errno == EAGAIN ? FOUND_EMPTY : RECEIVE_FAILED;
+    if (!message.msg_namelen) { /* input has ended; an empty datagram has a sender */
+        if (!(flags & MSG_DONTWAIT)) usleep(1000);
+        return FOUND_EMPTY;
+    }
+    struct received received = {.listener = listener, .length = (size_t)length, .arrived_at = arrival(listener->fd, &message),
+                                .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
+    handle(carrier, &received);
+    share_processor(&carrier->share, received.now);
+    return RECEIVED;
+}
+
+static void serve_due(struct carrier *carrier) {
+    int64_t due = atomic_load_explicit(&carrier->routing.stage.timers->wakes_at, memory_order_relaxed);
+    if (due == NEVER) return;
+    int64_t now = boottime_ns();
+    if (due <= now) timers_serve(carrier->routing.stage.timers, now);
+}
+
+static void drain(struct carrier *carrier, const struct listener *listener) {
+    for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT) == RECEIVED; left--)
+        serve_due(carrier);
+}
+
+/* ---- changes of the program ---- */
+
+static bool has_listener(const struct program *program, int fd) {
+    for (uint32_t index = 0; index < program->listener_count; index++)
+        if (program->listeners[index].fd == fd) return true;
+    return false;
+}
+
+static void adopt(struct carrier *carrier, const struct change *change) {
+    const struct program *earlier = carrier->routing.program;
+    if (earlier)
+        for (uint32_t index = 0; index < earlier->listener_count; index++)
+            if (!has_listener(change->program, earlier->listeners[index].fd)) drain(carrier, &earlier->listeners[index]);
+    struct timeval turn = {0, TURN_MS * 1000};
+    for (uint32_t index = 0; index < change->program->listener_count; index++)
+        setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
+    route_by(&carrier->routing, change);
+    atomic_store(&carrier->adopted, change);
+}
+
+/* Adopt the next program if there is one. The caller must not use the earlier one any more: its memory may go. */
+static void adopt_next(struct carrier *carrier) {
+    const struct change *next = atomic_exchange(&carrier->next, NULL);
+    if (next) adopt(carrier, next);
+}
+
+static bool is_stopping(struct carrier *carrier) {
+    return atomic_load_explicit(&carrier->is_stopping, memory_order_relaxed);
+}
+
+static bool goes_on(struct carrier *carrier) {
+    serve_due(carrier);
+    /* Release: who sees the next turn may free what was read in this one. */
+    atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_release);
+    return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
+}
+
+/* With one system call per datagram: a receive that blocks, unless the clock was set since nothing was waiting. */
+static void receive_from_one(struct carrier *carrier) {
+    const struct listener *listener = carrier->routing.program->listeners;
+    do {
+        int flags = carrier->routing.freshness.count ? MSG_DONTWAIT : 0;
+        if (receive_one(carrier, listener, flags) == FOUND_EMPTY) found_empty(carrier);
+    } while (goes_on(carrier));
+}
+
+/* One datagram of each listener that has some per turn, so that none starves the others. */
+static void receive_from_many(struct carrier *carrier, int waiting) {
+    const struct program *program = carrier->routing.program;
+    for (uint32_t index = 0; index < program->listener_count; index++) {
+        struct epoll_event interest = {.events = EPOLLIN, .data.u32 = index};
+        epoll_ctl(waiting, EPOLL_CTL_ADD, program->listeners[index].fd, &interest);
+    }
+    do {
+        struct epoll_event ready[LISTENERS_PER_WAIT];
+        int turn = carrier->routing.freshness.count ? 0 : TURN_MS;
+        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, turn), empty = 0;
+        bool has_noted = false;
+        for (int index = 0; index < count; index++) {
+            const struct listener *listener = &program->listeners[ready[index].data.u32];
+            if (ready[index].events & EPOLLERR) has_noted |= sender_note_errors(listener->fd);
+            empty += receive_one(carrier, listener, MSG_DONTWAIT) == FOUND_EMPTY;
+        }
+        if (count > 0 && empty == count && !has_noted) usleep(1000); /* input has ended, which epoll says again and again */
+        if (count >= 0 && empty == count && count < LISTENERS_PER_WAIT) found_empty(carrier);
+    } while (goes_on(carrier));
+    for (uint32_t index = 0; index < program->listener_count; index++)
+        epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);
+}
+
+static void *receive_thread(void *of) {
+    struct carrier *carrier = of;
+    carrier->share.may_be_first = carrier->share.is_first = run_first();
+    while (!is_stopping(carrier)) {
+        if (carrier->routing.program->listener_count == 1) receive_from_one(carrier);
+        else receive_from_many(carrier, carrier->epoll);
+        adopt_next(carrier);
+    }
+    for (uint32_t index = 0; index < carrier->routing.program->listener_count; index++)
+        if (!carrier->routing.program->listeners[index].keeps_input) drain(carrier, &carrier->routing.program->listeners[index]);
+    return NULL;
+}
+
+/* ---- the timer thread ---- */
+
+/* Feed the service manager's watchdog while receiving makes progress and Python does something now and then. */
+static void feed_watchdog(struct carrier *carrier) {
+    uint64_t turns = carrier_turns(carrier);
+    if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;
+    carrier->turns_seen = turns;
+    send(atomic_load(&carrier->notify), ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+/* Return how long to wait for the watchdog's next turn, in ms for `poll`. */
+static int until_turn(struct carrier *carrier, int64_t turn) {
+    if (atomic_load(&carrier->notify) < 0) return -1;
+    int64_t wait = turn - monotonic_ns();
+    return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
+}
+
+/* Serves what is due when nothing is received, and the watchdog. */
+static void *timer_thread(void *of) {
+    struct carrier *carrier = of;
+    int64_t turn = 0;
+    run_first();
+    while (!atomic_load(&carrier->is_closing)) {
+        struct pollfd waiting[] = {{carrier->routing.stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        poll(waiting, 2, until_turn(carrier, turn));
+        eventfd_t ignored;
+        if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
+        if (waiting[0].revents) timers_serve(carrier->routing.stage.timers, boottime_ns());
+        if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
+            feed_watchdog(carrier);
+            turn = monotonic_ns() + atomic_load(&carrier->interval);
+        }
+    }
+    return NULL;
+}
+
+/* ---- for others ---- */
 
 struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
@@ -32,10 +287,10 @@ struct carrier *carrier_open(struct timers *timers, counter *counters, struct ri
 
 int carrier_start(struct carrier *carrier, const struct change *first) {
     carrier_pulse(carrier);
-    carrier_adopt_first(carrier, first);
-    int error = start_thread(&carrier->timing, "timers", timer_thread, carrier);
+    adopt(carrier, first);
+    int error = thread_start(&carrier->timing, "timers", timer_thread, carrier);
     if (error) return error;
-    error = start_thread(&carrier->receiving, "receive", receive_thread, carrier);
+    error = thread_start(&carrier->receiving, "receive", receive_thread, carrier);
     carrier->has_started = true;
     carrier->has_stopped = error != 0;
     return error;
@@ -55,40 +310,6 @@ void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost)
 void carrier_pulse(struct carrier *carrier) { atomic_store(&carrier->pulse, monotonic_ns()); }
 
 uint64_t carrier_turns(struct carrier *carrier) { return atomic_load_explicit(&carrier->turns, memory_order_acquire); }
-
-/* Feed the service manager's watchdog while receiving makes progress and Python does something now and then. */
-static void feed_watchdog(struct carrier *carrier) {
-    uint64_t turns = carrier_turns(carrier);
-    if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;
-    carrier->turns_seen = turns;
-    send(atomic_load(&carrier->notify), ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
-}
-
-/* Return how long to wait for the watchdog's next turn, in ms for `poll`. */
-static int until_turn(struct carrier *carrier, int64_t turn) {
-    if (atomic_load(&carrier->notify) < 0) return -1;
-    int64_t wait = turn - monotonic_ns();
-    return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
-}
-
-/* Serves what is due when nothing is received, and the watchdog. */
-void *timer_thread(void *of) {
-    struct carrier *carrier = of;
-    int64_t turn = 0;
-    run_first();
-    while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->routing.stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
-        poll(waiting, 2, until_turn(carrier, turn));
-        eventfd_t ignored;
-        if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) timers_serve(carrier->routing.stage.timers, boottime_ns());
-        if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
-            feed_watchdog(carrier);
-            turn = monotonic_ns() + atomic_load(&carrier->interval);
-        }
-    }
-    return NULL;
-}
 
 void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
     atomic_store(&carrier->interval, interval);

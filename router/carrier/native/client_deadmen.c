@@ -3,12 +3,13 @@
 #include <errno.h>
 #include <poll.h>
 #include <stdlib.h>
-#include <string.h>
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-#include "carrier_internal.h"
 #include "clock.h"
+#include "deliver.h"
+#include "priority.h"
+#include "threads.h"
 
 struct client_deadmen {
     struct stage stage; /* first: `brake` is given this */
@@ -22,31 +23,19 @@ struct client_deadmen {
     _Atomic uint32_t latest; /* generation */
     /* Written by the thread: */
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
-    _Atomic int64_t since;       /* when it entered the middleware, or 0 */
-    _Atomic uint32_t topic;      /* where it did */
+    struct publishing publishing;
     /* Of the thread: */
-    publish_function *publish;
-    error_function *error;
-    reset_function *reset;
-    bool has_message;              /* a deadman was served, and sends this: */
+    bool has_message;              /* a deadman was served, and sends the machine's output there: */
     struct deadman_destination to; /* its `datagram` is not used: the deadman may go */
-    uint8_t *message;
-    size_t size, capacity;
 };
 
 /* ---- with the lock held ---- */
 
-/* Keep what a deadman sends, of which only one is served at a time. */
+/* Keep what a deadman sends as the output of the machine. Only one is served at a time. */
 static int keep_message(struct stage *stage, const struct deadman_destination *to) {
     struct client_deadmen *of = (struct client_deadmen *)stage;
-    if (to->size > of->capacity) {
-        uint8_t *larger = realloc(of->message, to->size);
-        if (!larger) return ENOMEM;
-        of->message = larger;
-        of->capacity = to->size;
-    }
-    memcpy(of->message, to->datagram, to->size);
-    of->size = to->size;
+    stage->machine.output.size = 0;
+    if (!append(&stage->machine.output, to->datagram, to->size)) return ENOMEM;
     of->to = *to;
     of->has_message = true;
     return BRAKE_LATER;
@@ -54,20 +43,10 @@ static int keep_message(struct stage *stage, const struct deadman_destination *t
 
 /* Publish what was kept of a deadman; without the lock meanwhile. */
 static void publish_message(struct client_deadmen *of, struct timer *from) {
-    struct serialized_message message = {of->message, of->size, of->capacity, ALLOCATOR};
-    struct error_text why;
     of->has_message = false;
-    atomic_store_explicit(&of->topic, of->to.id, memory_order_relaxed);
-    atomic_store_explicit(&of->since, monotonic_ns(), memory_order_release);
-    pthread_mutex_unlock(&of->group->lock);
-    int error = of->publish(of->to.publisher, &message, NULL);
-    if (error) {
-        why = of->error();
-        of->reset();
-    }
-    pthread_mutex_lock(&of->group->lock);
-    atomic_store_explicit(&of->since, 0, memory_order_relaxed);
-    if (!of->group->is_left) deadman_settle(of->group, from, &of->to, error ? why.text : NULL, boottime_ns());
+    const char *why = publish_unlocked(&of->publishing, &of->group->lock, of->to.publisher, of->to.id,
+                                       &of->stage.machine.output);
+    if (!of->group->is_abandoned) deadman_settle(of->group, from, &of->to, why, boottime_ns());
 }
 
 static struct timer *find_due(const struct timers *group, int64_t now) {
@@ -80,7 +59,7 @@ static struct timer *find_due(const struct timers *group, int64_t now) {
 static void serve_all(struct client_deadmen *of) {
     int64_t now = boottime_ns();
     struct timer *due;
-    while (!of->group->is_left && (due = find_due(of->group, now))) {
+    while (!of->group->is_abandoned && (due = find_due(of->group, now))) {
         due->kind->serve(of->group, due, boottime_ns());
         if (of->has_message) publish_message(of, due);
     }
@@ -111,7 +90,7 @@ static void *run(void *argument) {
         bool is_stopping = atomic_load(&of->is_stopping);
         if (is_stopping) end_all(of);
         serve_all(of);
-        if (of->group->is_left || is_stopping) break;
+        if (of->group->is_abandoned || is_stopping) break;
         atomic_store(&of->generation, latest);
         wait_for_more(of);
     }
@@ -145,10 +124,10 @@ struct timers *client_deadmen_group(struct client_deadmen *of) { return of->grou
 
 int client_deadmen_start(struct client_deadmen *of, publish_function *publish, error_function *error,
                          reset_function *reset) {
-    of->publish = publish;
-    of->error = error;
-    of->reset = reset;
-    int failed = start_thread(&of->thread, "client deadmen", run, of);
+    of->publishing.publish = publish;
+    of->publishing.error = error;
+    of->publishing.reset = reset;
+    int failed = thread_start(&of->thread, "client deadmen", run, of);
     of->has_started = !failed;
     return failed;
 }
@@ -163,23 +142,13 @@ bool client_deadmen_have_reached(struct client_deadmen *of, uint32_t generation)
 }
 
 int64_t client_deadmen_since(struct client_deadmen *of, uint32_t *topic) {
-    int64_t since = atomic_load_explicit(&of->since, memory_order_acquire);
-    *topic = atomic_load_explicit(&of->topic, memory_order_relaxed);
-    return since;
+    return publishing_since(&of->publishing, topic);
 }
 
 bool client_deadmen_stop(struct client_deadmen *of) {
-    struct timespec until = patience();
-    if (!of->has_started || of->has_stopped) return !of->group->is_left;
+    if (!of->has_started || of->has_stopped) return !of->group->is_abandoned;
     of->has_stopped = true;
     atomic_store(&of->is_stopping, true);
     wake_up(of);
-    pthread_mutex_lock(&of->group->lock);
-    while (!of->has_ended && !pthread_cond_timedwait(&of->changed, &of->group->lock, &until)) {}
-    bool has_ended = of->has_ended;
-    of->group->is_left = !has_ended;
-    pthread_mutex_unlock(&of->group->lock);
-    if (has_ended) pthread_join(of->thread, NULL);
-    else pthread_detach(of->thread);
-    return has_ended;
+    return thread_end(of->thread, &of->group->lock, &of->changed, &of->has_ended, &of->group->is_abandoned);
 }

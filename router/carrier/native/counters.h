@@ -15,6 +15,19 @@ static inline void counter_add(counter *counters, uint32_t index, int64_t amount
     atomic_store_explicit(&counters[index], now + amount, memory_order_relaxed);
 }
 
+/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for what is slower and one for the sum follow. */
+enum { HISTOGRAM_BOUNDS = 12 };
+
+/* Count a duration in ns in the histogram that begins at this counter. */
+static inline void count_duration(counter *counters, uint32_t histogram, int64_t elapsed) {
+    static const int64_t BOUNDS[HISTOGRAM_BOUNDS] = {10000,   20000,   50000,   100000,  200000,   500000,
+                                                     1000000, 2000000, 5000000, 10000000, 20000000, 50000000};
+    uint32_t cell = 0;
+    while (cell < HISTOGRAM_BOUNDS && elapsed > BOUNDS[cell]) cell++;
+    counter_add(counters, histogram + cell, 1);
+    counter_add(counters, histogram + HISTOGRAM_BOUNDS + 1, elapsed);
+}
+
 static inline void counter_set(counter *counters, uint32_t index, int64_t value) {
     atomic_store_explicit(&counters[index], value, memory_order_relaxed);
 }

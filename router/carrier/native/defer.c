@@ -26,7 +26,7 @@ static void pass_on(struct timers *timers, struct deferral *deferral, const uint
     if (deferral->pacer && !deferral->has_ended && can_leave)
         pacer_queue(timers, deferral->pacer, of, data, size, expires, now);
     else if (!deliver_now(timers->stage, of->to, of->target, data, size, expires, now))
-        timers->is_left = true;
+        timers->is_abandoned = true;
 }
 
 static void exchange(struct output *one, struct output *other) {
@@ -95,7 +95,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
     int64_t period = target->period;
     if (period != deferral->limit.period) {
         release(timers, deferral, timers->stage->now(timers->stage));
-        if (timers->is_left) return;
+        if (timers->is_abandoned) return;
         deferral->limit = (struct limit){period, period - period / 2, -period};
     }
     deferral->of = (struct route_target){to, target};
@@ -105,7 +105,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deferral *deferral = (struct deferral *)timer;
     release(timers, deferral, now);
-    if (timers->is_left) return;
+    if (timers->is_abandoned) return;
     deferral->has_ended = true;
     if (deferral->pacer) pacer_release(timers, deferral->pacer, &deferral->of, now);
     timers_remove(timers, timer);
@@ -120,7 +120,7 @@ bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, 
     pthread_mutex_lock(&timers->lock);
     if (deferral->limit.period && !deferral->has_ended) offer(stage, deferral, data, size, expires, now);
     else pass_on(timers, deferral, data, size, expires, now);
-    bool goes_on = !timers->is_left;
+    bool goes_on = !timers->is_abandoned;
     pthread_mutex_unlock(&timers->lock);
     return goes_on;
 }

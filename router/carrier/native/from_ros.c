@@ -8,8 +8,9 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-#include "carrier_internal.h"
 #include "clock.h"
+#include "priority.h"
+#include "threads.h"
 
 enum {
     TURN = 32, /* messages of one topic before others have their turn */
@@ -23,7 +24,7 @@ struct from_ros {
     pthread_cond_t changed;
     /* Under the lock: */
     const struct ros_set *current, *offered;
-    bool is_stopping, has_ended, is_left;
+    bool is_stopping, has_ended, is_abandoned;
     /* Written by the thread: */
     edition edition; /* of the counters */
     _Atomic uint64_t failures;
@@ -62,7 +63,7 @@ static bool serve_one(struct from_ros *thread, const struct ros_topic *topic) {
         atomic_fetch_add_explicit(&thread->failures, 1, memory_order_relaxed);
     }
     pthread_mutex_lock(&thread->lock);
-    if (error || thread->is_left) return false;
+    if (error || thread->is_abandoned) return false;
     edition_begin(&thread->edition);
     serve_message(thread, topic, &info);
     edition_end(&thread->edition);
@@ -80,7 +81,7 @@ static bool has_subscription(const struct ros_set *set, const void *subscription
 /* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. `next` may be taken back
  * meanwhile. */
 static void serve_rest(struct from_ros *thread, const struct ros_set *set, const struct ros_set *next) {
-    for (uint32_t index = 0; set && !thread->is_left && index < set->count; index++) {
+    for (uint32_t index = 0; set && !thread->is_abandoned && index < set->count; index++) {
         const struct ros_topic *topic = &set->topics[index];
         if (next && thread->offered != next) return;
         if (next && has_subscription(next, topic->subscription)) continue;
@@ -104,7 +105,7 @@ static bool adopt(struct from_ros *thread) {
 
 /* Whether the thread may go on with what it serves. */
 static bool goes_on(struct from_ros *thread) {
-    return !thread->is_left && !thread->is_stopping && !adopt(thread);
+    return !thread->is_abandoned && !thread->is_stopping && !adopt(thread);
 }
 
 static const struct ros_topic *find_topic(const struct ros_set *set, int eventfd) {
@@ -143,7 +144,7 @@ static void *run(void *of) {
     if (thread->is_urgent) run_first();
     else run_in_turn(); /* Fast DDS wakes it with the lock of its reader in hand */
     pthread_mutex_lock(&thread->lock);
-    while (!thread->is_stopping && !thread->is_left) serve_arrivals(thread);
+    while (!thread->is_stopping && !thread->is_abandoned) serve_arrivals(thread);
     serve_rest(thread, thread->current, NULL);
     thread->has_ended = true;
     pthread_cond_broadcast(&thread->changed);
@@ -178,7 +179,7 @@ struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct 
     thread->wake = eventfd(0, EFD_CLOEXEC);
     bool is_open = stage_open(&thread->routing.stage, counters, events, timers);
     if (!is_open || thread->epoll < 0 || thread->wake < 0 || from_ros_watch(thread, thread->wake) ||
-        start_thread(&thread->thread, is_urgent ? "ros urgent" : "ros messages", run, thread)) {
+        thread_start(&thread->thread, is_urgent ? "ros urgent" : "ros messages", run, thread)) {
         from_ros_close(thread);
         return NULL;
     }
@@ -216,19 +217,11 @@ void from_ros_follow(struct from_ros *thread, struct from_ros *other) {
 }
 
 bool from_ros_stop(struct from_ros *thread) {
-    struct timespec until = patience();
     pthread_mutex_lock(&thread->lock);
     thread->is_stopping = true;
-    eventfd_write(thread->wake, 1);
-    while (!thread->has_ended && !pthread_cond_timedwait(&thread->changed, &thread->lock, &until)) {}
-    thread->is_left = !thread->has_ended;
-    bool has_ended = thread->has_ended;
     pthread_mutex_unlock(&thread->lock);
-    if (!has_ended) {
-        pthread_detach(thread->thread);
-        return false;
-    }
-    pthread_join(thread->thread, NULL);
+    eventfd_write(thread->wake, 1);
+    if (!thread_end(thread->thread, &thread->lock, &thread->changed, &thread->has_ended, &thread->is_abandoned)) return false;
     from_ros_close(thread);
     return true;
 }

@@ -9,7 +9,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "carrier.h"
 #include "rcl_types.h"
 #include "route_ros.h"
 

@@ -5,54 +5,38 @@
 #include <string.h>
 #include <time.h>
 
-#include "carrier_internal.h"
 #include "clock.h"
+#include "priority.h"
+#include "route.h"
+#include "threads.h"
 
 struct publish_thread {
     struct stage stage; /* first: what it calls is given this */
     pthread_t thread;
     pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
     pthread_cond_t changed;
-    bool has_ended, is_left; /* under the lock */
+    bool has_ended, is_abandoned; /* under the lock */
     struct publish_change *changes; /* likewise: those that it has not reached, in order */
     _Atomic bool is_stopping;
     _Atomic uint32_t latest; /* generation */
     /* Written by the thread: */
     edition edition;             /* of the counters */
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
-    _Atomic int64_t since;       /* when it entered the middleware, or 0 */
-    _Atomic uint32_t topic;      /* where it did */
+    struct publishing publishing;
     /* Of the thread: */
     struct ring *ring;
-    publish_function *publish;
-    error_function *error;
-    reset_function *reset;
-    struct error_text why; /* the last publication failed */
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
 };
 
 /* ---- the middleware ---- */
 
 /* Publish what was written, without the lock. The counters balance meanwhile: the message waits. */
-static enum publication publish_unlocked(struct stage *stage, const struct target *target, const char **why) {
+static enum publication publish_written(struct stage *stage, const struct target *target, const char **why) {
     struct publish_thread *thread = (struct publish_thread *)stage;
-    struct output *written = &stage->machine.output;
-    struct serialized_message message = {written->data, written->size, written->capacity, ALLOCATOR};
-    const void *publisher = target->topic->publisher;
-    atomic_store_explicit(&thread->topic, target->id, memory_order_relaxed);
-    atomic_store_explicit(&thread->since, monotonic_ns(), memory_order_release);
     edition_end(&thread->edition);
-    pthread_mutex_unlock(&thread->lock);
-    int error = thread->publish(publisher, &message, NULL);
-    if (error) {
-        thread->why = thread->error();
-        thread->reset();
-    }
-    pthread_mutex_lock(&thread->lock);
+    *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &stage->machine.output);
     edition_begin(&thread->edition);
-    atomic_store_explicit(&thread->since, 0, memory_order_relaxed);
-    *why = thread->why.text;
-    return thread->is_left ? LEFT : error ? PUBLISH_FAILED : PUBLISHED;
+    return thread->is_abandoned ? ABANDONED : *why ? PUBLISH_FAILED : PUBLISHED;
 }
 
 /* ---- the thread ---- */
@@ -87,7 +71,7 @@ static void serve_timers(struct publish_thread *thread) {
 /* Go on to a generation, unless it was reached. */
 static void reach(struct publish_thread *thread, uint32_t generation) {
     if (generation <= atomic_load(&thread->generation)) return;
-    while (!thread->is_left && thread->changes && thread->changes->generation <= generation) {
+    while (!thread->is_abandoned && thread->changes && thread->changes->generation <= generation) {
         const struct publish_change *change = thread->changes;
         thread->changes = change->next;
         edition_begin(&thread->edition);
@@ -102,13 +86,13 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
     for (size_t at = 0; at < size;) {
         const struct message_record *record = (const struct message_record *)(thread->records + at);
         reach(thread, record->generation);
-        if (thread->is_left) return false;
+        if (thread->is_abandoned) return false;
         edition_begin(&thread->edition);
         bool goes_on = route_to_topics(&thread->stage, record);
         edition_end(&thread->edition);
         if (!goes_on) return false;
         serve_timers(thread);
-        if (thread->is_left) return false;
+        if (thread->is_abandoned) return false;
         at += record->size;
     }
     return true;
@@ -130,12 +114,12 @@ static void *run(void *of) {
         uint32_t latest = atomic_load(&thread->latest);
         bool is_stopping = atomic_load(&thread->is_stopping);
         size_t size = take(thread, !is_stopping && latest <= atomic_load(&thread->generation));
-        if (thread->is_left || !serve_all(thread, size) || (is_stopping && !size)) break;
+        if (thread->is_abandoned || !serve_all(thread, size) || (is_stopping && !size)) break;
         if (!size) reach(thread, latest);
-        if (!thread->is_left) serve_timers(thread);
-        if (thread->is_left) break;
+        if (!thread->is_abandoned) serve_timers(thread);
+        if (thread->is_abandoned) break;
     }
-    if (!thread->is_left) end_timers(thread);
+    if (!thread->is_abandoned) end_timers(thread);
     thread->has_ended = true;
     pthread_cond_broadcast(&thread->changed);
     pthread_mutex_unlock(&thread->lock);
@@ -159,13 +143,13 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
     struct publish_thread *thread = calloc(1, sizeof *thread);
     if (!thread) return NULL;
     thread->ring = ring;
-    thread->publish = publish;
-    thread->error = error;
-    thread->reset = reset;
+    thread->publishing.publish = publish;
+    thread->publishing.error = error;
+    thread->publishing.reset = reset;
     pthread_mutex_init(&thread->lock, NULL);
     condition_open(&thread->changed);
     bool is_open = stage_open(&thread->stage, counters, events, NULL);
-    thread->stage.publish = publish_unlocked;
+    thread->stage.publish = publish_written;
     thread->stage.timers = timers_open_on(&thread->stage, false);
     if (is_open && thread->stage.timers) return thread;
     publish_close(thread);
@@ -175,7 +159,7 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
 struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
                                     error_function *error, reset_function *reset) {
     struct publish_thread *thread = publish_prepare(ring, counters, events, publish, error, reset);
-    if (!thread || !start_thread(&thread->thread, "publish", run, thread)) return thread;
+    if (!thread || !thread_start(&thread->thread, "publish", run, thread)) return thread;
     publish_close(thread);
     return NULL;
 }
@@ -199,25 +183,13 @@ bool publish_has_reached(struct publish_thread *thread, uint32_t generation) {
 }
 
 int64_t publish_since(struct publish_thread *thread, uint32_t *topic) {
-    int64_t since = atomic_load_explicit(&thread->since, memory_order_acquire);
-    *topic = atomic_load_explicit(&thread->topic, memory_order_relaxed);
-    return since;
+    return publishing_since(&thread->publishing, topic);
 }
 
 bool publish_stop(struct publish_thread *thread) {
-    struct timespec until = patience();
     atomic_store(&thread->is_stopping, true);
     ring_wake(thread->ring);
-    pthread_mutex_lock(&thread->lock);
-    while (!thread->has_ended && !pthread_cond_timedwait(&thread->changed, &thread->lock, &until)) {}
-    bool has_ended = thread->has_ended;
-    thread->is_left = !has_ended;
-    pthread_mutex_unlock(&thread->lock);
-    if (!has_ended) {
-        pthread_detach(thread->thread);
-        return false;
-    }
-    pthread_join(thread->thread, NULL);
+    if (!thread_end(thread->thread, &thread->lock, &thread->changed, &thread->has_ended, &thread->is_abandoned)) return false;
     publish_close(thread);
     return true;
 }

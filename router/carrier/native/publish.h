@@ -8,7 +8,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "carrier.h"
+#include "program.h"
 #include "rcl_types.h"
 
 struct publish_thread;

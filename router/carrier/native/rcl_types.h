@@ -1,5 +1,5 @@
 /* What is used of rcl. It has these types in C as well, but its headers need not be there where the library is made:
- * rcl_check.c compares them if they are, and router/ros/rcl.py tries them when the router starts. */
+ * library.c compares them if they are, and router/ros/rcl.py tries them when the router starts. */
 #ifndef RCL_TYPES_H
 #define RCL_TYPES_H
 

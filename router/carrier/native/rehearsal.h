@@ -9,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "carrier.h"
+#include "program.h"
 #include "route_ros.h"
 
 /* What was written down: events (events.h), and records of these kinds. Each begins with `size` and `kind`. */

@@ -1,7 +1,7 @@
 /* What a received datagram comes to: it is routed, sent to the destinations of its route, and handed over to the thread
  * that serves the route's topics; there it comes out of a ring again.
  *
- * Sockets, threads and clocks are the caller's: receive.c, publish.c, and rehearsal.c, which has none. */
+ * Sockets, threads and clocks are the caller's: carrier.c, publish.c, and rehearsal.c, which has none. */
 #ifndef ROUTE_H
 #define ROUTE_H
 
@@ -9,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "carrier.h"
+#include "program.h"
 #include "deliver.h"
 #include "envelope.h"
 #include "freshness.h"
@@ -42,6 +42,8 @@ struct received {
     struct envelope envelope;
 };
 
+enum { ROUTED = -1 };
+
 /* Route and deliver the datagram in `routing->datagram`. Return ROUTED, or the reason why no route takes it. */
 int route_datagram(struct routing *routing, struct received *received);
 
@@ -49,7 +51,7 @@ int route_datagram(struct routing *routing, struct received *received);
 void route_by(struct routing *routing, const struct change *change);
 
 /* Deliver a message that `route_datagram` has put into the ring. Return false if the thread has been
- * given up (LEFT). */
+ * given up (ABANDONED). */
 bool route_to_topics(struct stage *stage, const struct message_record *record);
 
 #endif

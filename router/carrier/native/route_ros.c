@@ -2,7 +2,6 @@
 
 #include <string.h>
 
-#include "carrier_internal.h"
 #include "evaluate.h"
 #include "lists.h"
 

@@ -106,7 +106,7 @@ void timers_remove(struct timers *timers, struct timer *timer) {
 
 /* End all deadmen, or all others, the oldest first: a pacer before the deferrals that pass messages to it. */
 static void end_all(struct timers *timers, bool are_deadmen, int64_t now) {
-    for (struct timer *each = timers->last, *next; each && !timers->is_left; each = next) {
+    for (struct timer *each = timers->last, *next; each && !timers->is_abandoned; each = next) {
         next = each->previous; /* `end` may take it off the list */
         if ((each->kind->adopt == NULL) == are_deadmen) each->kind->end(timers, each, now);
     }
@@ -116,20 +116,20 @@ static void end_all(struct timers *timers, bool are_deadmen, int64_t now) {
 
 void timers_serve(struct timers *timers, int64_t now) {
     pthread_mutex_lock(&timers->lock);
-    for (struct timer *each = timers->first; each; each = timers->is_left ? NULL : each->next)
+    for (struct timer *each = timers->first; each; each = timers->is_abandoned ? NULL : each->next)
         if (each->due <= now) each->kind->serve(timers, each, now);
-    if (!timers->is_left) timers_await_next(timers);
+    if (!timers->is_abandoned) timers_await_next(timers);
     pthread_mutex_unlock(&timers->lock);
 }
 
 void timers_change(struct timers *timers, const struct timer_change *change) {
     pthread_mutex_lock(&timers->lock);
     int64_t now = timers->stage->now(timers->stage);
-    for (uint32_t index = 0; index < change->ended_count && !timers->is_left; index++) {
+    for (uint32_t index = 0; index < change->ended_count && !timers->is_abandoned; index++) {
         struct timer *timer = change->ended[index];
         timer->kind->end(timers, timer, now);
     }
-    for (uint32_t index = 0; index < change->adopted_count && !timers->is_left; index++) {
+    for (uint32_t index = 0; index < change->adopted_count && !timers->is_abandoned; index++) {
         const struct adoption *adoption = &change->adopted[index];
         adoption->timer->kind->adopt(timers, adoption->timer, adoption->to, adoption->target);
     }

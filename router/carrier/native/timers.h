@@ -46,7 +46,7 @@ struct timers {
     pthread_mutex_t lock;
     struct stage *stage;
     bool has_own_stage;
-    bool is_left; /* publishing returned LEFT: nothing of others may be used any more */
+    bool is_abandoned; /* publishing returned ABANDONED: nothing of others may be used any more */
     int timer;    /* timerfd, readable from `wakes_at` on; -1 if the thread of the group waits for that without it */
     /* Nothing is due before (boot clock, ns); NEVER while nothing is due at all. May be read without the lock. It is put off
      * only when timers are served: a command that puts off a deadline costs the same however many timers there are. */

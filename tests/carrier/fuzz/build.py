@@ -25,7 +25,7 @@ from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
 SEEDS_OF_A_SCHEMA = 300
 TARGETS = ("envelope_fuzz", "handle_fuzz", "collect_fuzz")
-INCLUDED = {"handle_fuzz": "receive.c", "collect_fuzz": "collect.c"}
+INCLUDED = {"handle_fuzz": "carrier.c", "collect_fuzz": "collect.c"}
 """What a target includes: it stands in the place of that source."""
 
 

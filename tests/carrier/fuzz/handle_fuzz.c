@@ -3,7 +3,7 @@
 #include <stdlib.h>
 
 #include "defer.h"
-#include "receive.c"
+#include "carrier.c"
 #include "schemas.h"
 
 enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 3 + REASONS };
@@ -86,7 +86,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
         adopted[index].timer = (struct timer *)deferral;
     }
     struct change first = {.program = &program, .timers = {.adopted = adopted, .adopted_count = 3}};
-    carrier_adopt_first(carrier, &first);
+    adopt(carrier, &first);
     carrier_mirror(carrier, ring_open(1 << 15), LOST);
     return 0;
 }

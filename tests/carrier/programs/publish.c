@@ -1,6 +1,7 @@
 /* Programs replace each other without a pause while datagrams come as fast as they can and are published, by a middleware
  * that takes its time now and then, refuses, and is stuck at last. Counters are read, and all ends at some moment. Fails unless each topic gets its messages in order and from a program that is alive, and
  * the counters balance; sanitizers see the rest. A program is freed as soon as nobody can use it. */
+#include "carrier.h"
 #include "publish.h"
 
 #include <pthread.h>

@@ -1,0 +1,87 @@
+/* A program: immutable arrays that router/carrier/program.py makes of a compiled table.
+ *
+ * All arrays belong to the caller and must live until another program was adopted, the ring holds no message that refers to
+ * them, and the receive thread has made another turn since (`carrier_turns`): it may be dropping such a message. */
+#ifndef PROGRAM_H
+#define PROGRAM_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "deadman.h"
+#include "deliver.h"
+#include "envelope.h"
+
+struct route {
+    struct targets sends;     /* destinations, which the receive thread serves */
+    struct targets publishes; /* topics, which the publish thread serves */
+    uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
+};
+
+/* What a sender's messages of a payload case come to: the index of a route, or -1. */
+struct choice {
+    int32_t route;
+    uint32_t received; /* counter */
+};
+
+/* A field of the envelope's oneof. */
+struct payload_case {
+    uint32_t number;
+    int32_t row;        /* of the listener's choices; -1 for a case without a route */
+    uint32_t is_ignored;
+    uint32_t unhandled; /* counter */
+};
+
+/* An endpoint as a listener recognises it. */
+struct peer {
+    uint32_t address; /* host byte order */
+    uint32_t port;    /* 0: any */
+    uint32_t column;  /* of the listener's choices */
+    uint32_t last_seen; /* counter */
+    uint32_t id;        /* of the endpoint, in what is mirrored */
+};
+
+struct listener {
+    int32_t fd;
+    uint32_t id; /* in events, and in what is mirrored */
+    uint32_t repairs;
+    uint32_t keeps_input; /* what it holds at the stop is left for the next process */
+    const struct peer *peers; /* by address; of one address, those with a port first */
+    const struct choice *choices; /* `columns` for each row; the last one is for strangers */
+    uint32_t peer_count, columns;
+    uint32_t received, received_bytes, padded, rejected[REASONS]; /* counters */
+    uint32_t reserved;
+};
+
+struct program {
+    uint32_t generation;
+    uint32_t listener_count, case_count;
+    uint32_t unknown_case; /* counter */
+    const struct wire_schema *schema;
+    const struct listener *listeners;
+    const struct payload_case *cases; /* by number */
+    const struct route *routes;
+};
+
+/* What changes with a program, beside it: done between two datagrams. What ends sends what it holds, then. */
+struct change {
+    const struct program *program;
+    struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
+    struct timer_change timers;
+    uint32_t replaced_count, reserved;
+};
+
+/* A message for topics, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
+struct message_record {
+    uint32_t size, generation;
+    const struct targets *to;
+    int64_t received_at;  /* wall clock */
+    int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct born */
+    uint32_t column;      /* of the sender */
+    uint32_t is_single;   /* the payload is the only field */
+    uint32_t length;      /* of the datagram */
+    uint32_t start, payload_length; /* of the payload, where it is the only field */
+    uint32_t reserved;
+};
+
+#endif
