@@ -26,9 +26,6 @@ from router.compiler.cdr.primitives import (
     put_wide_text,
     scalar_format,
 )
-from router.compiler.cdr.reading import LENGTH, Loop, ReadingCode, Step, Stretch, Take
-from router.compiler.source import Source
-from router.errors import SourceSpan
 from router.gateway.json_types import PLACEHOLDER, Style
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
@@ -58,80 +55,140 @@ _LARGEST_UNIT = 0xFFFF
 
 def encoder(message: MessageType, style: Style) -> Encode:
     """A function that writes messages of this type as JSON. Bytes behind the message are ignored: middlewares pad."""
+    reading = _Reading(style)
+    expression = reading.message(message)
+    reading.unpack()
+    text = _FUNCTION.format("\n".join(reading.lines), expression)
     file = f"<json of {message.name}>"
-    span = SourceSpan(file)
-    out = Source()
-    steps, expression = _Reading(style, out).message(message)
-    with out.block("def encode(cdr):", span):
-        with out.block("try:", span):
-            with out.block("if cdr[:2] != CDR_LE:", span):
-                out.line("refuse(cdr[:2])", span)
-            code = ReadingCode(out, span)
-            code.write(steps)
-            if not code.is_checked:
-                with out.block("if at > len(cdr):", span):
-                    out.line("cut_off(cdr)", span)
-            out.line(f"return dumps({expression}, None, NUMPY)", span)
-        with out.block("except DAMAGED as error:", span):
-            out.line("raise UnreadableError(str(error)) from error", span)
-    text = out.text()
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)  # for tracebacks
-    scope: dict[str, Any] = {**_ENCODING, **out.constants}
+    scope: dict[str, Any] = {**_ENCODING, **reading.constants}
     exec(compile(text, file, "exec"), scope)  # noqa: S102 - generated here; names are rosidl's identifiers
     function: Encode = scope["encode"]
     return function
 
 
-class _Reading:
-    """The steps that read a message, and the expression that is its value for orjson once they are done."""
+_FUNCTION = f"""\
+def encode(cdr):
+    try:
+        if cdr[:2] != CDR_LE:
+            refuse(cdr[:2])
+        at = {len(HEADER)}
+{{}}
+        if at > len(cdr):
+            cut_off(cdr)
+        return dumps({{}}, None, NUMPY)
+    except DAMAGED as error:
+        raise UnreadableError(str(error)) from error
+"""
 
-    def __init__(self, style: Style, out: Source) -> None:
+
+class _Reading:
+    """The lines that read a message from `cdr`, from the offset `at` on. Methods return expressions for orjson.
+
+    Scalars that stand together are unpacked together. Where their alignment puts gaps depends on the last three bits of
+    `at`, so these select one of eight unpackers.
+    """
+
+    def __init__(self, style: Style) -> None:
+        self.lines: list[str] = []
+        self.constants: dict[str, object] = {}
         self._is_wrapped = style is Style.WRAPPED
-        self._out = out
+        self._indent = 8 * " "
+        self._together: list[tuple[str, int, str]] = []  # format, alignment, variable
         self._numbers = count(1)
 
-    def message(self, message: MessageType) -> tuple[list[Step], str]:
-        steps: list[Step] = []
+    def message(self, message: MessageType) -> str:
         members: dict[str, str] = {}
         for field in message.fields or (PLACEHOLDER,):
-            of_field, expression = self._value(field.type)
-            steps += of_field
+            expression = self._value(field.type)
             is_bare = isinstance(field.type, List) or not self._is_wrapped
             members[field.name] = expression if is_bare else f"({expression},)"
-        return steps, "{" + ", ".join(f"{name!r}: {members[name]}" for name in sorted(members)) + "}"
+        return "{" + ", ".join(f"{name!r}: {members[name]}" for name in sorted(members)) + "}"
 
-    def _value(self, declared: Type) -> tuple[list[Step], str]:
+    def unpack(self) -> None:
+        """Append the lines for all that was taken and is not unpacked yet."""
+        if self._together:
+            layouts = (_layout(self._together, phase) for phase in range(8))
+            unpackers = self._constant(tuple((struct.Struct(form).unpack_from, size) for form, size in layouts))
+            self._line(f"unpack, size = {unpackers}[at & 7]")
+            self._line(f"{', '.join(variable for _, _, variable in self._together)}, = unpack(cdr, at)")
+            self._line("at += size")
+            self._together = []
+
+    def _value(self, declared: Type) -> str:
         match declared:
             case MessageType():
                 return self.message(declared)
+            case List(element=MessageType() | String()):
+                return f"in_chunks({self._elements(declared)})"
             case List():
-                return self._list(declared)
+                return self._scalars(declared)
             case String():
-                variable = self._variable()
                 convert = "text" if not declared.wide else "wide_units" if self._is_wrapped else "wide_text"
-                return [LENGTH, Stretch(4 if declared.wide else 1, variable)], f"{convert}({variable})"
+                return f"{convert}({self._stretch(4 if declared.wide else 1)})"
             case _:
-                variable, letter = self._variable(), scalar_format(declared)
-                return [Take(letter, struct.calcsize(letter), variable)], variable
+                letter = scalar_format(declared)
+                return self._take(letter, struct.calcsize(letter))
 
-    def _list(self, declared: List) -> tuple[list[Step], str]:
-        length: list[Step] = [LENGTH] if declared.length is None else []
-        variable = self._variable()
-        if isinstance(declared.element, (MessageType, String)):
-            body, element = self._value(declared.element)
-            return [*length, Loop(declared.length, tuple(body), element, variable)], f"in_chunks({variable})"
+    def _scalars(self, declared: List) -> str:
         letter = scalar_format(declared.element)
         size = struct.calcsize(letter)
         if declared.length is None:
-            return [LENGTH, Stretch(size, variable)], f"{_SEQUENCES[letter]}({variable})"
-        steps: list[Step] = [Take(f"{declared.length * size}s", size, variable)]
+            return f"{_SEQUENCES[letter]}({self._stretch(size)})"
+        array = self._take(f"{declared.length * size}s", size)
         if declared.length > _SHORT:
-            return steps, f"{_SEQUENCES[letter]}({variable})"
-        unpack = self._out.constant("unpack_array", struct.Struct(f"<{declared.length}{letter}").unpack)
-        return steps, f"{unpack}({variable})"
+            return f"{_SEQUENCES[letter]}({array})"
+        return f"{self._constant(struct.Struct(f'<{declared.length}{letter}').unpack)}({array})"
 
-    def _variable(self) -> str:
-        return f"v{next(self._numbers)}"
+    def _elements(self, declared: List) -> str:
+        times = self._take("I", 4) if declared.length is None else declared.length
+        self.unpack()
+        elements = self._name("v")
+        self._line(f"{elements} = []")
+        self._line(f"for _ in range({times}):")
+        self._indent += 4 * " "
+        element = self._value(declared.element)
+        self.unpack()
+        self._line(f"{elements}.append({element})")
+        self._indent = self._indent[4:]
+        return elements
+
+    def _stretch(self, size: int) -> str:
+        """The bytes of a string, or of a sequence of scalars of `size` bytes each."""
+        length, stretch = self._take("I", 4), self._name("v")
+        self.unpack()
+        if size == 8:
+            self._line(f"at += {length} and {len(HEADER)} - at & 7")
+        self._line(f"{stretch} = cdr[at : at + {size} * {length}]")
+        self._line(f"at += {size} * {length}")
+        return stretch
+
+    def _take(self, form: str, alignment: int) -> str:
+        """The variable of what `struct` is to read."""
+        variable = self._name("v")
+        self._together.append((form, alignment, variable))
+        return variable
+
+    def _constant(self, value: object) -> str:
+        name = self._name("c")
+        self.constants[name] = value
+        return name
+
+    def _name(self, prefix: str) -> str:
+        return f"{prefix}{next(self._numbers)}"
+
+    def _line(self, text: str) -> None:
+        self.lines.append(self._indent + text)
+
+
+def _layout(takes: Sequence[tuple[str, int, str]], phase: int) -> tuple[str, int]:
+    """Format for struct, and size, of what begins at an offset with these last three bits."""
+    whole, at = "<", phase
+    for form, alignment, _ in takes:
+        padding = (len(HEADER) - at) % alignment
+        whole += f"{padding}x{form}"
+        at += padding + struct.calcsize(f"<{form}")
+    return whole, at - phase
 
 
 def _refuse(representation: bytes) -> NoReturn:
