@@ -1,90 +1,183 @@
-"""Payloads of constants: what deadmen send in place of commands."""
+"""Messages of constants: what deadmen send in place of commands.
+
+Their expressions are computed here, once. The bytes are those that `lowering` gives constants of any message.
+"""
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Mapping
+import functools
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
-from google.protobuf.message import Message
-
-from router.compiler.expressions.tree import Node
-from router.compiler.namespace import NAMESPACE, fit_length
+from router.compiler.expressions import tree
+from router.compiler.expressions.functions import FUNCTIONS
+from router.compiler.expressions.kinds import INT64, OCTET, UINT64, EnumKind, IntKind, Kind, ListKind
+from router.compiler.expressions.operators import COMPUTED
+from router.compiler.lowering.cdr import cdr_message
+from router.compiler.lowering.expressions import Lowering
+from router.compiler.lowering.messages import Placed
+from router.compiler.lowering.names import Names
+from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.compiler.python import render
 from router.errors import MappingError
-from router.types.model import Float
 from router.types.protobuf import PayloadCase
-from router.types.wire import delimited
 
-_Variables = Mapping[str, object]
+_Variables = Mapping[str, Any]
+
+_RELATIONS: Mapping[tree.Relation, Callable[[Any, Any], bool]] = {
+    tree.Relation.EQUAL: operator.eq,
+    tree.Relation.UNEQUAL: operator.ne,
+    tree.Relation.LESS: operator.lt,
+    tree.Relation.LESS_OR_EQUAL: operator.le,
+    tree.Relation.MORE: operator.gt,
+    tree.Relation.MORE_OR_EQUAL: operator.ge,
+}
 
 
 def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
-    """The envelope of a plan whose expressions read no message.
+    """The envelope of a plan whose expressions read no message. Raises MappingError if there is none."""
+    return _written(plan, lambda lowering, computed: protobuf_message(lowering, computed, case))
 
-    Raises MappingError or ValueError when it cannot be built.
-    """
-    payload = case.message_class()
+
+def constant_message(plan: Record) -> bytes:
+    """The same of a ROS message, as CDR."""
+    return _written(plan, cdr_message)
+
+
+def _written(plan: Record, write: Callable[[Lowering, Record], Sequence[Placed]]) -> bytes:
     try:
-        _fill(payload, plan, {})
-    except (ArithmeticError, LookupError) as error:
+        placed = write(Lowering(Names({})), _record(plan, {}))
+    except (ArithmeticError, LookupError, ValueError) as error:
         raise MappingError(str(error)) from error
-    return delimited(case.number, payload.SerializeToString())
+    return b"".join(operation.data for operation, _ in placed)
 
 
-def _fill(message: Message, plan: Record, variables: _Variables) -> None:
-    for member, made in plan.members:
-        match made:
-            case Leaf():
-                setattr(message, member.name, _leaf(made, variables))
-            case Record():
-                inner = getattr(message, member.name)
-                inner.SetInParent()
-                _fill(inner, made, variables)
-            case Items():
-                for element in made.items:
-                    _add(getattr(message, member.name), element, variables)
-            case Each():
-                _add_each(getattr(message, member.name), made, variables)
-            case Unset():
-                pass
+# plans
 
 
-def _add(repeated: Any, element: Plan, variables: _Variables) -> None:
-    """Append an element, or set an entry of a map: of two with the same key the later one stays."""
-    match element:
+def _record(plan: Record, variables: _Variables) -> Record:
+    members = tuple((member, _computed(made, variables)) for member, made in plan.members)
+    return Record(plan.type, members, plan.span)
+
+
+def _computed(plan: Plan, variables: _Variables) -> Plan:
+    """The plan with constants in place of expressions."""
+    match plan:
         case Leaf():
-            repeated.append(_leaf(element, variables))
-        case Record() if element.type.is_map_entry:
-            plans = {member.name: made for member, made in element.members}
-            key, value = _leaf(plans["key"], variables), plans["value"]
-            if isinstance(value, Record):
-                repeated[key].Clear()
-                _fill(repeated[key], value, variables)
-            else:
-                repeated[key] = _leaf(value, variables)
+            return Leaf(plan.type, _constant(_value(plan.node, variables), plan), plan.span)
         case Record():
-            _fill(repeated.add(), element, variables)
+            return _record(plan, variables)
+        case Items():
+            return Items(plan.type, tuple(_computed(item, variables) for item in plan.items), plan.span)
+        case Each():
+            items = tuple(_computed(plan.element, each) for each in _turns(plan.lists, variables))
+            wanted = plan.type.bound if plan.type.length is None else plan.type.length
+            if wanted is not None and (len(items) > wanted or plan.type.length not in (None, len(items))):
+                raise MappingError(f"{len(items)} elements do not fit {plan.type}")
+            return Items(plan.type, items, plan.span)
+        case Unset():
+            return plan
 
 
-def _add_each(repeated: Any, each: Each, variables: _Variables) -> None:
-    names, values = zip(*((name, _value(node, variables)) for name, node in each.lists), strict=True)
-    length, bound = each.type.length, each.type.bound
-    if length is not None:
-        fit_length(values[0], length, length)
-    elif bound is not None:
-        fit_length(values[0], 0, bound)
+def _constant(value: Any, plan: Leaf) -> tree.Node:
+    if not isinstance(value, bytes):
+        return tree.Constant(plan.node.kind, plan.span, value)
+    octets = tree.Listed(ListKind(OCTET, len(value)), plan.span, tuple(tree.whole(each, plan.span) for each in value))
+    return tree.Call(plan.node.kind, plan.span, "octets", (octets,))
+
+
+def _turns(lists: Sequence[tuple[str, tree.Node]], variables: _Variables) -> Iterator[_Variables]:
+    """The variables for the elements of lists side by side."""
+    values = [_value(node, variables) for _, node in lists]
     for elements in zip(*values, strict=True):
-        _add(repeated, each.element, {**variables, **dict(zip(names, elements, strict=True))})
+        yield {**variables, **{name: element for (name, _), element in zip(lists, elements, strict=True)}}
 
 
-def _leaf(plan: Plan, variables: _Variables) -> Any:
-    assert isinstance(plan, Leaf)  # noqa: S101 - where a scalar is filled
-    value = _value(plan.node, variables)
-    return NAMESPACE["float32"](value) if plan.type == Float(32) else value  # type: ignore[operator]  # it is a function
+# expressions
 
 
-def _value(node: Node, variables: _Variables) -> Any:
-    made = ast.fix_missing_locations(ast.Expression(render(node)))
-    return eval(compile(made, "a constant", "eval"), {**NAMESPACE, **variables})  # noqa: S307 - of a checked expression
+def _value(node: tree.Node, variables: _Variables) -> Any:  # noqa: C901, PLR0912 - a case a node
+    match node:
+        case tree.Constant():
+            return node.value
+        case tree.Variable():
+            return variables[node.name]
+        case tree.Element():
+            return _value(node.values, variables)[node.index]
+        case tree.Listed():
+            return [_value(item, variables) for item in node.items]
+        case tree.Each():
+            return [_value(node.element, each) for each in _turns(node.lists, variables)]
+        case tree.Unary(operator=tree.Operator.NOT):
+            return not _value(node.operand, variables)
+        case tree.Unary():
+            return _fitting(-_value(node.operand, variables), node.kind)
+        case tree.Binary():
+            operands = _value(node.left, variables), _value(node.right, variables)
+            return _fitting(COMPUTED[node.operator](*operands), node.kind)
+        case tree.Compare():
+            values = (_value(operand, variables) for operand in node.operands)
+            pairs = zip(node.relations, pairwise(values), strict=True)
+            return all(_RELATIONS[relation](*pair) for relation, pair in pairs)
+        case tree.Contains():
+            sought = _value(node.sought, variables)
+            return any(each == sought for each in _value(node.values, variables)) is not node.is_negated
+        case tree.Logic():
+            return (all if node.is_all else any)(_value(operand, variables) for operand in node.operands)
+        case tree.Choice():
+            return _value(node.body if _value(node.test, variables) else node.orelse, variables)
+        case tree.Call():
+            return _result(node, [_value(argument, variables) for argument in node.arguments])
+        case tree.Read() | tree.Present():
+            raise AssertionError("a constant reads no message")
+
+
+def _fitting(value: Any, kind: Kind) -> Any:
+    """The value. Raises MappingError for an integer outside of the range of its kind."""
+    if isinstance(kind, IntKind) and not kind.low <= value <= kind.high:
+        raise MappingError(f"{value} is outside {kind.low}..{kind.high}")
+    return value
+
+
+def _result(node: tree.Call, arguments: Sequence[Any]) -> Any:
+    """The result of a function, or of one of `tree.CHECKS`."""
+    value, *others = arguments
+    match node.function:
+        case "fit":
+            return _fitting(value, IntKind(*others))
+        case "fit_text":
+            return _of_size(value, *others)
+        case "octets":
+            return bytes(value)
+        case "named" | "member":
+            return _of_enum(value, node.kind)
+        case "sum":
+            return _sum(value, node.kind)
+        case name:
+            return FUNCTIONS[name].implementation(*arguments)
+
+
+def _of_size(value: str | bytes, most: int) -> str | bytes:
+    size = len(value.encode() if isinstance(value, str) else value)
+    if size > most:
+        raise MappingError(f"{size} bytes are more than {most}")
+    return value
+
+
+def _of_enum(value: str | int, kind: Kind) -> int:
+    """The number of an enum's value, which is given by name or number."""
+    assert isinstance(kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
+    for name, number in kind.enum.values:
+        if value in (name, number):
+            return number
+    raise MappingError(f"{value!r} is no value of {kind.enum.name}")
+
+
+def _sum(values: Sequence[Any], kind: Kind) -> Any:
+    """Of integers, each partial sum has to fit."""
+    if isinstance(kind, IntKind):
+        limits = UINT64 if kind.high > INT64.high else INT64
+        return functools.reduce(lambda total, value: _fitting(total + value, limits), values, 0)
+    return functools.reduce(operator.add, values, 0.0)

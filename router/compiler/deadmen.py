@@ -221,7 +221,7 @@ def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | No
         return None
     try:
         return constant_envelope(plan, case)
-    except (MappingError, ValueError) as error:
+    except MappingError as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
 

@@ -5,13 +5,11 @@ Clashes of their addresses are checked in `network`, those of their topics in `t
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 
-from router.compiler.cdr import write_message
+from router.compiler.constants import constant_message
 from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
 from router.compiler.lookup import Lookup
-from router.compiler.namespace import constant_bytes
 from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.selection import pattern_problem
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
@@ -90,8 +88,8 @@ def _deadman(
     if plan is None:
         return None
     try:
-        message = constant_bytes(lambda out: write_message(out, plan, "constant"), span)
-    except (MappingError, ValueError, struct.error) as error:
+        message = constant_message(plan)
+    except MappingError as error:
         lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
         return None
     return deadman_plan(f"{gateway.name}:{name}", deadman, [(name, message)])

@@ -6,8 +6,8 @@ A value that a field cannot hold raises MappingError.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
-from typing import Any, TypeVar
+from collections.abc import Collection, Iterable, Mapping, Sequence, Sized
+from typing import TypeVar
 
 from router.compiler.cdr.primitives import (
     CDR_LE,
@@ -26,8 +26,7 @@ from router.compiler.cdr.primitives import (
     want_length,
 )
 from router.compiler.expressions.functions import FUNCTIONS
-from router.compiler.source import Source
-from router.errors import MappingError, SourceSpan
+from router.errors import MappingError
 from router.types.framing import trimmed
 
 MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
@@ -137,19 +136,3 @@ NAMESPACE: Mapping[str, object] = {
     "CDR_LE": CDR_LE,
     "trimmed": trimmed,
 }
-
-
-def constant_bytes(write: Callable[[Source], str], span: SourceSpan) -> bytes:
-    """Run now what `write` appends to a function, and return the bytes that its expression gives.
-
-    For plans whose expressions read no message. Raises MappingError, ValueError or struct.error if they give none.
-    """
-    out = Source()
-    with out.block("def build():", span):
-        out.line(f"return {write(out)}", span)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile(span.file), namespace)  # noqa: S102 - code that we made of a checked plan
-    try:
-        return bytes(namespace["build"]())
-    except (ArithmeticError, LookupError) as error:
-        raise MappingError(str(error)) from error

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Union
 
-from router.compiler.expressions.tree import Node, constant_of
+from router.compiler.expressions.tree import Call, Node, constant_bytes, constant_of
 from router.errors import SourceSpan
 from router.types.model import Field, List, MessageType, Type
 
@@ -23,7 +23,9 @@ class Leaf:
     span: SourceSpan
 
     @property
-    def constant(self) -> bool | int | float | str | None:
+    def constant(self) -> bool | int | float | str | bytes | None:
+        if isinstance(self.node, Call) and self.node.function == "octets":
+            return constant_bytes(self.node)
         return constant_of(self.node)
 
 

@@ -100,7 +100,7 @@ _RELATIONS: Mapping[type[ast.cmpop], Relation] = {
     ast.Gt: Relation.MORE,
     ast.GtE: Relation.MORE_OR_EQUAL,
 }
-_COMPUTED: Mapping[Operator, Callable[[Any, Any], Any]] = {
+COMPUTED: Mapping[Operator, Callable[[Any, Any], Any]] = {
     Operator.ADD: operator.add,
     Operator.SUBTRACT: operator.sub,
     Operator.MULTIPLY: operator.mul,
@@ -178,7 +178,7 @@ def folded(made: Binary) -> Binary | Constant:
     if left is None or right is None:
         return made
     try:
-        value = _COMPUTED[made.operator](left, right)
+        value = COMPUTED[made.operator](left, right)
     except ArithmeticError as error:
         raise ExpressionError(made.span, Code.OUT_OF_RANGE, str(error)) from None
     if isinstance(value, float) and not math.isfinite(value):
@@ -192,7 +192,7 @@ def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:
     """Integers that include the smallest and the largest value of `left op right`."""
     bounds, (low, high) = (left.low, left.high), (right.low, right.high)
     if op in _MONOTONE:
-        return [_COMPUTED[op](x, y) for x in bounds for y in (low, high)]
+        return [COMPUTED[op](x, y) for x in bounds for y in (low, high)]
     if op is Operator.POWER:
         return [left.low**high, left.high**high, *[0] * (left.low < 0 < left.high)]
     if op is Operator.MODULO:  # has the divisor's sign

@@ -211,6 +211,14 @@ def constant_of(node: Node) -> bool | int | float | str | None:
     return node.value if isinstance(node, Constant) else None
 
 
+def constant_bytes(octets: Call) -> bytes | None:
+    """What a call of `octets` gives, if all its integers are Constants."""
+    (values,) = octets.arguments
+    if not isinstance(values, Listed) or not all(isinstance(item, Constant) for item in values.items):
+        return None
+    return bytes(int(item.value) for item in values.items if isinstance(item, Constant))
+
+
 def whole(number: int, span: SourceSpan) -> Constant:
     """An integer."""
     return Constant(IntKind(number, number), span, number)

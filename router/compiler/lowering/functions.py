@@ -195,8 +195,8 @@ def _fit_text(lowering: Lowering, node: tree.Call) -> Routine:
 
 def _octets(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
-    if isinstance(first, tree.Listed) and all(isinstance(item, tree.Constant) for item in first.items):
-        return (text(bytes(int(item.value) for item in first.items if isinstance(item, tree.Constant))),)
+    if (known := tree.constant_bytes(node)) is not None:
+        return (text(known),)
     made = lists.stored(lowering, first)
     return made.routine if made.is_octets else routine(made.routine, Operation(Op.OCTETS, flag=made.scalar))
 

@@ -106,15 +106,16 @@ def _tag(to: FieldDescriptor) -> int:
 # ---- known bytes
 
 
-def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
+def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
     """A constant without its tag."""
     write = kind_of(to).write
     if write is Op.WRITE_FLOAT:
         return struct.pack("<f", value)
     if write is Op.WRITE_DOUBLE:
         return struct.pack("<d", value)
-    if isinstance(value, str):
-        return varint(len(value.encode())) + value.encode()
+    if isinstance(value, (str, bytes)):
+        data = value.encode() if isinstance(value, str) else value
+        return varint(len(data)) + data
     number = int(value)
     if write is Op.WRITE_FIXED32:
         return struct.pack("<i" if number < 0 else "<I", number)
@@ -123,7 +124,7 @@ def _encoded(value: bool | float | str, to: FieldDescriptor) -> bytes:
     return varint(number << 1 ^ number >> 63 if write is Op.WRITE_ZIGZAG else number)
 
 
-def _is_set(value: bool | float | str, to: FieldDescriptor) -> bool:
+def _is_set(value: bool | float | str | bytes, to: FieldDescriptor) -> bool:
     """Whether a constant is not zero, which has no presence. Minus zero is not."""
     is_real = kind_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
