@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
-MODULES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROUTER.rglob("*.py"))}
 
 GROUND = "declared errors assets clock log threads"
 LANGUAGE = "declared errors assets table types compiler"
@@ -41,6 +41,11 @@ PURE = {"declared", "errors", "table", "types", "values", "compiler", "datagrams
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 
+@cache
+def modules() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROUTER.rglob("*.py"))}
+
+
 def imports(tree: ast.Module) -> Iterator[tuple[str, str | None, int]]:
     """The imports anywhere in a module, also those for types: (module, name or None, line)."""
     for node in ast.walk(tree):
@@ -68,14 +73,14 @@ def where(path: Path, line: int) -> str:
 
 
 def test_the_table_has_every_package_and_no_circle() -> None:
-    assert {package(path) for path in MODULES} - {None} == set(IMPORTS)
+    assert {package(path) for path in modules()} - {None} == set(IMPORTS)
     list(TopologicalSorter({name: allowed.split() for name, allowed in IMPORTS.items()}).static_order())
 
 
 def test_packages_import_what_the_table_allows() -> None:
     wrong = [
         f"{where(path, line)}: {own} imports {other}"
-        for path, tree in MODULES.items()
+        for path, tree in modules().items()
         if (own := package(path)) is not None
         for module, name, line in imports(tree)
         if (other := imported_package(module, name)) not in {None, own, *IMPORTS[own].split()}
@@ -86,7 +91,7 @@ def test_packages_import_what_the_table_allows() -> None:
 def test_no_module_imports_the_tests() -> None:
     wrong = [
         where(path, line)
-        for path, tree in MODULES.items()
+        for path, tree in modules().items()
         for module, _, line in imports(tree)
         if module.partition(".")[0] == "tests"
     ]
@@ -96,7 +101,7 @@ def test_no_module_imports_the_tests() -> None:
 def test_pure_packages_touch_no_socket_thread_loop_or_ros() -> None:
     wrong = [
         f"{where(path, line)}: imports {module}"
-        for path, tree in MODULES.items()
+        for path, tree in modules().items()
         if package(path) in PURE
         for module, _, line in imports(tree)
         if module.partition(".")[0] in IMPURE_MODULES
@@ -107,7 +112,7 @@ def test_pure_packages_touch_no_socket_thread_loop_or_ros() -> None:
 def test_rclpy_is_imported_in_ros_alone() -> None:
     wrong = [
         where(path, line)
-        for path, tree in MODULES.items()
+        for path, tree in modules().items()
         if package(path) != "ros"
         for module, _, line in imports(tree)
         if module.partition(".")[0] == "rclpy"
@@ -118,7 +123,7 @@ def test_rclpy_is_imported_in_ros_alone() -> None:
 def test_no_module_imports_private_names_of_another_package() -> None:
     wrong = [
         f"{where(path, line)}: {module}.{name}"
-        for path, tree in MODULES.items()
+        for path, tree in modules().items()
         for module, name, line in imports(tree)
         if imported_package(module, name) not in {None, package(path)}
         and any(part.startswith("_") for part in [*module.split("."), name or ""])
@@ -127,4 +132,4 @@ def test_no_module_imports_private_names_of_another_package() -> None:
 
 
 def test_every_module_has_a_docstring() -> None:
-    assert [str(path) for path, tree in MODULES.items() if tree.body and not ast.get_docstring(tree)] == []
+    assert [str(path) for path, tree in modules().items() if tree.body and not ast.get_docstring(tree)] == []
