@@ -182,7 +182,7 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (GOOD, "{none: nothing moves because of it}", "500ms", "deadman: 500ms", "{none: why} where there is none"),
         (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "its place only beside a topic"),
         (GOOD, "for_each: detections", "collect: {}", "collect: {}", "it has no place beside a topic"),
-        (GOOD, "source: [basestation, sensor_board]\n      collect", "collect", "- collect", 'Missing property "source"'),
+        (GOOD, "source: [basestation, sensor_board]\n      ", "", "- collect", 'Missing property "source"'),
         (GATEWAYS, "tcp: 0.0.0.0:8600", "tpc: 0.0.0.0:8600", "tpc", "must be one of udp, tcp"),
         (GATEWAYS, "json_lines", "gateway_v2", "format: gateway_v2\n    max", "must be 'gateway_v1' or 'json_lines'"),
         (GATEWAYS, "8765}", "8765}\n    receive: 10.0.0.230:1", "receive: 10.0.0.230:1", "of a udp gateway"),
