@@ -103,13 +103,6 @@ def test_the_map_says_how_much_can_be_saved(running: FakeRunning) -> None:
         assert shown.map()["keeps"] == 60.0
 
 
-def test_what_is_wrong_is_told_in_words(running: FakeRunning, shown: Status) -> None:
-    running.count("config_last_reload_successful", to=1)
-    assert shown.numbers()["problems"] == []
-    running.is_stuck = True
-    assert [problem["words"] for problem in shown.numbers()["problems"]] == ["the receive thread is stuck"]
-
-
 def test_a_last_value_comes_from_what_is_received_while_somebody_looks(running: FakeRunning, shown: Status) -> None:
     running.receive(imu(accel_x=1.0), BOARD)
     assert shown.numbers()["values"] == {}  # nobody was looking

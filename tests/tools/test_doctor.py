@@ -98,11 +98,6 @@ def test_message_types_are_counted(table: Path) -> None:
     assert found.text.endswith(", and 1 message type of the table")
 
 
-def test_a_library_that_is_up_to_date_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor_checks, "load", lambda: None)
-    assert gist(carrier(), "up to date")[0] == (Grade.FINE, True)
-
-
 def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise PermissionError

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.documents import data_document, schema_document
-from router.gateway.packets import Packet, datagrams, pack
+from router.gateway.packets import Packet, pack
 from router.tools.gateway_client import GatewayClient, topic_filter
-from router.tools.gateway_messages import Heard, Message, Problem, Schema, Shape, json_line, pieces
+from router.tools.gateway_messages import Heard, Message, Schema, Shape, json_line, pieces
 from router.tools.gateway_sources import Arrival, Source, open_source
 from tests.ports import free_port
 
@@ -63,14 +63,6 @@ def arrivals(*packets: bytes, sender: object = "a") -> list[Arrival]:
     return [Arrival(data, sender) for data in packets]
 
 
-def test_batches_become_packets() -> None:
-    packets = [packet(SCHEMA), packet('{"x":[1]}'), packet(json.dumps({"x": ["y" * 5000]}))]
-    sent = arrivals(*datagrams(packets, 1400, 5.0))
-    listening, source = GatewayClient(EVERY), Played(sent)
-    assert [type(one) for one in heard(listening, source)] == [Schema, Message, Message]
-    assert str(listening.tally(source)) == "2 messages, 1 schemas, 0 undecodable, 0 lost"
-
-
 def test_a_message_before_its_schema_is_shown_and_counted() -> None:
     sent = arrivals(packet('{"x":[1]}'), packet(SCHEMA), packet('{"x":[2]}'))
     listening, source = GatewayClient(EVERY), Played(sent)
@@ -86,13 +78,6 @@ def test_another_sender_has_to_send_its_schema_first() -> None:
     assert listening.tally(source).early == 1
 
 
-def test_other_topics_are_counted_and_not_shown() -> None:
-    sent = arrivals(packet(SCHEMA, "/a"), packet('{"x":[1]}', "/a"), packet(SCHEMA, "/b"), packet('{"x":[2]}', "/b"))
-    listening, source = GatewayClient(lambda topic: topic == "/b"), Played(sent)
-    assert [getattr(one, "topic", None) for one in heard(listening, source)] == ["/b", "/b"]
-    assert str(listening.tally(source)) == "1 messages, 2 schemas, 0 undecodable, 0 lost, 1 of other topics"
-
-
 def test_schemas_of_other_topics_are_not_shown() -> None:
     schemas = [schema_document(name, 5.0, SCHEMA) for name in ("p/msg/S", "p/msg/T", "p/msg/U")]
     values = [data_document(topic, name, 5.0, b'{"x":1}') for topic, name in (("/a", "p/msg/S"), ("/b", "p/msg/T"))]
@@ -102,16 +87,6 @@ def test_schemas_of_other_topics_are_not_shown() -> None:
     assert schema.type_name == "p/msg/T"
     assert [type(one) for one in messages] == [Message, Message]
     assert str(listening.tally(source)) == "2 messages, 3 schemas, 0 undecodable, 0 lost, 1 of other topics"
-
-
-def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
-    batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0))
-    listening, source = GatewayClient(EVERY), Played(arrivals(b"", b"garbage and more", batch))
-    *problems, last = heard(listening, source)
-    assert problems[0] == Problem("0 bytes are no packet", b"")
-    assert [getattr(each, "data", None) for each in problems] == [b"", b"garbage and more", packet("no JSON")]
-    assert isinstance(last, Message)
-    assert listening.tally(source).undecodable == 3
 
 
 NAMES = ["op", "name", "namespace", "fields", "time", "topic", "type", "is_array", "subtype", "x", "data", "schema"]
@@ -157,10 +132,6 @@ def test_schemas_are_asked_for_until_one_came(monkeypatch: pytest.MonkeyPatch) -
     source = Patient(arrivals(packet(SCHEMA)))
     heard(GatewayClient(EVERY), source)
     assert source.asked == 3
-
-
-def test_listening_ends_when_its_time_is_over() -> None:
-    assert list(GatewayClient(EVERY).hear(Played([], [], []), 0.0)) == []
 
 
 def silent(line: str) -> None:

@@ -23,14 +23,6 @@ def test_speed_heading_and_turn_rate_belong_to_the_walked_path() -> None:
         assert (there.heading - here.heading) / step == pytest.approx(here.turn_rate, rel=2e-2, abs=1e-2)
 
 
-def test_the_walk_is_a_closed_path_without_jumps() -> None:
-    for second in range(120):
-        here, there = pose(second, EPOCH), pose(second + 1, EPOCH)
-        assert math.dist((here.north, here.east), (there.north, there.east)) < 1
-    start, end = pose(0, EPOCH), pose(120, EPOCH)
-    assert (start.north, start.east) == pytest.approx((end.north, end.east), abs=1e-9)
-
-
 @pytest.fixture(scope="module")
 def rover() -> Wire:
     return wire_of_protos(PROTOS)

@@ -41,12 +41,6 @@ def test_an_endpoint_known_by_its_source_port_sends_from_it(table_path: Callable
     assert name_of(("127.0.6.10", 1)) == "127.0.6.10:1"
 
 
-def test_peers_are_named_by_their_address(table: RouteTable) -> None:
-    name_of = udp.peer_names(table)
-    assert name_of(("127.0.6.30", 12345)) == "board"
-    assert name_of(("127.0.0.1", 12345)) == "127.0.0.1:12345"
-
-
 def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
         first.bind(("127.0.0.1", 0))
@@ -67,8 +61,3 @@ def test_a_port_where_nobody_listens_is_noticed_and_does_not_stop_the_sending() 
         sent = Sent()
         send(sender, nobody, b"hello", 3, None, sent)
     assert (sent.count, sent.refused) == (3, 3)
-
-
-def test_one_datagram_alone_has_no_rate() -> None:
-    assert Sent(count=1, seconds=0.0).rate == 0
-    assert Sent(count=11, seconds=2.0).rate == 5
