@@ -12,17 +12,10 @@ from typing import TypeVar
 from router.compiler.cdr.primitives import (
     CDR_LE,
     HEADER,
-    cut_off,
-    numbers,
     put_length,
     put_numbers,
     put_text,
     put_wide_text,
-    read_text,
-    read_texts,
-    read_wide_text,
-    read_wide_texts,
-    refuse,
     want_length,
 )
 from router.compiler.expressions.functions import FUNCTIONS
@@ -127,7 +120,6 @@ _CALLED = (
     checked_text, checked_texts, fit, fit_length, fit_text, named, member, octets,
     side_by_side, contains, total, whole_total,
     put_text, put_wide_text, put_numbers, put_length, want_length,
-    refuse, cut_off, read_text, read_texts, read_wide_text, read_wide_texts, numbers,
 )  # fmt: skip
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},

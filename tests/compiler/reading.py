@@ -1,22 +1,14 @@
-"""Compiled readers of CDR bytes, what they may be asked for, and what they read in a form that compares."""
+"""ROS messages to be read, and what is read of them in a form that compares."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from hypothesis import strategies as st
 
-from router.compiler.cdr.reading import CdrReads
 from router.compiler.expressions.kinds import TIME_TYPES
-from router.compiler.namespace import NAMESPACE
-from router.compiler.source import Source, placed
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.compiling import SPAN
 from tests.compiler.generated_types import INTS
-
-Path = tuple[str, ...]
-WHOLE: Path = ()
 
 TIMES = tuple(
     MessageType(name, (Field("sec", Int(32, signed=True)), Field("nanosec", Int(32, signed=False))))
@@ -24,33 +16,6 @@ TIMES = tuple(
 )
 _NAMES = ["from", "in", "is", "class", "count", "index", "a", "a_b", "b", "b_c", "c", "item", "length", "at", "header"]
 """Of fields. Some are Python's, some methods of tuples, some run together when they are put side by side."""
-
-
-def paths(declared: MessageType, holder: Path = ()) -> Iterator[tuple[Path, Type]]:
-    """Everything in a message that expressions reach by name, times being values."""
-    yield holder, declared
-    for member in declared.fields:
-        path = (*holder, member.name)
-        if isinstance(member.type, MessageType) and member.type.name not in TIME_TYPES:
-            yield from paths(member.type, path)
-        else:
-            yield path, member.type
-
-
-def at(declared: MessageType, path: Path) -> Type:
-    return dict(paths(declared))[path]
-
-
-def reader(declared: MessageType, wanted: Sequence[Path]) -> tuple[str, Callable[[bytes], list[Any]]]:
-    """The code, and as a function what it reads at each of `wanted`, in this order."""
-    reads, out = CdrReads(declared, wanted), Source()
-    nodes = [placed(reads.values[path], SPAN) for path in wanted]
-    with out.block("def read(cdr):", SPAN):
-        reads.write(out, SPAN)
-        out.line(f"return [{', '.join(map(out.expression, nodes))}]", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return out.text(), namespace["read"]
 
 
 def plain(value: Any, declared: Type) -> Any:
@@ -77,11 +42,6 @@ def field_values(value: Any, declared: Type) -> Any:
             return [field_values(element, declared.element) for element in value]
         case _:
             return value
-
-
-def wanted_paths(declared: MessageType) -> st.SearchStrategy[list[Path]]:
-    known = [path for path, _ in paths(declared)]
-    return st.lists(st.sampled_from(known), max_size=5, unique=True)
 
 
 # types

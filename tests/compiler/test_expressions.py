@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import struct
 from collections.abc import Mapping
@@ -13,7 +12,6 @@ import pytest
 from hypothesis import strategies as st
 
 from router.compiler import plan
-from router.compiler.cdr import CdrReads
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import (
@@ -28,7 +26,6 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     kind_of,
 )
-from router.compiler.expressions.scope import field_of
 from router.compiler.expressions.tree import (
     Binary,
     Each,
@@ -38,13 +35,10 @@ from router.compiler.expressions.tree import (
     Variable,
     constant_of,
     path_of,
-    paths_in,
 )
 from router.compiler.mapping import build
-from router.compiler.namespace import NAMESPACE
 from router.compiler.python import render
 from router.compiler.source import Source
-from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import (
     SPAN,
@@ -60,7 +54,6 @@ from tests.compiler.compiling import (
 from tests.compiler.generated_types import values
 from tests.compiler.machine import FAILURES
 from tests.compiler.reading import TIMES
-from tests.oracles.reference import Value
 from tests.oracles.reference_expressions import evaluate
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
@@ -389,66 +382,14 @@ DECLARED = MessageType(
 )
 
 
-def box(name: str, area: float, seconds: int) -> dict[str, Value]:
-    return {"from": name, "area": area, "seen": {"sec": seconds, "nanosec": 5}}
-
-
-SCENE: dict[str, Value] = {
-    "left": box("left", 1.0, 1), "use_left": True, "right": box("right", 2.0, 2),
-    "boxes": [box("first", 3.0, 3), box("second", 4.0, -4)], "item": 9, "names": ["a", "b"],
-    "stamp": {"sec": 7, "nanosec": 8},
-}  # fmt: skip
-
-
 def scope_over(declared: MessageType, names: Mapping[str, Node]) -> Scope:
     return Scope(declared, (), (), names)
 
 
-def evaluated(text: str, **given: Any) -> Any:
-    """What an expression comes to; `given` are elements of `boxes` by the names that they have beside the fields."""
-    names = {name: Variable(kind_of(BOX), SPAN, name) for name in given}
-    node, out = check(written(text), scope_over(DECLARED, names)), Source()
-    reads = CdrReads(DECLARED, paths_in(node))
-    with out.block(f"def evaluate(cdr, {', '.join(given)}):", SPAN):
-        reads.write(out, SPAN)
-        out.line(f"return {out.expression(render(node, reads.values))}", SPAN)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
-    return namespace["evaluate"](cdr(DECLARED, SCENE), **given)
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("left.area + right.area", 3.0),
-        ("stamp", 7_000_000_008),
-        ("left.seen", 1_000_000_005),
-        ("message.item", 9),
-        ("names[1]", "b"),
-        ("len(boxes)", 2),
-        ("boxes[1].area", 4.0),
-        ("boxes[1].seen", -3_999_999_995),
-        ("left.area if use_left else right.area", 1.0),
-        ("right.seen if use_left else left.seen", 2_000_000_005),
-        ("[left, right][1].area", 2.0),
-    ],
-)
-def test_expression_over_a_serialized_message(text: str, value: object) -> None:
-    assert evaluated(text) == value
-
-
 def test_name_beside_the_fields_wins_over_a_field() -> None:
-    (first, _) = evaluated("boxes")
-    assert evaluated("item.area", item=first) == 3.0
-    assert evaluated("item.seen", item=first) == 3_000_000_005
-    assert evaluated("message.item", item=first) == 9
-
-
-def test_element_has_fields_that_are_called_as_keywords_are() -> None:
-    (first, _) = evaluated("boxes")
-    name = field_of(Variable(kind_of(BOX), SPAN, "item"), BOX.fields[0], SPAN)
-    code = compile(ast.Expression(render(name)), "table.yaml", "eval")
-    assert eval(code, {"item": first}) == "first"  # noqa: S307 - what is tested
+    scope = scope_over(DECLARED, {"item": Variable(kind_of(BOX), SPAN, "item")})
+    assert isinstance(check(written("item.area"), scope).kind, FloatKind)
+    assert isinstance(check(written("message.item"), scope).kind, IntKind)
 
 
 def test_misspelt_name_beside_the_fields_is_suggested() -> None:

@@ -1,19 +1,16 @@
-"""Formats of CDR scalars, and the functions that generated code calls to read and write strings, lists and lengths.
+"""Formats of CDR scalars, and functions that write strings, lists and lengths.
 
-Readers take bytes that were cut out of a message and may be anything. Writers append to `data`, the message without
-its header, so that offsets into it are what alignment counts. What cannot be read or written raises MappingError,
-struct.error or UnicodeError.
+They append to `data`, the message without its header, so that offsets into it are what alignment counts. What cannot be
+written raises MappingError, struct.error or UnicodeError.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
-from operator import itemgetter
-from typing import Any
+from collections.abc import Sequence
 
 from router.errors import MappingError
-from router.types.model import Bool, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Float, Int, Type
 
 HEADER = b"\x00\x01\x00\x00"
 """Representation identifier CDR_LE and two option bytes."""
@@ -22,12 +19,6 @@ CDR_LE = HEADER[:2]
 
 _PADDING = tuple(bytes(count) for count in range(8))
 _INTEGERS = {8: "B", 16: "H", 32: "I", 64: "Q"}
-_OTHERS = {
-    b"\x00\x00": "CDR_BE", b"\x00\x02": "PL_CDR_BE", b"\x00\x03": "PL_CDR_LE", b"\x00\x06": "CDR2_BE",
-    b"\x00\x07": "CDR2_LE", b"\x00\x08": "D_CDR2_BE", b"\x00\x09": "D_CDR2_LE", b"\x00\x0a": "PL_CDR2_BE",
-    b"\x00\x0b": "PL_CDR2_LE",
-}  # fmt: skip
-"""Representation identifiers of DDS-XTypes 1.3, table 60, that are not read."""
 
 
 def scalar_format(declared: Type) -> str:
@@ -42,72 +33,6 @@ def scalar_format(declared: Type) -> str:
             return "f" if declared.bits == 32 else "d"
         case _:
             raise AssertionError(f"{declared} is no scalar of a ROS message")
-
-
-# reading
-
-
-def refuse(representation: bytes) -> None:
-    """Raise MappingError for a message in another representation than CDR_LE, or in none."""
-    name = _OTHERS.get(representation, "of an unknown kind")
-    raise MappingError(f"the message is {name} (0x{representation.hex()}), not CDR_LE")
-
-
-def cut_off(cdr: bytes) -> None:
-    """Raise MappingError for a message that ends before its last field."""
-    raise MappingError(f"the message ends after {len(cdr)} bytes, within a string or list")
-
-
-def read_text(data: bytes) -> str:
-    """A string from its bytes with the final NUL, which some writers leave out of empty strings."""
-    if data and data[-1]:
-        raise MappingError("a string does not end with NUL")
-    return data[:-1].decode()
-
-
-def read_wide_text(data: bytes) -> str:
-    """A wstring from its UTF-16 code units of 32 bits each."""
-    units = numbers("I", 4, data)
-    return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
-
-
-def read_texts(many: Iterable[bytes]) -> list[str]:
-    return [read_text(data) for data in many]
-
-
-def read_wide_texts(many: Iterable[bytes]) -> list[str]:
-    return [read_wide_text(data) for data in many]
-
-
-def numbers(letter: str, size: int, data: bytes) -> tuple[int | float, ...]:
-    """Scalars of `size` bytes each."""
-    return struct.unpack(f"<{len(data) // size}{letter}", data)
-
-
-def decoder(declared: Type) -> Callable[[Any], object] | None:
-    """The function that decodes the text of a field, None for other types."""
-    match declared:
-        case String():
-            return read_wide_text if declared.wide else read_text
-        case List(element=String(wide=wide)):
-            return read_wide_texts if wide else read_texts
-        case _:
-            return None
-
-
-def object_class(declared: MessageType) -> type[tuple[object, ...]]:
-    """A class whose objects are made of a tuple of all fields, which are its attributes.
-
-    Text in the tuple is not decoded, text that an attribute gives is. It is a tuple since that is the fastest to make.
-    Fields may have the names of Python keywords.
-    """
-    fields = {member.name: property(_getter(index, member.type)) for index, member in enumerate(declared.fields)}
-    return type(declared.short_name, (tuple,), {"__slots__": (), **fields})
-
-
-def _getter(index: int, declared: Type) -> Callable[[Any], object]:
-    decode = decoder(declared)
-    return itemgetter(index) if decode is None else lambda values: decode(values[index])
 
 
 # writing
