@@ -35,8 +35,7 @@ SHORTEST_REPEAT = 10_000_000
 """ns. Shorter would flood a board, which may still be busy with the last datagram."""
 
 SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 20_000_000, 10 * NS_PER_SECOND
-"""ns. Commands that come within a shorter timeout are rare, and in a longer one a rover gets far: other units are
-meant."""
+"""ns. Commands rarely come more often than the former; within the latter a rover goes far. Other units are meant."""
 
 _NOTHING = MessageType("a deadman")
 """The source message of a deadman's payload: one without fields."""
@@ -95,7 +94,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 def timing_findings(
     deadman: Deadman | InboundDeadman, ttl: Located[int] | None, max_rate: float | None, sends: str
 ) -> Iterator[Diagnostic]:
-    """A deadman that trips while commands come, or that floods; and one whose times are most likely not meant.
+    """Findings for a deadman that trips between commands, or sends too often, or whose times look like a mistake.
 
     `max_rate` (Hz) limits all its commands.
     """
@@ -148,7 +147,7 @@ def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 
 def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """Report other routes with a deadman that command a board between whose commands this deadman would act."""
+    """Report routes with a deadman whose commands to a board this deadman would interrupt."""
     if deadman.disarmed_by == ():
         return
     boards = [to.value for to in deadman.to if to.value in lookup.boards]
