@@ -9,7 +9,7 @@ from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import SourceSpan
-from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
+from router.table.model import Destination, Endpoint, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -45,10 +45,6 @@ class CheckedTarget:
     @property
     def span(self) -> SourceSpan:
         return self.declared.span
-
-    @property
-    def is_board(self) -> bool:
-        return self.endpoint is not None and self.endpoint.kind is EndpointKind.BOARD
 
     @property
     def is_deferred(self) -> bool:
