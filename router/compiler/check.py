@@ -65,7 +65,7 @@ class Checked:
 def check_table(
     path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
 ) -> Checked:
-    """Check a table and everything that it refers to. Never raises for what a person may have written.
+    """Check a table and everything that it refers to. Mistakes in these files are findings, never exceptions.
 
     `environ` fills the table's variables, None means the process environment. Pass one `definitions` to
     several calls to read `.proto` files and ROS interfaces once.

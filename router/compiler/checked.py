@@ -1,4 +1,4 @@
-"""Routes after their checks: plain data from which code is generated and `explain` prints."""
+"""Routes after their checks: plain data for `lowering`, `link` and `explain`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import SourceSpan
-from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
+from router.table.model import Destination, Endpoint, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -18,9 +18,9 @@ from router.types.protobuf import PayloadCase
 class CheckedTarget:
     """A target of a route, as the table declares it, with what its check has found.
 
-    `endpoint` is that of a destination, `type` that of a topic which is published. Without a `plan` the datagram is
-    forwarded unchanged; `rows` show the mapping that the plan was made of. `deadmen` are the routes whose deadmen are
-    fed or disarmed by each command to it.
+    `endpoint` is set for a destination, `type` for a topic that is published. Without a `plan` the datagram is
+    forwarded unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command
+    to it feeds or disarms.
     """
 
     declared: Destination | Topic
@@ -47,12 +47,8 @@ class CheckedTarget:
         return self.declared.span
 
     @property
-    def is_board(self) -> bool:
-        return self.endpoint is not None and self.endpoint.kind is EndpointKind.BOARD
-
-    @property
     def is_deferred(self) -> bool:
-        """Whether it may be served later, and by another thread."""
+        """Whether messages to it may be deferred, and then sent by another thread."""
         has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import functools
 import operator
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +24,7 @@ from router.compiler.lowering.names import Names
 from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import MappingError
+from router.types.board_limits import BoardField, BoardMessage
 from router.types.protobuf import PayloadCase
 
 _Variables = Mapping[str, Any]
@@ -36,22 +39,46 @@ _RELATIONS: Mapping[tree.Relation, Callable[[Any, Any], bool]] = {
 }
 
 
-def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
-    """The envelope of a plan whose expressions read no message. Raises MappingError if there is none."""
-    return _written(plan, lambda lowering, computed: protobuf_message(lowering, computed, case))
+def computed(plan: Record) -> Record:
+    """The plan with constants in place of expressions, which read no message. Raises MappingError."""
+    with _failing():
+        return _record(plan, {})
 
 
-def constant_message(plan: Record) -> bytes:
-    """The same of a ROS message, as CDR."""
-    return _written(plan, cdr_message)
+def envelope_of(plan: Record, case: PayloadCase) -> bytes:
+    """The envelope of a computed payload. Raises MappingError."""
+    with _failing():
+        return _bytes(protobuf_message(Lowering(Names({})), plan, case))
 
 
-def _written(plan: Record, write: Callable[[Lowering, Record], Sequence[Placed]]) -> bytes:
-    try:
-        placed = write(Lowering(Names({})), _record(plan, {}))
-    except (ArithmeticError, LookupError, ValueError) as error:
-        raise MappingError(str(error)) from error
+def cdr_of(plan: Record) -> bytes:
+    """The CDR of a computed ROS message. Raises MappingError."""
+    with _failing():
+        return _bytes(cdr_message(Lowering(Names({})), plan))
+
+
+def _bytes(placed: Sequence[Placed]) -> bytes:
     return b"".join(operation.data for operation, _ in placed)
+
+
+@contextmanager
+def _failing() -> Iterator[None]:
+    """Raise MappingError for a value that there is not, or that does not fit."""
+    try:
+        yield
+    except (ArithmeticError, LookupError, ValueError, struct.error) as error:
+        raise MappingError(str(error)) from error
+
+
+def scalars(plan: Record, fields: BoardMessage) -> Iterator[tuple[BoardField, object]]:
+    """The scalars of a computed payload, each with its field, as far as boards have bounds for it."""
+    for member, made in plan.members:
+        field = fields.get(member.number)
+        for element in made.items if isinstance(made, Items) else (made,):
+            if field is not None and isinstance(element, Record):
+                yield from scalars(element, field.message or {})
+            elif field is not None and isinstance(element, Leaf):
+                yield field, element.constant
 
 
 # plans

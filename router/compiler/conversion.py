@@ -1,9 +1,9 @@
 """From a checked value to the plan of the field that it fills.
 
 Messages are converted field by field, lists element by element, scalars by a node that converts or checks them. No
-value loses anything unless the table says so: known ranges are checked here, and a rounded float at run time, where a
-value that does not fit drops the target. An enum saturates into a narrower integer, as the boards' firmware does. Every
-function raises ExpressionError where the value does not fit.
+conversion is lossy unless the table says so. Known ranges are checked here, rounded floats at run time, where a value
+that does not fit drops the message for that target. An enum saturates in a narrower integer, as in the boards'
+firmware. Every function raises ExpressionError if the value does not fit.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from router.compiler.constants import constant_envelope
+from router.compiler.constants import computed, envelope_of, scalars
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -26,7 +26,6 @@ from router.table.model import (
     RouteTable,
 )
 from router.table.units import duration
-from router.types.board_limits import NON_FINITE
 from router.types.framing import trimmed
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
@@ -35,8 +34,7 @@ SHORTEST_REPEAT = 10_000_000
 """ns. Shorter would flood a board, which may still be busy with the last datagram."""
 
 SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 20_000_000, 10 * NS_PER_SECOND
-"""ns. Commands that come within a shorter timeout are rare, and in a longer one a rover gets far: other units are
-meant."""
+"""ns. Commands rarely come more often than the former; within the latter a rover goes far. Other units are meant."""
 
 _NOTHING = MessageType("a deadman")
 """The source message of a deadman's payload: one without fields."""
@@ -57,9 +55,10 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
         lookup.recipient(case, name, sources=frozenset())
     can_reach = len(lookup.findings) == known
     disarmed_by = _successors(lookup, route, deadman)
-    datagram = _datagram(lookup, deadman, case)
-    if datagram is None or (can_reach and _is_refused(lookup, deadman, datagram)):
+    sent = _payload(lookup, deadman, case)
+    if sent is None or (can_reach and _is_refused(lookup, deadman, sent[0], case)):
         return None
+    _, datagram = sent
     trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
     datagrams = [(to.value, trimmed(datagram) if to.value in trims else datagram) for to in deadman.to]
     return deadman_plan(route.name, deadman, datagrams, disarmed_by)
@@ -95,7 +94,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 def timing_findings(
     deadman: Deadman | InboundDeadman, ttl: Located[int] | None, max_rate: float | None, sends: str
 ) -> Iterator[Diagnostic]:
-    """A deadman that trips while commands come, or that floods; and one whose times are most likely not meant.
+    """Findings for a deadman that trips between commands, or sends too often, or whose times look like a mistake.
 
     `max_rate` (Hz) limits all its commands.
     """
@@ -148,7 +147,7 @@ def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 
 def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """Report other routes with a deadman that command a board between whose commands this deadman would act."""
+    """Report routes with a deadman whose commands to a board this deadman would interrupt."""
     if deadman.disarmed_by == ():
         return
     boards = [to.value for to in deadman.to if to.value in lookup.boards]
@@ -215,25 +214,29 @@ def _commanding(table: RouteTable, route: Route, deadman: Deadman) -> set[str]:
     return {each.case.value for each in others if stopped & {to.endpoint.value for to in each.destinations}}
 
 
-def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | None:
+def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> tuple[Record, bytes] | None:
+    """What the deadman sends, as a computed plan and as the envelope; None with a finding."""
     plan = constant_plan(lookup, deadman.fields, case.type, deadman.case.span)
     if plan is None:
         return None
     try:
-        return constant_envelope(plan, case)
+        payload = computed(plan)
+        return payload, envelope_of(payload, case)
     except MappingError as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
 
 
-def _is_refused(lookup: Lookup, deadman: Deadman, datagram: bytes) -> bool:
-    """Report the first board that cannot take what the deadman sends."""
-    for to in deadman.to:
-        board = lookup.boards.get(to.value)
-        if refusal := board.refusal(datagram) if board else None:
-            hint = f"'{to.value}' gets it with `allow_non_finite: true`" if refusal.reason == NON_FINITE else ""
-            lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board cannot take this: {refusal.text}", hint)
-            return True
+def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: PayloadCase) -> bool:
+    """Report the first board that cannot take what the deadman sends. Its size was checked with the payload case."""
+    for name in (to.value for to in deadman.to if to.value in lookup.boards):
+        board = lookup.boards[name]
+        bounds = board.fields.get(case.number)
+        for field, value in scalars(payload, bounds.message or {}) if bounds else ():
+            if misfit := board.misfit(field, value):
+                hint = f"'{name}' gets it with `allow_non_finite: true`" if isinstance(value, float) else ""
+                lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board cannot take this: {misfit}", hint)
+                return True
     return False
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from router.compiler.constants import constant_message
+from router.compiler.constants import cdr_of, computed
 from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
 from router.compiler.lookup import Lookup
 from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
@@ -88,7 +88,7 @@ def _deadman(
     if plan is None:
         return None
     try:
-        message = constant_message(plan)
+        message = cdr_of(computed(plan))
     except MappingError as error:
         lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
         return None

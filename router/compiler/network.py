@@ -1,4 +1,4 @@
-"""Addresses: clashes between them, destinations that lead back to the router, and how senders are recognised."""
+"""Addresses: clashes between them, destinations that lead back to the router, and how senders are identified."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOPBACK = "127."
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """A local address, and what findings call its owner. UDP and TCP addresses do not clash."""
+    """A local address, with the name of its owner for findings. UDP and TCP addresses do not clash."""
 
     owner: str
     address: Located[Address]
@@ -78,7 +78,7 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
-    """A gateway that sends to a listener or to a gateway of this table, which could go on for ever."""
+    """Findings for a gateway that sends to a listener or gateway of this table: messages could loop for ever."""
     own = {f"listener '{listener.name}'": listener.address.value for listener in table.listeners.values()}
     for other in table.gateways.values():
         if other.receive is not None:

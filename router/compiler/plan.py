@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Union
 
@@ -71,21 +70,3 @@ class Unset:
 
 
 Plan = Union[Leaf, Record, Items, Each, Unset]
-
-
-def expressions(plan: Plan) -> Iterator[Node]:
-    """All expressions of a plan."""
-    match plan:
-        case Leaf():
-            yield plan.node
-        case Record():
-            for _, member in plan.members:
-                yield from expressions(member)
-        case Items():
-            for item in plan.items:
-                yield from expressions(item)
-        case Each():
-            yield from (values for _, values in plan.lists)
-            yield from expressions(plan.element)
-        case Unset():
-            pass

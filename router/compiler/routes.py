@@ -33,7 +33,7 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
-"""Findings that are dropped for a route of which an invalid part, with a finding of its own, was left out."""
+"""Findings that are dropped for a route with an invalid part, which was left out and reported before."""
 
 
 def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
@@ -162,7 +162,7 @@ def _publish(
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:
-    """What expressions of topics see beside the fields of a frame's first part."""
+    """The names in expressions of topics beside the fields of a frame's first datagram."""
     return {
         ITEMS: Variable(ListKind(MessageKind(case.type)), span, ITEMS),
         COUNT: Variable(UINT32, span, COUNT),
@@ -207,7 +207,7 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
 def _subscription(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
 ) -> CheckedSubscription | None:
-    """A topic with its targets. None if the type of `item` is unknown, since every use of it would be a finding."""
+    """A topic with its targets. None if the type of `item` is unknown: every use of it would be reported."""
     scope = lookup.scope(ros_type, ros_type)
     stamp = _stamp(scope, topic.span) if route.ttl else None
     for_each = None
@@ -257,7 +257,7 @@ def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | No
 
 
 def _element_names(elements: Node) -> dict[str, Node]:
-    """What expressions see beside the fields of the message, with `for_each`."""
+    """The names in expressions beside the fields of the message, with `for_each`."""
     assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
     assert elements.kind.element is not None  # noqa: S101
     return {

@@ -1,4 +1,4 @@
-"""Every series of a table, opened before anything counts: what is scraped does not depend on who serves a target."""
+"""All series of a program, opened before anything is counted: scrapes show every series from the start, at 0."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
 
 
 def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
-    """Endpoints that would get their own messages back through a topic."""
+    """Findings for endpoints that would get their own messages back through a topic."""
     sources = {source.value for source in publisher.sources}
     for destination in subscriber.destinations:
         sender = destination.endpoint
@@ -187,7 +187,7 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
 
 
 def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
-    """Deadmen of gateways that would publish against others, or keep the deadman of a route from tripping."""
+    """Findings for deadmen of gateways that publish on a topic of others, or that feed the deadman of a route."""
     if use.deadman is None:
         return
     for other in others:

@@ -1,4 +1,4 @@
-"""Nodes that fit the schema to the typed route table; what has a finding is left out and named in `broken`.
+"""Build the typed route table from nodes that fit the schema. Parts with findings are left out and named in `broken`.
 
 Objects of the model are read key by key as its classes declare them (`structure`); what has a syntax of its own has a
 function here.
@@ -93,10 +93,9 @@ DEFAULT_FORMATS: Mapping[Transport, GatewayFormat] = {
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
-    """The table of everything valid; None where the envelope or the routes as a whole are not, or are missing.
+    """The table of all valid parts; None if the envelope or the routes as a whole are invalid or missing.
 
-    What only the values themselves can tell, such as a size beyond what the kernel takes, is added to
-    `findings`.
+    Findings that the schema cannot make, such as a buffer size that the kernel refuses, are added to `findings`.
     """
     builder = _Builder(findings)
     envelope = builder.one(root, "envelope", _envelope)
@@ -138,11 +137,11 @@ def _has_gateways_only(root: MappingNode) -> bool:
 
 
 Salvage = Callable[[Entry], Union[Entry, None]]
-"""What is valid in a part that is broken, if anything is."""
+"""Returns the valid rest of a broken part, or None."""
 
 
 def _nothing(_: Entry) -> None:
-    """Most parts are all or nothing: an endpoint without its address is none."""
+    """Most parts are valid as a whole or not at all, such as an endpoint."""
 
 
 class _Builder:
@@ -531,4 +530,4 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,
 }
-"""Readers of values other than a scalar or a mapping of keys; they get its node and its key's span."""
+"""Readers of types with a syntax of their own. Each gets the value's node and the span of its key."""

@@ -27,7 +27,7 @@ IGNORE = "ignore"
 _DEPTH = len(("routes", "case"))
 """At which routes and gateways stand."""
 _WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
-"""How a route or gateway, or a part of it, says that there is none."""
+"""The key that says that there is no route or gateway, or no such part of it."""
 _ALTERNATIVES = {"topic": "topics", "topics": "topic"}
 """Keys of a route that exclude each other."""
 _WHOLE = ("source", "destinations", *_ALTERNATIVES)
@@ -79,7 +79,7 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Nothing to merge: what is whole, what one of the two says there is none of, other kinds of source or payload."""
+    """Whether `over` replaces `base` instead of being merged with it: see above."""
     if path == ("defaults", "qos") or is_choice(over) or is_choice(base):
         return True
     if path[0] not in _OF_ONE_KIND:
@@ -121,7 +121,7 @@ def _reference(root: MappingNode) -> ScalarNode | None:
 
 
 def _read_base(path: Path, reference: ScalarNode) -> Source:
-    """The file that a table extends; that there is none is the fault of the line that names it."""
+    """Read the file that a table extends. If it cannot be read, the line that names it is blamed."""
     try:
         return read_source(path)
     except TableError as error:

@@ -1,4 +1,4 @@
-"""What to write in place of a key or value that does not fit: tables of what people write, and what they mean by it."""
+"""Hints for keys and values that do not fit the schema: what people write by mistake, and what they mean."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _ELSEWHERE = {
     "from": ("source", "sender"),
     "case": ("payload", "type"),
 }
-"""Keys, and what people who know other programs call them."""
+"""Keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
 _IN_OTHER_WORDS = (
     ("address", ADDRESS_PARTS, "an address is IP and port in one: `address: 192.168.0.30:8`"),
@@ -67,9 +67,9 @@ _IN_OTHER_WORDS = (
     ("extends", ("description", "name", "title"), "what is for people stands in a comment: `# ...`"),
     ("source", ("description", "comment", "note"), "what is for people stands in a comment: `# ...`"),
 )
-"""A key that there is, those that people write where it is known, and how to say what they mean."""
+"""A known key, the keys that people write beside it by mistake, and the hint for these."""
 CLOSE = 0.7
-"""How near a misspelt key is to the one that it stands for: `period` is not `schema_period`."""
+"""The similarity of a misspelt key to the one that is suggested: `period` does not suggest `schema_period`."""
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:
@@ -107,9 +107,9 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
 
 
 def _owners(name: str, path: Path) -> str:
-    """A hint for a key that there is, but elsewhere in a table; empty where there is no such key.
+    """A hint for a key that belongs elsewhere in a table; empty if there is no such key.
 
-    Others that are called as what stands at `path` (deadmen are of two kinds) would make no hint.
+    Definitions of the same name as the one at `path` are skipped: deadmen are of two kinds.
     """
     definitions = table_schema()["definitions"]
     others = (*map(str, path[-1:]), "defaults")

@@ -40,7 +40,7 @@ def bound_to(address: Address, interface: str | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Networks:
-    """In which all addresses of the table lie. `span` is the key `networks`."""
+    """The networks that contain every address of the table. `span` is the key `networks`."""
 
     span: SourceSpan
     members: tuple[IPv4Network, ...]
@@ -62,7 +62,7 @@ class EndpointKind(enum.Enum):
 
 
 class Priority(enum.Enum):
-    """Who goes first when an endpoint's bandwidth is short; in this order."""
+    """The order in which targets share an endpoint's bandwidth when it is short."""
 
     COMMAND = "command"
     TELEMETRY = "telemetry"
@@ -70,7 +70,7 @@ class Priority(enum.Enum):
 
 
 class OnLimit(enum.Enum):
-    """Which of the messages that `max_rate` holds back is sent after all: none, or the latest as soon as it may."""
+    """What becomes of messages that exceed `max_rate`: all are dropped, or the latest is kept and sent later."""
 
     FIRST = "first"
     LATEST = "latest"
@@ -103,7 +103,7 @@ class NodeSettings:
 class Listener:
     """`span` is the listener's name in the table. `receive_buffer` is in bytes.
 
-    With an `interface`, only what comes in by that network interface is received.
+    With an `interface`, only datagrams that arrive on that network interface are received.
     """
 
     name: str
@@ -119,16 +119,16 @@ class Listener:
 
 
 EPHEMERAL = "ephemeral"
-"""Where an endpoint's datagrams leave from if not from a listener's port: one that the kernel chooses."""
+"""The value of `send_from` for a source port that the kernel chooses, in place of a listener's port."""
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
     """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
 
-    Silent for longer than `stale_after` (ns) it is stale; None means that it never is. With a `listener`, only what
-    that one receives can be from it. `send_from` is a listener's name or EPHEMERAL, None where the table says nothing.
-    `allow_non_finite`: a board gets NaN and infinities as well.
+    An endpoint that is silent for longer than `stale_after` (ns) is stale; None means never. With a `listener`, only
+    datagrams that this listener receives are attributed to it. `send_from` is a listener's name or EPHEMERAL, None
+    where the table says nothing. `allow_non_finite`: a board also gets NaN and infinities.
     """
 
     name: str
@@ -146,7 +146,7 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
-    """Which datagrams are kept, and where. `span` is the key `record`; `directory` is an absolute path.
+    """Which datagrams are recorded, and where. `span` is the key `record`; `directory` is an absolute path.
 
     `last` and `max_age` in ns, sizes in bytes.
     """
@@ -292,7 +292,7 @@ DEFAULT_REPEAT = Located(100_000_000, SourceSpan("the default"))
 class DeadmanKeys:
     """The keys that the deadmen of routes and of gateways have in common. Durations in ns.
 
-    `because` is the reason of what looks like a mistake.
+    `because` justifies settings that look like a mistake.
     """
 
     timeout: Annotated[Located[int], DURATION]
@@ -303,7 +303,7 @@ class DeadmanKeys:
 
 @dataclass(frozen=True, slots=True)
 class Deadman(DeadmanKeys):
-    """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
+    """What is sent when commands stop: the payload `case` with `fields`, to the endpoints `to`.
 
     `span` is the key `deadman`. `disarmed_by` are payload cases; None if the table does not say. `at_start` says
     whether it is sent when the router starts as well.
@@ -334,7 +334,7 @@ ROS = "ros"
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """What happens to one payload case, or to that part of it that comes from certain sources.
+    """What happens to one payload case, or to the messages of it that come from certain sources.
 
     `span` is the payload case in the table, of a route in a list its first key.
     `name` tells the routes of a table apart, in metrics and log: the payload case, or where a case has
@@ -413,7 +413,7 @@ MOST_INBOUND = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class TopicRate:
-    """How often topics that `pattern` matches are sent: a period in ns, or EACH."""
+    """How often topics that match `pattern` are sent: a period in ns, or EACH."""
 
     pattern: TopicPattern
     period: int
@@ -451,7 +451,7 @@ class ZenohSettings:
 
 @dataclass(frozen=True, slots=True)
 class InboundDeadman(DeadmanKeys):
-    """What is published in place of a client's messages that stopped coming, and at the start if `at_start` says so.
+    """What is published when a client's messages stop, and with `at_start` when the router starts.
 
     `span` is the key `deadman`.
     """
@@ -474,9 +474,9 @@ class Inbound:
 class Gateway:
     """ROS topics for clients that speak neither ROS nor protobuf, and back. `span` is its name in the table.
 
-    `address` is where clients are (udp) or are waited for (tcp, websocket); None for Zenoh. `receive` is the local
-    address of a udp gateway. Periods in ns, sizes in bytes. `compression` is a zstd level, 0 for none. `rates` are
-    asked in order; what none matches has `publish_period`.
+    `address` is the clients' (udp) or the one to listen on (tcp, websocket); None for Zenoh. `receive` is the local
+    address of a udp gateway. Periods in ns, sizes in bytes. `compression` is a zstd level, 0 for none. The first of
+    `rates` that matches a topic applies; without one it is `publish_period`.
     """
 
     name: str
@@ -523,11 +523,10 @@ class IgnoredGateway:
 class RouteTable:
     """One table after `extends` and variables. `files` are all files read, the table itself first.
 
-    `routes_span` is the place of the key `routes`. A table of gateways has none, and need not have an envelope.
-    `sha256` is over the bytes of `files` in order.
-    `broken` names what the table has but is left out here because of findings of its own, as
-    `endpoints/arm_board`, so that nobody reports its absence as well. Of a route in it, `routes/imu_info`,
-    there may be the valid part: what is missing there is no finding.
+    `routes_span` is the place of the key `routes`. A table with gateways only has none, and needs no envelope.
+    `sha256` is over the bytes of `files` in order. `broken` names parts that were left out because they have findings,
+    such as `endpoints/arm_board`, so that their absence is not reported as well. The valid part of a route,
+    `routes/imu_info`, may be there all the same; what that lacks is not reported either.
     """
 
     path: Path

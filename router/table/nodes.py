@@ -109,7 +109,7 @@ Node = Union[ScalarNode, SequenceNode, MappingNode]
 
 
 def cut_off(pairs: Iterable[tuple[str, Node]]) -> Iterator[str]:
-    """The keys that are none: `b)` of `{x: max(a, b)}`, where the comma ends the value of `x`."""
+    """Keys that are the rest of an expression: `b)` of `{x: max(a, b)}`, where the comma ends the value of `x`."""
     opened = 0
     rests: list[str] = []
     for key, value in pairs:
@@ -133,7 +133,7 @@ def to_data(node: Node) -> object:
 
 
 def is_valid(node: Node) -> bool:
-    """Nothing in it has a finding."""
+    """Whether nothing in the tree has a finding."""
     if node.broken:
         return False
     if isinstance(node, MappingNode):
@@ -213,14 +213,14 @@ _INDISPENSABLE = frozenset(
 """Keys without which a route, a topic, a destination, a deadman, a collect or a gateway has no meaning."""
 
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
-"""Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
+"""Sets of keys, each of which makes a mapping worth checking, whatever it lacks otherwise."""
 
 _NEEDED_BY = {"collect": ("topics",), "destinations": ("deadman",)}
-"""Keys of a route, and others that mean nothing without: expressions use `items`, a deadman sends to destinations."""
+"""Keys of a route, with others that need them: expressions use `items`, a deadman sends to destinations."""
 
 
 def valid_part(entry: Entry) -> Entry | None:
-    """A case or a gateway without what has findings of its own, so that the rest is checked in the same run."""
+    """A payload case or gateway without its broken parts, so that the rest is checked in the same run."""
     value = None if entry.key.broken else _valid_part(entry.value)
     return Entry(entry.key, value) if value else None
 

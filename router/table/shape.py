@@ -62,8 +62,10 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
 
 
 def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
-    """Errors that go with another one: lists after a first one in a list, and what stands below `send` where that has
-    several, or beside a case that lacks its fields.
+    """Errors that follow from another one, which is reported.
+
+    These are all but the first of several lists in a list, and errors below `send` where it has several payload cases
+    or one without fields.
     """
     empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
@@ -86,7 +88,7 @@ def _is_broken(tree: Node, path: Path) -> bool:
 
 
 def _is_rest(tree: Node, path: Path) -> bool:
-    """There is no value because there is no key: a comma cut it off an expression, which will have a finding."""
+    """Whether the key at `path` is the rest of an expression that a comma has cut, which gets a finding of its own."""
     siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in hints.NAME_FIELDS) else None
     return isinstance(siblings, MappingNode) and path[-1] in _rests(siblings)
 
@@ -106,7 +108,7 @@ def unknown_keys(
 ) -> Iterator[Diagnostic]:
     """A finding for each key of the mapping at `path` that is not `known`.
 
-    None for those below a key at one of the paths in `empty`: they belong to it.
+    Keys after one of the paths in `empty` are not reported: they belong below it, and lack indentation.
     """
     said = set()
     for name, entry in mapping(node_at(tree, path)).entries.items():

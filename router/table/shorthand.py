@@ -1,4 +1,4 @@
-"""Write out what a table says in short, so that the rest of the router meets one form of everything.
+"""Expand the short forms of a table, so that the rest of the router sees one form of everything.
 
 | short | written out |
 |---|---|
@@ -7,7 +7,7 @@
 | `qos: sensor_data` | `qos: {profile: sensor_data}` |
 | a key of `defaults` | that key wherever it applies and is missing |
 
-What is written out keeps the position of what was written, of a default that in `defaults`.
+Expanded nodes keep the positions of the short form; defaults those of `defaults`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Shorthand:
 
 
 def _of_deadmen(defaults: Node | None) -> Entries:
-    """What they say for deadmen, valid or not. A timeout that a mistake has lost is there, and broken."""
+    """The defaults of deadmen, valid or not. If a mistake may have lost the timeout, there is one, marked broken."""
     deadman = defaults.get("deadman") if isinstance(defaults, MappingNode) else None
     entries = deadman.entries if isinstance(deadman, MappingNode) else {}
     lost = next((node for node in (deadman, defaults) if node and node.broken), None)

@@ -30,25 +30,25 @@ MAX_SIZE = (1 << 30) - 1
 """The largest receive buffer that the kernel takes, which doubles what it is asked for."""
 
 MAX_DATA_RATE = 10**12
-"""More than any link carries; what is multiplied with nanoseconds stays a small integer."""
+"""More than any link carries; products with nanoseconds stay small integers."""
 
 EACH = "each"
 """In place of a gateway's period or rate: every message is sent."""
 
 NEVER = "never"
-"""In place of a duration: what waits for it to pass does not happen."""
+"""In place of a duration that never passes."""
 
 MIN_PERIOD = 1_000_000
-"""ns. A gateway that ticks faster does nothing else; `each` is meant for that."""
+"""ns. A gateway with a shorter period does nothing else; `each` sends every message."""
 
 MIN_INTERVAL = 10_000_000
-"""ns. Looking at the ROS graph, and sending schemas, costs more than data."""
+"""ns. Discovery of the ROS graph, and sending schemas, cost more than data."""
 
 MIN_DATAGRAM = 576
 """Bytes that every IPv4 host takes."""
 
 MIN_DISK_SIZE, MAX_DISK_SIZE = 1 << 20, 1 << 50
-"""Bytes of recordings: a file that is smaller would be begun anew with every few datagrams."""
+"""Bytes of recordings. Smaller files would be rotated every few datagrams."""
 
 LARGEST_DATAGRAM = 65_507
 """Bytes that one UDP datagram over IPv4 can carry."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
@@ -84,32 +84,6 @@ def read_varint(data: bytes, position: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, position + index + 1
     raise IndexError
-
-
-def wire_fields(message: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The fields of a well-formed message: number, wire type, and the value as it is encoded, without a size.
-
-    Groups are left out.
-    """
-    position, open_groups = 0, 0
-    while position < len(message):
-        tag, position = read_varint(message, position)
-        number, wire_type, start = tag >> 3, tag & 7, position
-        if wire_type == GROUP:
-            open_groups += 1
-            continue
-        if wire_type == GROUP_END:
-            open_groups -= 1
-            continue
-        if wire_type == VARINT:
-            _, position = read_varint(message, position)
-        elif wire_type == LEN:
-            size, start = read_varint(message, position)
-            position = start + size
-        else:
-            position += I64_SIZE if wire_type == I64 else I32_SIZE
-        if not open_groups:
-            yield number, wire_type, message[start:position]
 
 
 def delimited(number: int, value: bytes) -> bytes:

@@ -12,11 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier.boards import NativeBoards
+from router.compiler.constants import computed, envelope_of, scalars
+from router.compiler.mapping import build
 from router.declared import BoardRefusal, Loss
 from router.errors import Located, SourceSpan
-from router.types.board_limits import NON_FINITE, TOO_LARGE, BoardLimits, Refusal, board_fields
+from router.table.model import FieldMap
+from router.types.board_limits import BoardLimits, board_fields
+from router.types.model import MessageType
 from router.types.protobuf import find_envelope, load_protos
+from tests.compiler.compiling import SPAN, field_map, scope_of
 from tests.envelopes import I32, I64, VARINT, framed, tag, varint
+from tests.oracles.boards import NON_FINITE, TOO_LARGE, Refusal, refusal
 
 PROTOS = Path(__file__).parent / "protos_of_boards"
 TEXTS, NUMBERS, TREE = 1, 2, 3
@@ -51,9 +57,9 @@ class Boards:
 
     def refusal(self, data: bytes, board: str = "strict") -> Refusal | None:
         """What both say, which has to be the same."""
-        refusal = self.limits[board].refusal(data)
-        assert self.carrier(data, board) == refusal
-        return refusal
+        found = refusal(self.limits[board], data)
+        assert self.carrier(data, board) == found
+        return found
 
 
 @pytest.fixture(scope="module")
@@ -146,9 +152,29 @@ def test_a_number_that_is_not_finite_is_refused_unless_it_is_allowed(boards: Boa
 )
 def test_what_a_later_field_replaces_counts_as_well(boards: Boards, data: bytes, text: str) -> None:
     """nanopb decodes it, and refuses it."""
-    refusal = boards.refusal(data)
-    assert refusal is not None
-    assert refusal.text.startswith(text)
+    found = boards.refusal(data)
+    assert found is not None
+    assert found.text.startswith(text)
+
+
+@pytest.mark.parametrize(
+    ("case", "fields"),
+    [
+        ("texts", field_map(key="[1, 2]")),
+        ("texts", field_map(keys="[[1, 2, 3, 4], []]", name="'seven'")),
+        ("numbers", field_map(doubles="[1 / clamp(2.0, 0, 9), inf]")),
+        ("numbers", field_map(small="3")),
+        ("tree", field_map(one__large="-inf")),
+    ],
+)
+def test_what_a_deadman_sends_is_judged_alike_before_it_is_sent(boards: Boards, case: str, fields: FieldMap) -> None:
+    declared, limits = boards.envelope.cases[case], boards.limits["strict"]
+    mapping = build(fields, declared.type, scope_of(MessageType("nothing")), SPAN)
+    assert not mapping.findings
+    payload = computed(mapping.plan)
+    said = [limits.misfit(*each) for each in scalars(payload, limits.fields[declared.number].message or {})]
+    found = boards.refusal(envelope_of(payload, declared))
+    assert list(filter(None, said)) == ([found.text] if found else [])
 
 
 # -- any message ------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from router.compiler.expressions.kinds import UINT32, BoolKind, Kind, ListKind, 
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
 from router.compiler.mapping import build
-from router.compiler.plan import Record, expressions
+from router.compiler.plan import Record
 from router.errors import Code, Diagnostic
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
@@ -74,10 +74,6 @@ class Checked(NamedTuple):
     for_each: Node | None
     condition: Node | None
     plan: Record | None
-
-    def nodes(self) -> list[Node]:
-        planned = expressions(self.plan) if self.plan is not None else ()
-        return [each for each in (self.for_each, self.condition, *planned) if each is not None]
 
 
 def _element_names(for_each: Node) -> dict[str, Node]:

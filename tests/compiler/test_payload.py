@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.constants import constant_envelope
+from router.compiler.constants import computed, envelope_of
 from router.compiler.expressions import check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import StringKind, TimeKind
@@ -366,7 +366,7 @@ def constant(case: str, fields: FieldMap) -> bytes:
     scope = scope_of(MessageType("nothing"), tuple(schema.enums.values()))
     mapping = build(fields, declared.type, scope, SPAN)
     assert mapping.findings == []
-    return constant_envelope(mapping.plan, declared)
+    return envelope_of(computed(mapping.plan), declared)
 
 
 def test_an_envelope_of_constants_is_that_of_the_reference() -> None:

@@ -2,8 +2,8 @@
  *
  * Checked are the sizes of the envelope, of strings and bytes, the number of elements, and that numbers are finite. Not
  * checked, though nanopb refuses it: a field of another wire type than its own, an integer of more bits than its field, a
- * negative number in an enum that declares none, an unknown group. `BoardLimits` in types/board_limits.py has to give the
- * same answers. */
+ * negative number in an enum that declares none, an unknown group. tests/oracles/boards.py decides the same a
+ * second time. */
 #ifndef BOARD_H
 #define BOARD_H
 

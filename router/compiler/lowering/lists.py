@@ -1,7 +1,7 @@
 """Lists: loops over them, computation element by element, and functions of a whole list.
 
-A list on the stack is stored as scalars in a row, as the message has them, or in cells. A loop copies its lists to
-slots of its own, and takes the elements off the copies.
+A list on the stack is stored as scalars in a row, as in the message, or in cells. A loop copies its lists to slots of
+its own, and removes the elements from the copies one by one.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section
 
 
 def _without_a_detour(made: Routine) -> Routine:
-    """Leave an element on the stack that would be kept, dropped and loaded again, and is used nowhere else."""
+    """Leave an element on the stack, in place of storing, dropping and loading it, if it is used only there."""
     for index, operation in enumerate(made[:-2]):
         if operation.kind is Op.KEEP:
             slot = operation.slot

@@ -1,0 +1,107 @@
+"""What boards can take, decided a second time: `board.h` has to give the same answers."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from router.errors import plural
+from router.types.board_limits import BoardField, BoardLimits, BoardMessage
+from router.types.wire import GROUP, GROUP_END, I32_SIZE, I64, I64_SIZE, LEN, VARINT, kind_of, read_varint
+
+TOO_LARGE, NON_FINITE = "too_large", "non_finite"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a board cannot take a datagram: TOO_LARGE or NON_FINITE, and in words."""
+
+    reason: str
+    text: str
+
+
+def refusal(limits: BoardLimits, datagram: bytes) -> Refusal | None:
+    """Why the board cannot take an envelope that is well formed; None if it can."""
+    if len(datagram) > limits.longest:
+        return _too_many("the envelope", len(datagram), "byte", limits.longest)
+    return next(_refusals(limits, datagram, limits.fields, {}), None)
+
+
+def _refusals(limits: BoardLimits, message: bytes, fields: BoardMessage, counts: dict[str, int]) -> Iterator[Refusal]:
+    """`counts` are the elements of each list so far, by path; a message that comes twice is merged."""
+    for number, wire_type, value in wire_fields(message):
+        field = fields.get(number)
+        if field is None:
+            continue
+        elements = _elements(field, wire_type, value)
+        if field.most is not None and elements is not None:
+            counts[field.path] = total = counts.get(field.path, 0) + len(elements)
+            if total > field.most or (field.has_fixed_count and not elements):
+                yield _too_many(field.path, total, "element", field.most)
+        for element in elements or ():
+            yield from _of_element(limits, field, element, counts)
+    for field in fields.values():
+        count = counts.get(field.path, 0)
+        if field.most is not None and field.has_fixed_count and count not in (0, field.most):
+            yield _too_many(field.path, count, "element", field.most)
+
+
+def _of_element(limits: BoardLimits, field: BoardField, element: bytes, counts: dict[str, int]) -> Iterator[Refusal]:
+    if field.message is not None:
+        yield from _refusals(limits, element, field.message, {} if field.most is not None else counts)
+    elif field.longest is not None:
+        if not _fits(len(element), field.longest, field.has_fixed_length):
+            yield _too_many(field.path, len(element), "byte", field.longest)
+    elif field.is_float and not limits.allows_non_finite:
+        [number] = struct.unpack("<d" if len(element) == I64_SIZE else "<f", element)
+        if not math.isfinite(number):
+            yield Refusal(NON_FINITE, f"{field.path} is {number}")
+
+
+def _too_many(what: str, found: int, unit: str, bound: int) -> Refusal:
+    return Refusal(TOO_LARGE, f"{what} has {plural(found, unit)}; the board takes {bound}")
+
+
+def _fits(size: int, bound: int, is_fixed: bool) -> bool:
+    return size in (0, bound) if is_fixed else size <= bound
+
+
+def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes] | None:
+    """The elements that a field brings, as they are encoded; None if it has another wire type than its own."""
+    own = kind_of(field.descriptor).wire_type
+    if wire_type == own:
+        return [value]
+    if wire_type != LEN or not field.descriptor.is_repeated:
+        return None
+    if own == VARINT:
+        return [b""] * sum(byte < 0x80 for byte in value)
+    size = I64_SIZE if own == I64 else I32_SIZE
+    return [value[at : at + size] for at in range(0, len(value) - size + 1, size)]
+
+
+def wire_fields(message: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """The fields of a well-formed message: number, wire type, and the value as it is encoded, without a size.
+
+    Groups are left out.
+    """
+    position, open_groups = 0, 0
+    while position < len(message):
+        tag, position = read_varint(message, position)
+        number, wire_type, start = tag >> 3, tag & 7, position
+        if wire_type == GROUP:
+            open_groups += 1
+            continue
+        if wire_type == GROUP_END:
+            open_groups -= 1
+            continue
+        if wire_type == VARINT:
+            _, position = read_varint(message, position)
+        elif wire_type == LEN:
+            size, start = read_varint(message, position)
+            position = start + size
+        else:
+            position += I64_SIZE if wire_type == I64 else I32_SIZE
+        if not open_groups:
+            yield number, wire_type, message[start:position]
