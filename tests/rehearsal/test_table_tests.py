@@ -15,7 +15,7 @@ from router.rehearsal.coverage import Coverage
 from router.rehearsal.fields import leaves, offset
 from router.rehearsal.reading import TestFile, find_test_files, read_test_file
 from router.rehearsal.running import run_tests
-from tests.small_tables import HEAD, HEAD_OF_LISTENERS
+from tests.small_tables import HEAD
 from tests.tables import PROTOS
 
 DEFINITIONS = Definitions()
@@ -91,28 +91,6 @@ QUIET = "{imu_data: any, imu/data_raw: any}"
 # what passes
 
 
-def test_everything_that_happens_is_expected(tmp_path: Path) -> None:
-    assert not failures(
-        tmp_path,
-        IMU,
-        f"""
-        raw:
-          given: {given("{accel_x: 1.5, accel_y: 0.5, gyro_x: 90}")}
-          expect:
-            route: imu_info
-            sent: [basestation, recorder]
-            published:
-              imu_data: unchanged
-              imu/data_raw:
-                header: {{stamp: received_at, frame_id: imu_link}}
-                angular_velocity: {{x: ~1.571, y: 2}}
-        withheld:
-          given: {given("{accel_x: 0.5, accel_y: 1}")}
-          expect: {{sent: basestation, filtered: recorder, published: {QUIET}}}
-        """,
-    )
-
-
 def test_numbers_may_be_rounded_or_have_a_tolerance(tmp_path: Path) -> None:
     within = ["~1.571", "~1.6", "1.57 +- 0.01", "1.5 ± 0.1", "~157.1e-2", "1.5707963267948966"]
     outside = ["~1.572", "~1.5", "1.58 +- 0.001", "1.57", "nan"]
@@ -144,137 +122,6 @@ imu_info:
         "1.5": ["field: variance is nan, not 1.5"],
         "inf": ["field: variance is nan, not inf"],
     }
-
-
-def test_float32_is_the_nearest_to_what_is_written(tmp_path: Path) -> None:
-    tests = f"""
-        a:
-          given: {given("{accel_x: 0.1, accel_y: 1}")}
-          expect: {{sent: {{basestation: {{imu_info: {{accel_x: 0.1, accel_y: 1}}}}}}, published: {QUIET}}}
-        """
-    assert not failures(tmp_path, IMU, tests)
-
-
-def test_bytes_are_given_and_expected_as_hex(tmp_path: Path) -> None:
-    tests = """
-        a:
-          given: {hex: "6a 05 0d 00 00 c0 3f", from: sensor_board, listener: exact}
-          expect:
-            sent: {basestation: {hex: "6a050d0000c03f"}, recorder: {imu_info: {accel_x: 1.5}}}
-            published: {imu_data: any}
-            dropped: {imu/data_raw: mapping_error}
-        """
-    assert not failures(tmp_path, IMU, tests)
-
-
-def test_a_datagram_arrives_where_its_sender_is_believed_unless_said(tmp_path: Path) -> None:
-    drive = (
-        "\nmanual_drive: {source: basestation, destinations: [driving_board], deadman: {none: not part of this test}}\n"
-    )
-    tests = """
-        believed:
-          given: {case: manual_drive, from: basestation}
-          expect: {sent: driving_board}
-        forged:
-          given: {case: manual_drive, from: basestation, listener: trimmed}
-          expect: {rejected: source_mismatch}
-        """
-    assert not failures(tmp_path, drive, tests, HEAD_OF_LISTENERS)
-
-
-def test_old_boards_trim_and_pad(tmp_path: Path) -> None:
-    tests = f"""
-        trimmed:
-          given: {given("{accel_x: 2, accel_y: 1}", ", trim: true")}
-          expect: {{sent: [basestation, recorder], published: {QUIET}}}
-        padded:
-          given: {given("{accel_x: 2, accel_y: 1}", ", pad: 64")}
-          expect: {{sent: [basestation, recorder], published: {QUIET}}}
-        """
-    assert not failures(tmp_path, IMU, tests)
-
-
-def test_ros_message_is_given_and_its_age_counts(tmp_path: Path) -> None:
-    tests = """
-        fresh:
-          given: {topic: drive_motor, message: {distance_to_go: 2.5}, age: 150ms}
-          expect: {sent: {driving_board: {drive_motor: unchanged}}}
-        old:
-          given: {topic: drive_motor, message: {distance_to_go: 2.5}, age: 201ms}
-          expect: {dropped: {driving_board: stale}}
-        unreadable:
-          given: {topic: drive_motor, hex: "00 01 00 00"}
-          expect: {dropped: {driving_board: mapping_error}}
-        """
-    assert not failures(tmp_path, DRIVE, tests)
-
-
-def test_steps_have_their_time(tmp_path: Path) -> None:
-    tests = """
-        deadman:
-          steps:
-            - given: {topic: drive_motor}
-              expect: any
-            - at: 499ms
-              expect: nothing
-            - at: 500ms
-              expect: {sent: {driving_board: {manual_brake: {brake: true}}}}
-            - until: 1s
-              expect: {sent: {driving_board: {manual_brake: {brake: true}, times: 5}}}
-            - stop: true
-              expect: {sent: {driving_board: {manual_brake: {brake: true}}}}
-        """
-    assert not failures(tmp_path, DRIVE, tests)
-
-
-def test_every_test_begins_with_a_router_that_has_just_started(tmp_path: Path) -> None:
-    tests = """
-        armed:
-          given: {topic: drive_motor}
-          expect: {sent: {driving_board: {drive_motor: {}}}}
-        not armed:
-          until: 10s
-          expect: nothing
-        """
-    assert not failures(tmp_path, DRIVE, tests)
-
-
-def test_rates_are_tested_with_what_is_given_many_times(tmp_path: Path) -> None:
-    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10 Hz}]}"
-    tests = f"""
-        a:
-          given: {given("{accel_x: 1}", ", times: 100, every: 10ms")}
-          expect:
-            sent: {{basestation: {{times: 11}}}}   # the first one is before the grid of the rate
-            dropped: {{basestation: {{rate_limited: 89}}}}
-        """
-    assert not failures(tmp_path, routes, tests)
-
-
-def test_frames_are_complete_or_dropped_in_time(tmp_path: Path) -> None:
-    part = "{case: detected_object, from: basestation, listener: trimmed, fields: {frame_id: 7, total_count: 2, "
-    tests = f"""
-        whole:
-          steps:
-            - given: {part}index: 1, id: 20}}}}
-              expect: nothing
-            - at: 900ms
-              given: {part}id: 10}}}}
-              expect:
-                published:
-                  seen:
-                    frame_id: 7
-                    detections:
-                      - {{frame_id: 7, total_count: 2, id: 10}}
-                      - {{frame_id: 7, total_count: 2, id: 20, index: 1}}
-        too late:
-          steps:
-            - given: {part}index: 1}}}}
-              expect: nothing
-            - at: 1s
-              expect: {{dropped: {{seen: incomplete}}}}
-        """
-    assert not failures(tmp_path, FRAMES, tests)
 
 
 def test_variables_of_the_table_come_from_the_test_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
