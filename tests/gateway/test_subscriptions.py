@@ -299,14 +299,11 @@ async def test_what_gave_way_in_the_queue_is_counted_once_and_nothing_else(publi
         assert (subscription.arrived, subscription.missed) == (252, 150)
 
 
-@pytest.mark.parametrize("is_each", [False, True])
 @asynchronous
-async def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -> None:
+async def test_what_was_kept_comes_to_a_late_feed(publisher: Publish) -> None:
     publisher(STRING, "--transient-local").publish([HELLO])
     async with opened() as subscriptions:
-        subscription = subscriptions.join(
-            "/greeting", await seen(subscriptions), (lambda *_: None) if is_each else None
-        )
+        subscription = subscriptions.join("/greeting", await seen(subscriptions), None)
         await until(lambda: latest(subscription) == HELLO)
 
 

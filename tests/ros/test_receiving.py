@@ -14,7 +14,6 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rclpy.event_handler import EventHandler
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
-from structlog.testing import capture_logs
 
 from router.clock import wall_ns
 from router.compiler.program import QosPlan, TopicPlan
@@ -22,7 +21,7 @@ from router.errors import StartError
 from router.ros.events import WaitSet
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import RawSubscription
-from tests.ros.opening import HELLO, RELIABLE, SPAN, STRING, cdr, open_ros, string_topic
+from tests.ros.opening import HELLO, SPAN, STRING, cdr, open_ros, string_topic
 from tests.ros.peers import Publisher, wait_until
 
 BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 1000)
@@ -77,13 +76,6 @@ def test_bytes_arrive_as_they_were_sent(publisher: Publish, qos: QosPlan, option
     assert before < receiver.stamps[0] <= receiver.stamps[-1] <= wall_ns()
 
 
-def test_a_burst_as_long_as_the_queue_arrives_whole_and_in_order(publisher: Publish) -> None:
-    burst = [cdr(f"number {number}") for number in range(DEEP.depth)]
-    with Receiver(string_topic(DEEP)) as receiver:
-        publisher("greeting").publish(burst)
-        wait_until(lambda: receiver.messages() == burst)
-
-
 def test_late_joining_gets_what_was_kept_and_it_is_as_old_as_it_is() -> None:
     with closing(Publisher("greeting", STRING, "--transient-local")) as peer:
         peer.publish([HELLO])
@@ -120,31 +112,6 @@ def test_a_topic_may_be_published_and_subscribed_to() -> None:
         wait_until(lambda: ros.wanted["greeting"][0])
         ros.publish["greeting"](HELLO)
         wait_until(lambda: receiver.messages() == [HELLO])
-
-
-def test_a_publisher_that_was_killed_is_heard_again_when_it_is_back(publisher: Publish) -> None:
-    with Receiver(string_topic()) as receiver:
-        killed = Publisher("greeting", STRING)
-        assert killed.line() == "matched"
-        killed.publish([cdr("first")])
-        wait_until(lambda: receiver.messages() == [cdr("first")])
-        killed.kill()
-        publisher("greeting").publish([cdr("second")])
-        wait_until(lambda: receiver.messages() == [cdr("first"), cdr("second")])
-
-
-def test_a_publisher_with_incompatible_qos_is_warned_about() -> None:
-    told: list[tuple[str, str, int]] = []
-    asked = string_topic(RELIABLE)
-    with (
-        capture_logs() as logged,
-        closing(open_ros(subscriptions=[asked], incompatible=lambda *peers: told.append(peers))),
-        closing(Publisher("greeting", STRING, "--best-effort")),
-    ):
-        wait_until(lambda: ("greeting", "reliability", 1) in told)
-    assert [(line["log_level"], line["topic"], line["policy"]) for line in logged] == [
-        ("warning", "greeting", "reliability")
-    ]
 
 
 def test_ros_arguments_rename_subscribed_topics(publisher: Publish) -> None:

@@ -66,18 +66,6 @@ def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..
         assert ros.wanted["greeting"][0] == 1
 
 
-def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[..., Subscriber]) -> None:
-    told: list[tuple[str, str, int]] = []
-    offered = string_topic(QosPlan("best_effort", "volatile", "keep_last", 5))
-    with capture_logs() as logged, closing(open_ros(offered, incompatible=lambda *peers: told.append(peers))):
-        subscribe("greeting", "std_msgs/msg/String")
-        subscribe("greeting", "std_msgs/msg/String")
-        wait_until(lambda: ("greeting", "reliability", 2) in told)
-    assert logged[0]["topic"] == "greeting"
-    assert logged[0]["policy"] == "reliability"
-    assert logged[0]["log_level"] == "warning"
-
-
 BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 5)
 
 
