@@ -129,7 +129,7 @@ def test_without_any_table_it_says_how_to_name_one(words: list[str], capsys: pyt
     assert capsys.readouterr().err == f"router {words[0]}: there is no routes/rover.yaml here\nhelp: {how}\n"
 
 
-@pytest.mark.parametrize("verb", [None, "run", "validate"])
+@pytest.mark.parametrize("verb", [None, "validate"])
 @pytest.mark.parametrize("closing", ["| true", ">&-", "2>&-"])
 def test_who_does_not_read_its_help_is_no_reason_to_complain(verb: str | None, closing: str) -> None:
     router = shlex.join([sys.executable, "-m", "router", *([verb] if verb else []), "--help"])

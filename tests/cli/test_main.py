@@ -37,7 +37,7 @@ def test_alone_it_prints_help_with_every_verb_and_imports_none(
         assert rows[verb] == summary
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "--completion bash", "status --url http://127.0.0.1:1"])
+@pytest.mark.parametrize("words", ["--completion bash", "status --url http://127.0.0.1:1"])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_full_disk_below_stdout_is_a_line(words: str, unbuffered: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)

@@ -1,9 +1,9 @@
 """Transcripts: pages with commands, each with all that it prints, in the format of the documentation's pages.
 
 CONTRIBUTING.md has the format. Three things differ from the documentation. A command without output prints nothing. A
-page is gone through in a new folder, which has `rover/` (tests/rover), `bad_tables/base/` and `bad_tables/protos/`;
-`FOLDER` stands for its path. `router` runs in this process, unless the command needs a shell; other commands run in a
-shell, each for itself.
+page is gone through in a new folder, which has `rover/` (tests/rover), `site/` (tests/tools/new_message_site),
+`bad_tables/base/` and `bad_tables/protos/`; `FOLDER` stands for its path, and what the router ships is first looked for
+there. `router` runs in this process, unless the command needs a shell; other commands run in a shell, each for itself.
 
 `python -m tests.transcripts.transcript [PAGE ...]` writes what the commands print now, and keeps each line with `...`
 that still holds. Read the difference before you commit it.
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 from unittest.mock import patch
 
+from router import assets
 from router.cli import main
 from tests.bad_tables.corpus import HERE as BAD_TABLES
 from tests.docs_commands import ANY, Command, File, steps
@@ -32,6 +33,7 @@ from tests.tables import RIG
 
 HERE = Path(__file__).parent
 PAGES = sorted(HERE.glob("*.md"))
+SITE = HERE.parent / "tools" / "new_message_site"
 
 _NEEDS_A_SHELL = re.compile(r"[|&;<>$`\n]|^(?!(\w+=\S* )*router )")
 _ENVIRONMENT = {"COLUMNS": "100", "NO_COLOR": "1"}
@@ -64,10 +66,12 @@ class Played(NamedTuple):
 def folder(path: Path) -> Iterator[None]:
     """Work in a folder for one page."""
     shutil.copytree(RIG, path / "rover")
+    shutil.copytree(SITE, path / "site")
     for part in ("base", "protos"):
         shutil.copytree(BAD_TABLES / part, path / "bad_tables" / part)
     before = Path.cwd()
-    with patch.dict(os.environ, _ENVIRONMENT):
+    places = (path, *assets._PLACES)
+    with patch.dict(os.environ, _ENVIRONMENT), patch.object(assets, "_PLACES", places):
         for name in ("ROUTER_TABLE", "RECORDINGS"):
             os.environ.pop(name, None)
         os.chdir(path)
