@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Callable
 from typing import cast
 
+from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
 from router.errors import StartError
 
@@ -32,13 +33,9 @@ class ThreadCounts:
         """Counts of a native thread: they never move."""
         return (ctypes.c_int64 * MOST_COUNTERS)()
 
-    def add_fixed(
-        self, fixed: ctypes.Array[ctypes.c_int64], copy: Callable[[int], list[int]] | None = None
-    ) -> list[int]:
-        """Count in `fixed` too, and return it. `copy(size)` returns its beginning at a time at which it balances."""
-        counts = cast("list[int]", fixed)  # it is only indexed and sliced
-        self._add(counts, copy)
-        return counts
+    def add_thread(self, thread: NativeThread) -> None:
+        """Count what a native thread counts in an array that is `fixed`, by copies that balance."""
+        self._add(cast("list[int]", thread.counts), thread.counters)  # the array is only indexed and sliced
 
     def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
         self.counters.grow(counts)

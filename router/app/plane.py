@@ -11,37 +11,34 @@ import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from itertools import count
 from time import monotonic, sleep
 
 from router import declared as c
 from router.app.counts import ThreadCounts
-from router.app.from_ros import FromRos, RosTopics
-from router.app.publishing import Publishing, functions_of_rcl
 from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
-from router.carrier.collectors import NativeCollector, kept_collector
-from router.carrier.deadmen import Deadmen, NativeDeadman
-from router.carrier.deferrals import Adoption, Deferrals, NativeDeferral, NativePacer, timer_change
+from router.carrier.deadmen import Deadmen, NativeDeadman, replaced
+from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import EventReader, EventThread
-from router.carrier.from_ros import Subscription, native_from_ros
-from router.carrier.limits import open_limit
+from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
 from router.carrier.outlets import Names, Outlets, Publication
-from router.carrier.program import NativeProgram, native_program
+from router.carrier.program import NativeProgram, change_to, native_program
+from router.carrier.publishing import PublishThread
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.ring import Ring
+from router.carrier.ros_routes import NativeFromRos, Subscription, native_from_ros
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
 from router.clock import boottime_ns
-from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
+from router.compiler.program import Program
+from router.datagrams import Peer
 from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
-from router.recording.mirror import Mirror
 
 _PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
 """Bytes that may wait: messages for topics, received datagrams for observers, and events of a thread."""
@@ -73,53 +70,49 @@ class Built:
     program: Program
     state: State
     native: NativeProgram
-    topics: RosTopics
+    from_ros: NativeFromRos
     adopted: Sequence[Adoption]
     deadmen: Mapping[str, NativeDeadman]
     client_deadmen: Mapping[str, ClientDeadman]
+
+    def timers(self, earlier: Built | None, *, of_topics: bool) -> c.TimerChange:
+        """What changes in the timers of topics, or in those of endpoints: what only `earlier` had delivers the rest."""
+        now, before = (
+            [each for each in adopted if each.is_topic is of_topics]
+            for adopted in (self.adopted, earlier.adopted if earlier else ())
+        )
+        return timer_change(now, before)
 
 
 class Plane:
     """Receives, forwards, publishes and brakes. `changed` is called with a route and whether its deadman is tripped."""
 
     def __init__(
-        self,
-        library: ctypes.CDLL,
-        counts: ThreadCounts,
-        mirror: Mirror,
-        reporter: Reporter,
-        changed: Callable[[str, bool], None],
+        self, library: ctypes.CDLL, counts: ThreadCounts, reporter: Reporter, changed: Callable[[str, bool], None]
     ) -> None:
         self.now: Built | None = None
         """What runs."""
-        self._library = library
-        self._counters = counts
+        self.library = library
+        self.counts = counts
         self._names = Names()
         self._generations = count(1)
         self._is_running = self.has_stopped = False
-        braking, guarding, publishing, receiving, *from_ros = (ThreadCounts.fixed() for _ in range(6))
-        braked, guarded, published, received, *taken = (Ring(library, _EVENTS) for _ in range(6))
-        self._deadmen = Deadmen(library, braking, braked, self._names)
-        self._client_deadmen = ClientDeadmen(library, guarding, guarded, self._names)
-        self._publishing = Publishing(library, Ring(library, _PUBLISHED), publishing, published, self._names)
-        self._carrier = Carrier(library, self._deadmen.address, receiving, received, self._publishing.ring)
+        self._deadmen = Deadmen(library, *_counts_and_events(library), self._names)
+        self._client_deadmen = ClientDeadmen(library, *_counts_and_events(library), self._names)
+        waiting = Ring(library, _PUBLISHED)
+        self._publishing = PublishThread(library, waiting, *_counts_and_events(library), self._names)
+        self._carrier = Carrier(library, self._deadmen.address, *_counts_and_events(library), waiting)
         self._from_ros = [
-            FromRos(library, self._deadmen.address, counted, events, is_urgent=is_urgent)
-            for is_urgent, counted, events in zip((True, False), from_ros, taken, strict=True)
+            FromRosThread(library, self._deadmen.address, *_counts_and_events(library), is_urgent=is_urgent)
+            for is_urgent in (True, False)
         ]
-        told = [
-            (braked, counts.add_fixed(braking)),
-            (guarded, counts.add_fixed(guarding)),
-            # Before those of the receive thread: what was published was received, so no less than 0 waits.
-            (published, counts.add_fixed(publishing, self._publishing.counters)),
-            (received, counts.add_fixed(receiving, self._carrier.counters)),
-        ]
-        for thread, counted, events in zip(self._from_ros, from_ros, taken, strict=True):
-            told.append((events, counts.add_fixed(counted, thread.counters)))
+        # The publish thread before the receive thread: what was published was received, so no less than 0 waits.
+        threads = self._deadmen, self._client_deadmen, self._publishing, self._carrier, *self._from_ros
+        for thread in threads:
+            counts.add_thread(thread)
         self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
-        mirror.show(self._mirrored.take, lambda: counts.total("mirror_dropped"))
         reader = EventReader(self._names, self._why_rejected, self._where_refused)
-        self._events = EventThread(told, reader, reporter.report, changed, self._pulse)
+        self._events = EventThread(threads, reader, reporter.report, changed, self._pulse)
 
     @property
     def turns(self) -> int:
@@ -140,63 +133,56 @@ class Plane:
     def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
         """Have deadmen send at the start of the router. That needs sockets only: ROS takes seconds to open."""
         for plan in program.deadmen:
-            log_start(plan.route, self._deadman(plan, program, senders, state).start(boottime_ns()))
+            sent_to = self._deadmen.kept(plan, program.counters, senders, state).start(boottime_ns())
+            if sent_to:
+                what = "the deadman has sent its payload, since the router starts"
+                logger.info(what, route=plan.route, to=sent_to)
 
     def build(self, program: Program, opened: Opened) -> Built:
         """Make the arrays of a program. Raises StartError."""
-        deadmen = {plan.route: self._deadman(plan, program, opened.senders, opened.state) for plan in program.deadmen}
-        generation = next(self._generations)
-        if program.publishers:
-            self._publishing.open()
-        bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
-        deferrals = Deferrals(self._library, opened.state, opened.senders, opened.publications, bandwidths)
+        counters, state = program.counters, opened.state
+        deadmen = {plan.route: self._deadmen.kept(plan, counters, opened.senders, state) for plan in program.deadmen}
         outlets = Outlets(
-            listeners=opened.listeners,
-            senders={endpoint: sender.address for endpoint, sender in opened.senders.items()},
-            publications=opened.publications,
-            feeds=lambda route, names: [(deadmen[name].address, name != route) for name in names],
-            limit=partial(_limit, opened.state),
-            deferral=deferrals.deferral,
-            collector=partial(kept_collector, self._library, opened.state),
+            library=self.library,
+            state=state,
             names=self._names,
+            listeners=opened.listeners,
+            senders=opened.senders,
+            publications=opened.publications,
+            deadmen=deadmen,
+            bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=NativeBoards(program.boards),
         )
+        generation = next(self._generations)
         native = native_program(program, generation, outlets)
-        messages = native_from_ros(program, generation, outlets)
-        for arrays in (native.arrays, messages.arrays):
-            arrays += [opened.senders, deadmen]
+        from_ros = native_from_ros(program, generation, outlets, opened.subscriptions)
+        for arrays in (native.arrays, from_ros.arrays):
+            arrays.append(outlets)
+        adopted = [*outlets.pacers(), *native.states.adopted, *from_ros.states.adopted]
+        clients = {
+            plan.route: self._client_deadmen.kept(plan, counters, opened.publications, state)
+            for plan in program.client_deadmen
+        }
+        self._start_threads(program, from_ros, clients)
+        return Built(program, state, native, from_ros, adopted, deadmen, clients)
+
+    def _start_threads(self, program: Program, from_ros: NativeFromRos, clients: Mapping[str, ClientDeadman]) -> None:
+        """Start those that the program needs. Raises StartError.
+
+        Deadmen of clients are served from now on: clients may publish before the program runs.
+        """
+        if program.publishers:
+            self._publishing.start(_functions_of_rcl(self.library))
         for thread in self._from_ros:
-            thread.open(messages)
-        topics = RosTopics(messages, opened.subscriptions)
-        pacers = [Adoption(pacer.address) for pacer in deferrals.pacers()]
-        adopted = [*pacers, *native.states.adopted, *messages.states.adopted]
-        clients = self._deadmen_of_clients(program, opened)
-        return Built(program, opened.state, native, topics, adopted, deadmen, clients)
+            if from_ros.only(urgent=thread.is_urgent).topics:
+                from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
 
-    def _deadman(
-        self, plan: DeadmanPlan, program: Program, senders: Mapping[str, NativeSender], state: State
-    ) -> NativeDeadman:
-        used = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
-        key = "deadman", plan, tuple(used.values())
-        return state.keep(key, lambda: self._deadmen.add(plan, program.counters, used))
-
-    def _deadmen_of_clients(self, program: Program, opened: Opened) -> dict[str, ClientDeadman]:
-        """Their thread serves them from now on: clients may publish before the program runs. Raises StartError."""
-        made = {plan.route: self._client_deadman(plan, program, opened) for plan in program.client_deadmen}
-        if made:
-            try:
-                self._client_deadmen.start(functions_of_rcl(self._library))
-            except OSError as error:
-                raise StartError(str(error)) from error
+                thread.start(TAKE, RESET)
+        if clients:
+            self._client_deadmen.start(_functions_of_rcl(self.library))
         if self.now is None:
-            for deadman in made.values():
+            for deadman in clients.values():
                 deadman.await_subscribers(boottime_ns())
-        return made
-
-    def _client_deadman(self, plan: DeadmanPlan, program: Program, opened: Opened) -> ClientDeadman:
-        used = {topic: opened.publications[topic] for topic, _ in plan.datagrams}
-        key = "client deadman", plan, tuple(used.values())
-        return opened.state.keep(key, lambda: self._client_deadmen.add(plan, program.counters, used))
 
     def subscriber_joined(self, topic: str) -> None:
         """Shortly after the start, have deadmen of the topic publish to a subscriber that was discovered."""
@@ -214,52 +200,32 @@ class Plane:
 
         Raises StuckError or StartError, with nothing changed. Until `has_passed`, threads may use the earlier program.
         """
+        earlier, generation = self.now, built.native.generation
         with ExitStack() as undo:
             for thread in self._from_ros:
-                thread.leave(built.topics)
+                thread.leave(built.from_ros)
                 undo.callback(thread.stay)
-            self._change_topics(built)
-            if self.now is None:
-                self._carrier.start(built.native, _change_of_destinations(built))
+            # Before the publish thread gets a message of this program.
+            topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
+            built.native.arrays.append(topics)
+            self._publishing.change(topics)
+            if earlier is None:
+                self._carrier.start(change_to(built.native, built.timers(None, of_topics=False)), built.native)
                 self._is_running = True
             undo.pop_all()
-        if self.now is not None:
+        if earlier is not None:
             for listener in left:
                 listener.end_input()
-            self._change(built, self.now)
-        clients = self.now.client_deadmen if self.now else {}
-        self._client_deadmen.adopt(clients, built.client_deadmen, built.native.generation)
-        self._publishing.advance(built.native.generation)
+            deadmen = replaced(built.deadmen, earlier.deadmen)
+            change = change_to(built.native, built.timers(earlier, of_topics=False), deadmen)
+            self._carrier.change(change, built.native)
+        self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)
+        self._publishing.advance(generation)
         # After deadmen were replaced: a feed of the earlier ones acts on the next ones.
         for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
             thread.follow(other)
-            thread.serve(built.topics)
+            thread.adopt(built.from_ros)
         self.now = built
-
-    def _change(self, built: Built, earlier: Built) -> None:
-        """Have the receive thread execute another program; deadmen inherit the state of those that they replace."""
-        before = earlier.deadmen
-        replaced = [
-            (each, before[route])
-            for route, each in built.deadmen.items()
-            if route in before and before[route] is not each
-        ]
-        for next_one, replaced_one in replaced:
-            next_one.succeeds(replaced_one)
-        pairs = [(next_one.address, each.address) for next_one, each in replaced]
-        self._carrier.change(built.native, pairs, _change_of_destinations(built))
-
-    def _change_topics(self, built: Built) -> None:
-        """Post what changes in the timers of the publish thread, before it gets a message of this program."""
-        adopted = [each for each in built.adopted if each.is_topic]
-        left = [
-            each.address
-            for each in built.state.left()
-            if isinstance(each, NativeCollector) or (isinstance(each, NativeDeferral) and each.is_topic)
-        ]
-        change = c.PublishChange(timers=timer_change(adopted, left), generation=built.native.generation)
-        built.native.arrays.append(change)
-        self._publishing.change(change)
 
     def has_passed(self) -> bool:
         """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
@@ -290,10 +256,21 @@ class Plane:
             if deadman not in kept:
                 deadman.end()
 
+    # received datagrams, for the mirror
+
     def observe(self, *, is_observed: bool) -> None:
-        """Begin or cease to show received datagrams to the mirror."""
-        lost = self._counters.counters.index("mirror_dropped")
+        """Begin or cease to keep received datagrams for `take`."""
+        lost = self.counts.counters.index("mirror_dropped")
         self._carrier.mirror(self._mirrored.ring if is_observed else None, lost)
+
+    def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
+        """What was received since the last call, as `recording.mirror.Mirrored`. For one thread."""
+        return self._mirrored.take()
+
+    @property
+    def lost(self) -> int:
+        """Datagrams that had no room to be kept."""
+        return self.counts.total("mirror_dropped")
 
     def feed_watchdog(self, notify: int, interval: int) -> None:
         """Feed a watchdog by a connected socket, every `interval` ns; -1 for none."""
@@ -311,9 +288,12 @@ class Plane:
             listener.end_input()
         self._carrier.stop_receiving()
         self._is_running = False
-        have_ended = [self._publishing.stop(), *(thread.stop() for thread in self._from_ros)]
+        threads = self._publishing, *self._from_ros
+        stuck = [thread.name for thread in threads if not thread.stop()]
+        if stuck:
+            logger.error("a thread is stuck, and the router ends without it", threads=stuck)
         self.has_stopped = True
-        return all(have_ended)
+        return not stuck
 
     def close(self) -> bool:
         """Send what waits, then have deadmen send a last time. Nothing is sent afterwards.
@@ -341,21 +321,19 @@ class Plane:
         return where_refused(self.now.program.lowered, route, topic, target, place)
 
 
-def _change_of_destinations(built: Built) -> c.TimerChange:
-    """What changes in the timers of endpoints. What only the earlier program had sends what it holds."""
-    left = list(built.state.left())
-    ended = [each.address for each in left if isinstance(each, NativePacer)]
-    ended += [each.address for each in left if isinstance(each, NativeDeferral) and not each.is_topic]
-    return timer_change([each for each in built.adopted if not each.is_topic], ended)
+def _counts_and_events(library: ctypes.CDLL) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:
+    """What a native thread counts in, and writes its events to."""
+    return ThreadCounts.fixed(), Ring(library, _EVENTS)
 
 
-def _limit(state: State, plan: RoutePlan, target: TargetPlan) -> c.Limit:
-    """The limit of a target with `max_rate`, which lives as long as programs have the target."""
-    rate = target.max_rate
-    assert rate is not None  # noqa: S101 - asked for by the caller
-    return state.keep(("limit", plan.route, plan.topic, target), lambda: open_limit(rate))
+def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
+    """Addresses of what publishes, and of what says and forgets why it could not. Raises StartError."""
+    from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
 
-
-def log_start(route: str, sent_to: Sequence[str]) -> None:
-    if sent_to:
-        logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
+    functions = None if library.rcl_types_differ() else publish_functions()
+    if functions is None:
+        raise StartError(
+            "rcl, by which ROS publishes, has other structures than the carrier expects",
+            "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
+        )
+    return functions

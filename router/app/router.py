@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from router.app.counts import ThreadCounts
+from router.app.plane import Plane
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
@@ -57,8 +58,9 @@ class Router:
         self._first = program
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
-        self.mirror = Mirror(self._observers_changed, self._reporter.failed)
-        self._runtime = Runtime(load(), self._counts, self.mirror, self._reporter, self._deadman_changed, ros_args)
+        plane = Plane(load(), self._counts, self._reporter, self._deadman_changed)
+        self.mirror = Mirror(plane, self._reporter.failed)
+        self._runtime = Runtime(plane, self._reporter, ros_args)
         self._services = Services(self)
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
         self._watcher: Watcher | None = None
@@ -156,10 +158,6 @@ class Router:
         self._services.open(opening, (self._runtime.node_name, diagnostics.publish) if diagnostics else None)
         opening.callback(self.mirror.close)
 
-    def _observers_changed(self) -> None:
-        """Called when the first observer of received datagrams attaches or the last one detaches."""
-        self._runtime.plane.observe(is_observed=self.mirror.is_observed)
-
     def _deadman_changed(self, route: str, active: bool) -> None:
         self._reporter.deadman_changed(route, active)
         if active:
@@ -196,7 +194,6 @@ class Router:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
 
         return {
-            "mirror_dropped": lambda: [((), self.mirror.lost)],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],

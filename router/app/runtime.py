@@ -6,14 +6,12 @@ between two messages), finish (close what is no longer used). The first program 
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from router.app.counts import ThreadCounts
 from router.app.plane import Built, Opened, Plane
 from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.carrier.state import State
@@ -22,7 +20,6 @@ from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import SourceSpan, StartError
 from router.log import fault
 from router.observe.reports import Reporter
-from router.recording.mirror import Mirror
 from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
@@ -51,26 +48,14 @@ class Change:
 
 
 class Runtime:
-    """The sockets, ROS node, gateways and threads of the running program.
+    """The sockets, ROS node, gateways and threads of the running program."""
 
-    `deadman_changed` is called with a route and whether its deadman is tripped.
-    """
-
-    def __init__(
-        self,
-        library: ctypes.CDLL,
-        counts: ThreadCounts,
-        mirror: Mirror,
-        reporter: Reporter,
-        deadman_changed: Callable[[str, bool], None],
-        ros_args: Sequence[str],
-    ) -> None:
-        self._library = library
-        self.plane = Plane(library, counts, mirror, reporter, deadman_changed)
+    def __init__(self, plane: Plane, reporter: Reporter, ros_args: Sequence[str]) -> None:
+        self.plane = plane
         self.drops = KernelDrops()
-        self.sockets = Sockets(self.drops, library)
+        self.sockets = Sockets(self.drops, plane.library)
         self.gateways: GatewayThread | None = None
-        self._counts = counts
+        self._counts = plane.counts
         self._reporter = reporter
         self._ros_args = ros_args
         self._ros: RouterNode | None = None
@@ -230,7 +215,7 @@ class Runtime:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
             reporter, counts = self._reporter, self._counts.gateways
-            self.gateways = GatewayThread(self._ros, self._library, counts, reporter.report, reporter.failed)
+            self.gateways = GatewayThread(self._ros, self.plane.library, counts, reporter.report, reporter.failed)
             undo.callback(self._stop_gateways)
         feed = {name: deadman.feed for name, deadman in built.client_deadmen.items()}
         change = self.gateways.prepare(built.program, feed)

@@ -7,12 +7,15 @@ import os
 from collections.abc import Mapping
 from time import sleep
 
-from router.carrier.deadmen import NativeDeadman, open_deadman
+from router.carrier.deadmen import NativeDeadman, open_deadman, replaced
 from router.carrier.outlets import Names, Publication
 from router.carrier.ring import Ring
+from router.carrier.state import State
+from router.carrier.threads import NativeThread
 from router.clock import monotonic_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
+from router.errors import StartError
 
 _POLL_S = 0.002
 
@@ -40,20 +43,14 @@ class ClientDeadman(NativeDeadman):
         self._library.deadman_end_by_thread(self._deadmen, self.address)
 
 
-class ClientDeadmen:
-    """All deadmen of gateway clients, and their thread; never closed.
+class ClientDeadmen(NativeThread):
+    """All deadmen of gateway clients, and their thread; never closed. They write to `events` what they do."""
 
-    They count in `counters`, and write to `events` what they do.
-    """
-
-    def __init__(
-        self, library: ctypes.CDLL, counters: ctypes.Array[ctypes.c_int64], events: Ring, names: Names
-    ) -> None:
+    def __init__(self, library: ctypes.CDLL, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names) -> None:
         """Raises MemoryError."""
-        self._library = library
-        self._keep = counters, events
+        super().__init__(library, counts, events)
         self._names = names
-        self._address: int = library.client_deadmen_open(counters, events.address)
+        self._address = int(library.client_deadmen_open(counts, events.address) or 0)
         if not self._address:
             raise MemoryError("the deadmen of gateways cannot be opened")
         self._group: int = library.client_deadmen_group(self._address)
@@ -62,13 +59,20 @@ class ClientDeadmen:
     def start(self, functions: tuple[int, int, int]) -> None:
         """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
 
-        Raises OSError.
+        Raises StartError.
         """
         if not self._has_started:
             error = self._library.client_deadmen_start(self._address, *functions)
             if error:
-                raise OSError(error, f"a thread cannot be started: {os.strerror(error)}")
+                raise StartError(f"the thread for deadmen of clients cannot be started: {os.strerror(error)}")
             self._has_started = True
+
+    def kept(
+        self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
+    ) -> ClientDeadman:
+        """The deadman of a topic, which lives as long as programs have it with this publisher. Raises MemoryError."""
+        used = {topic: publications[topic] for topic, _ in plan.datagrams}
+        return state.keep(("client deadman", plan, tuple(used.values())), lambda: self.add(plan, counters, used))
 
     def add(self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication]) -> ClientDeadman:
         """Serve a deadman from now on, by the publisher of its topic. Raises MemoryError."""
@@ -76,18 +80,15 @@ class ClientDeadmen:
         address = open_deadman(self._library, self._group, self._names, counters, plan, outlets)
         return ClientDeadman(self._library, self._group, address, plan, publications)
 
-    def adopt(self, now: Mapping[str, ClientDeadman], then: Mapping[str, ClientDeadman], generation: int) -> None:
+    def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
         """Go on from the deadmen of a program to those of the next one, which has that generation. By name.
 
         Those with other settings inherit the state of earlier ones.
         """
-        for name, before in now.items():
-            next_one = then.get(name)
-            if next_one is None:
-                before.end()
-            elif next_one is not before:
-                next_one.succeeds(before)
-                self._library.deadman_replace(self._group, next_one.address, before.address)
+        for name in before.keys() - now.keys():
+            before[name].end()
+        for each, earlier in replaced(now, before):
+            self._library.deadman_replace(self._group, each.address, earlier.address)
         self._library.client_deadmen_advance(self._address, generation)
 
     def wait_for(self, generation: int, timeout: float) -> bool:

@@ -7,9 +7,7 @@ from collections.abc import Sequence
 
 from router import declared as c
 from router.carrier.lowered import Routines
-from router.carrier.state import State
 from router.compiler.lowering import LoweredCollect
-from router.compiler.program import RoutePlan
 
 
 class NativeCollector:
@@ -24,14 +22,6 @@ class NativeCollector:
 
     def __del__(self) -> None:
         self._library.collector_close(self.address)
-
-
-def kept_collector(library: ctypes.CDLL, state: State, plan: RoutePlan) -> NativeCollector:
-    """The collector of a route, which lives as long as programs have it, with these topics and this payload."""
-    timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
-    assert timeout is not None  # noqa: S101 - asked for by the caller
-    key = "collect", plan.route, timeout, plan.case.message_class, targets
-    return state.keep(key, lambda: NativeCollector(library, timeout))
 
 
 def native_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:

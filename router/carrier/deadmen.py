@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
+from typing import TypeVar
 
 from router import declared as c
-from router.carrier.outlets import Names
+from router.carrier.outlets import Addressed, Names
 from router.carrier.ring import Ring
-from router.carrier.sender import NativeSender
+from router.carrier.state import State
+from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 
@@ -41,15 +43,35 @@ class NativeDeadman:
         self._library.deadman_close(self._deadmen, self.address)
 
 
-class Deadmen:
-    """All deadmen of routes. They count in `counters`, and write to `events` what they do; never closed."""
+class DeadmanGroup:
+    """Deadmen of routes that one thread serves. `address` is that of its `struct timers`."""
 
-    def __init__(self, library: ctypes.CDLL, counters: object, events: Ring, names: Names) -> None:
-        """Raises MemoryError."""
+    def __init__(self, library: ctypes.CDLL, address: int, names: Names) -> None:
         self._library = library
-        self._keep = counters, events
         self._names = names
-        self.address: int = library.timers_open(counters, events.address)
+        self.address = address
+
+    def kept(
+        self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
+    ) -> NativeDeadman:
+        """The deadman of a route, which lives as long as programs have it with these senders. Raises MemoryError."""
+        used = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
+        return state.keep(("deadman", plan, tuple(used.values())), lambda: self.add(plan, counters, used))
+
+    def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed]) -> NativeDeadman:
+        """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
+        outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}
+        address = open_deadman(self._library, self.address, self._names, counters, plan, outlets)
+        return NativeDeadman(self._library, self.address, address, plan, senders)
+
+
+class Deadmen(NativeThread, DeadmanGroup):
+    """All deadmen of routes. They write to `events` what they do; never closed."""
+
+    def __init__(self, library: ctypes.CDLL, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names) -> None:
+        """Raises MemoryError."""
+        NativeThread.__init__(self, library, counts, events)
+        DeadmanGroup.__init__(self, library, library.timers_open(counts, events.address) or 0, names)
         if not self.address:
             raise MemoryError("the deadmen of the carrier cannot be opened")
 
@@ -57,11 +79,16 @@ class Deadmen:
         """Send what waits, then have deadmen send a last time. Nothing waits afterwards."""
         self._library.timers_end(self.address)
 
-    def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, NativeSender]) -> NativeDeadman:
-        """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
-        outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}
-        address = open_deadman(self._library, self.address, self._names, counters, plan, outlets)
-        return NativeDeadman(self._library, self.address, address, plan, senders)
+
+Deadman = TypeVar("Deadman", bound=NativeDeadman)
+
+
+def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
+    """The deadmen of a program that go on from other ones of an earlier program, by route, each with that one."""
+    pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
+    for each, earlier in pairs:
+        each.succeeds(earlier)
+    return pairs
 
 
 def open_deadman(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from router import declared as c
 from router.carrier.limits import period
-from router.carrier.state import State
-from router.compiler.program import RoutePlan, TargetPlan
+from router.compiler.program import TargetPlan
 from router.table.model import OnLimit
 
 
@@ -31,9 +30,8 @@ class NativePacer:
 class NativeDeferral:
     """What may hold back the messages of one target. `address` is that of its `struct deferral`."""
 
-    def __init__(self, library: ctypes.CDLL, pacer: NativePacer | None, *, is_topic: bool) -> None:
+    def __init__(self, library: ctypes.CDLL, pacer: NativePacer | None) -> None:
         """Raises MemoryError."""
-        self.is_topic = is_topic
         self._library = library
         self._keep = pacer
         self.address: int = library.deferral_open(pacer.address if pacer else None) or 0
@@ -46,40 +44,6 @@ class NativeDeferral:
 
 
 @dataclass(frozen=True, slots=True)
-class Deferrals:
-    """Pacers and deferrals of one program. It shares those that have the same key with the previous one, by `state`.
-
-    `senders` are by endpoint, as are `bandwidths`, and `publications` by topic: what waits for one of them does not go
-    to another.
-    """
-
-    library: ctypes.CDLL
-    state: State
-    senders: Mapping[str, object]
-    publications: Mapping[str, object]
-    bandwidths: Mapping[str, int]
-
-    def pacers(self) -> list[NativePacer]:
-        """Those of all endpoints with a bandwidth."""
-        return [self._pacer(endpoint) for endpoint in self.bandwidths]
-
-    def _pacer(self, endpoint: str) -> NativePacer:
-        bandwidth = self.bandwidths[endpoint]
-        key = "pacer", endpoint, bandwidth, self.senders[endpoint]
-        return self.state.keep(key, lambda: NativePacer(self.library, bandwidth))
-
-    def deferral(self, plan: RoutePlan, target: TargetPlan) -> NativeDeferral | None:
-        """The deferral of a target, if it needs one."""
-        is_paced = not target.is_topic and target.label in self.bandwidths
-        pacer = self._pacer(target.label) if is_paced else None
-        if pacer is None and not held_period(target):
-            return None
-        destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
-        key = "deferral", plan.route, plan.topic, target.label, destination
-        return self.state.keep(key, lambda: NativeDeferral(self.library, pacer, is_topic=target.is_topic))
-
-
-@dataclass(frozen=True, slots=True)
 class Adoption:
     """A timer, and what it delivers to from now on: `struct adoption` in native/timers.h."""
 
@@ -89,17 +53,24 @@ class Adoption:
     target: int | None = None
 
 
-def timer_change(adopted: Sequence[Adoption], ended: Sequence[int]) -> c.TimerChange:
-    """What a reload does to timers. What ends goes first: a pacer before its deferrals, and deadmen last."""
-    adoptions = [
+def timer_change(
+    now: Collection[Adoption], before: Iterable[Adoption] = (), ended: Iterable[int] = ()
+) -> c.TimerChange:
+    """What a reload does to timers. Those that only the earlier program had end, then others that are `ended`.
+
+    A pacer goes before its deferrals, and deadmen last.
+    """
+    adopted = [
         c.Adoption(timer=_at(c.Timer, each.timer), to=_at(c.Targets, each.targets), target=_at(c.Target, each.target))
-        for each in adopted
+        for each in now
     ]
+    kept = {each.timer for each in now}
+    left = [*(each.timer for each in before if each.timer not in kept), *ended]
     return c.TimerChange(
-        adopted=(c.Adoption * len(adoptions))(*adoptions),
-        ended=(ctypes.c_void_p * len(ended))(*ended),
-        adopted_count=len(adoptions),
-        ended_count=len(ended),
+        adopted=(c.Adoption * len(adopted))(*adopted),
+        ended=(ctypes.c_void_p * len(left))(*left),
+        adopted_count=len(adopted),
+        ended_count=len(left),
     )
 
 

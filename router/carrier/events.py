@@ -8,10 +8,11 @@ import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from socket import inet_ntoa
+from typing import cast
 
 from router.carrier.outlets import Names
 from router.carrier.reasons import LOSSES, REJECTIONS
-from router.carrier.ring import Ring
+from router.carrier.threads import NativeThread
 from router.compiler.metrics import Report
 from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, RejectedEvent
 from router.threads import Thread, join_or_leave
@@ -85,29 +86,29 @@ class EventReader:
 
 
 class EventThread:
-    """Reads the events of `rings`, and calls `pulse` every few seconds to say that Python is alive.
+    """Reads the events of native threads, and calls `pulse` every few seconds to say that Python is alive.
 
-    Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
-    that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
+    Of many losses of a kind, few are events; by the counter that an event names, `report` is told of all of them.
+    `changed` gets a route and whether its deadman has tripped.
     """
 
     def __init__(
         self,
-        rings: Sequence[tuple[Ring, Sequence[int]]],
+        threads: Sequence[NativeThread],
         reader: EventReader,
         report: Callable[[Report], None],
         changed: Callable[[str, bool], None],
         pulse: Callable[[], None],
     ) -> None:
-        self._rings = rings
+        self._threads = threads
         self._reader = reader
         self._report = report
         self._changed = changed
         self._pulse = pulse
         self._stopping = False
-        self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in rings]
-        """By ring and counter: how much of it was reported, and the last report."""
-        self._wakes = [ring.watch() for ring, _ in rings]
+        self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
+        """By thread and counter: how much of it was reported, and the last report."""
+        self._wakes = [thread.events.watch() for thread in threads]
         self._thread = Thread(self._run, "carrier events")
         self._thread.start()
 
@@ -129,8 +130,9 @@ class EventThread:
         self._read()
 
     def _read(self) -> None:
-        for (ring, counters), last in zip(self._rings, self._last, strict=True):
-            while records := ring.take():
+        for thread, last in zip(self._threads, self._last, strict=True):
+            counters = cast("Sequence[int]", thread.counts)
+            while records := thread.events.take():
                 position = 0
                 while position < len(records):
                     head = EventHead.from_buffer(records, position)

@@ -1,16 +1,18 @@
-"""What is open for a program, as the carrier's arrays refer to it."""
+"""What is open for a program, and what its targets keep from one message to the next, for the carrier's arrays."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.collectors import NativeCollector
-from router.carrier.deferrals import NativeDeferral
+from router.carrier.deferrals import Adoption, NativeDeferral, NativePacer, held_period
+from router.carrier.limits import open_limit
+from router.carrier.state import State
 from router.compiler.program import RoutePlan, TargetPlan
 from router.net.udp import Listener
 
@@ -32,11 +34,15 @@ class Names:
         return self._names[number]
 
 
-class Publication(Protocol):
-    """What `ros.endpoints.Publication` is. Several threads may publish at a time, until it is closed."""
+class Addressed(Protocol):
+    """What has a structure in C, at `address`: senders and deadmen."""
 
     @property
     def address(self) -> int: ...
+
+
+class Publication(Addressed, Protocol):
+    """What `ros.endpoints.Publication` is. Several threads may publish at a time, until it is closed."""
 
     @property
     def wanted(self) -> ctypes.Array[Any]: ...
@@ -44,20 +50,53 @@ class Publication(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outlets:
-    """What is open for a program. Pointers are addresses of C structures.
+    """What is open for a program. `state` has what its targets keep: the next program takes over what has the same key.
 
-    `senders` are by endpoint, `publications` by topic. `feeds(route, names)` returns the deadmen that a command feeds
-    (False) or disarms (True), `limit(plan, target)` the limit of a target with `max_rate`, `deferral(plan,
-    target)` what may hold its messages back, `collector(plan)` what makes frames for its topics. Without `boards`,
-    endpoints that are boards get everything.
+    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` by route. Without `boards`, endpoints
+    that are boards get everything.
     """
 
-    listeners: Mapping[str, Listener]
-    senders: Mapping[str, int]
-    publications: Mapping[str, Publication]
-    feeds: Callable[[str, Sequence[str]], Sequence[tuple[int, bool]]]
-    limit: Callable[[RoutePlan, TargetPlan], c.Limit]
-    deferral: Callable[[RoutePlan, TargetPlan], NativeDeferral | None]
-    collector: Callable[[RoutePlan], NativeCollector]
+    library: ctypes.CDLL
+    state: State
     names: Names
+    listeners: Mapping[str, Listener]
+    senders: Mapping[str, Addressed]
+    publications: Mapping[str, Publication]
+    deadmen: Mapping[str, Addressed]
+    bandwidths: Mapping[str, int]
     boards: NativeBoards | None = None
+
+    def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
+        """The deadmen that commands of the route feed, which is its own, or disarm."""
+        return [c.Feed(deadman=self.deadmen[name].address, disarms=name != plan.route) for name in target.deadmen]
+
+    def limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
+        """The limit of a target with `max_rate`."""
+        rate = target.max_rate
+        assert rate is not None  # noqa: S101 - said by the caller
+        return self.state.keep(("limit", plan.route, plan.topic, target), lambda: open_limit(rate))
+
+    def pacers(self) -> list[Adoption]:
+        """The pacers of all endpoints with a bandwidth."""
+        return [Adoption(self._pacer(endpoint).address) for endpoint in self.bandwidths]
+
+    def _pacer(self, endpoint: str) -> NativePacer:
+        bandwidth = self.bandwidths[endpoint]
+        key = "pacer", endpoint, bandwidth, self.senders[endpoint]
+        return self.state.keep(key, lambda: NativePacer(self.library, bandwidth))
+
+    def deferral(self, plan: RoutePlan, target: TargetPlan) -> NativeDeferral | None:
+        """What holds back the messages of a target, if it needs that. They do not go to another sender or publisher."""
+        pacer = self._pacer(target.label) if not target.is_topic and target.label in self.bandwidths else None
+        if pacer is None and not held_period(target):
+            return None
+        destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
+        key = "deferral", plan.route, plan.topic, target.label, destination
+        return self.state.keep(key, lambda: NativeDeferral(self.library, pacer))
+
+    def collector(self, plan: RoutePlan) -> NativeCollector:
+        """What makes frames of the route's payload for its topics."""
+        timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
+        assert timeout is not None  # noqa: S101 - said by the caller
+        key = "collect", plan.route, timeout, plan.case.message_class, targets
+        return self.state.keep(key, lambda: NativeCollector(self.library, timeout))

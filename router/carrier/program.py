@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
+from router.carrier.deadmen import NativeDeadman
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
@@ -53,6 +54,19 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         routes=writer.array(c.Route, [writer.route(plan) for plan in plans]),
     )
     return made
+
+
+def change_to(
+    program: NativeProgram, timers: c.TimerChange, deadmen: Sequence[tuple[NativeDeadman, NativeDeadman]] = ()
+) -> c.Change:
+    """What the receive thread is told. `deadmen` go on from others, each from the second of its pair."""
+    addresses = [deadman.address for pair in deadmen for deadman in pair]
+    return c.Change(
+        program=ctypes.pointer(program.structure),
+        replaced=(ctypes.c_void_p * len(addresses))(*addresses),
+        timers=timers,
+        replaced_count=len(deadmen),
+    )
 
 
 @dataclass(frozen=True, slots=True)

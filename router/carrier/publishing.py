@@ -3,50 +3,49 @@
 from __future__ import annotations
 
 import ctypes
-from threading import Lock
 from time import sleep
 
 from router import declared as c
+from router.carrier.outlets import Names
 from router.carrier.ring import Ring
+from router.carrier.threads import NativeThread
 from router.clock import monotonic_ns
+from router.errors import StartError
 
 _POLL_S = 0.002
 
 
-class PublishThread:
-    """Delivers the messages of `ring` to topics. It starts at once, and stops once.
+class PublishThread(NativeThread):
+    """Delivers the messages of `ring` to topics. It starts once, and stops once; before, nothing waits for it.
 
-    `counters` is the array that it counts in; losses go to `events`. `functions` are the addresses of those in
-    `ros.rcl.PublishFunctions`.
+    It counts what was delivered, and writes losses to `events`.
     """
 
     def __init__(
-        self,
-        library: ctypes.CDLL,
-        ring: Ring,
-        counters: ctypes.Array[ctypes.c_int64],
-        events: Ring,
-        functions: tuple[int, int, int],
+        self, library: ctypes.CDLL, ring: Ring, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names
     ) -> None:
-        """Raises MemoryError, also for a lack of descriptors or threads."""
-        self._library = library
-        self._ring, self._counters, self._events = ring, counters, events
-        self._in_use = Lock()  # for those who ask while it may be stopped
-        self._address: int = library.publish_open(ring.address, counters, events.address, *functions)
-        if not self._address:
-            raise MemoryError("the thread that publishes cannot be started")
+        super().__init__(library, counts, events, library.publish_counters)
+        self.name = "publish"
+        self.ring = ring
+        self._names = names
 
-    def counters(self, count: int) -> list[int]:
-        """Return the first counters, as they are between two messages."""
-        copy = (ctypes.c_int64 * count)()
-        with self._in_use:
-            if not self._address:
-                return list(self._counters[:count])
-            self._library.publish_counters(self._address, copy, count)
-        return list(copy)
+    def start(self, functions: tuple[int, int, int]) -> None:
+        """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
+
+        Raises StartError for a lack of memory, descriptors or threads.
+        """
+        if self._address:
+            return
+        arguments = self.ring.address, self.counts, self.events.address, *functions
+        self._address = int(self._library.publish_open(*arguments) or 0)
+        if not self._address:
+            raise StartError("the thread that publishes cannot be started")
 
     def change(self, change: c.PublishChange) -> None:
-        """Make a change of timers when its generation is reached: to be called before a message of that comes."""
+        """Make a change of timers when its generation is reached: to be called before a message of that comes.
+
+        It stays the caller's until then.
+        """
         with self._in_use:
             if self._address:
                 self._library.publish_change(self._address, ctypes.byref(change))
@@ -66,12 +65,12 @@ class PublishThread:
             sleep(_POLL_S)
         return False
 
-    def stalled(self) -> tuple[int, float] | None:
-        """The topic in whose publisher the thread is now, by its number, and for how many seconds; None if in none."""
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher the thread is now, and for how many seconds; None if in none."""
         topic = ctypes.c_uint32()
         with self._in_use:
             since = self._library.publish_since(self._address, ctypes.byref(topic)) if self._address else 0
-        return (topic.value, (monotonic_ns() - since) / 1e9) if since else None
+        return (self._names.name(topic.value), (monotonic_ns() - since) / 1e9) if since else None
 
     def stop(self) -> bool:
         """Serve what waits, and end.

@@ -12,17 +12,15 @@ from weakref import finalize
 
 from router import declared as c
 from router.carrier.boards import NativeBoards
-from router.carrier.collectors import kept_collector
-from router.carrier.deadmen import NativeDeadman, open_deadman
-from router.carrier.deferrals import Adoption, Deferrals, timer_change
+from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced
+from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import Changed, EventReader, Told
-from router.carrier.from_ros import NativeFromRos, native_from_ros
-from router.carrier.limits import open_limit
 from router.carrier.outlets import Names, Outlets
-from router.carrier.program import NativeProgram, native_program
+from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.reasons import where_refused, why_rejected
+from router.carrier.ros_routes import NativeFromRos, native_from_ros
 from router.carrier.state import State
-from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
+from router.compiler.program import Program
 from router.declared import RecordKind
 from router.table.model import Endpoint
 
@@ -97,19 +95,10 @@ class Stage:
 
     def _serve(self, running: _Running, earlier: _Running | None) -> None:
         before = earlier.deadmen if earlier else {}
-        replaced = [(each, before[route]) for route, each in running.deadmen.items() if route in before]
-        replaced = [(each, replaces) for each, replaces in replaced if replaces is not each]
-        for each, replaces in replaced:
-            each.succeeds(replaces)
-        addresses = [each.address for pair in replaced for each in pair]
         left = [each.address for each in before.values() if each not in running.deadmen.values()]
-        change = c.Change(
-            program=ctypes.pointer(running.native.structure),
-            replaced=(ctypes.c_void_p * len(addresses))(*addresses),
-            timers=running.timer_change(earlier, left, of_topics=False),
-            replaced_count=len(replaced),
-        )
-        of_topics = running.timer_change(earlier, (), of_topics=True)
+        timers = running.timers(earlier, left, of_topics=False)
+        change = change_to(running.native, timers, replaced(running.deadmen, before))
+        of_topics = running.timers(earlier, (), of_topics=True)
         address = self._opened.address
         self._library.rehearsal_adopt(address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
 
@@ -192,44 +181,23 @@ class Stage:
 
     def _bound(self, program: Program, state: State, fixed: _Fixed) -> _Bound:
         """Open what messages change, unless `state` has it."""
-        deadmen = {plan.route: self._deadman(plan, program, fixed.senders, state) for plan in program.deadmen}
-
-        def feeds(route: str, names: Sequence[str]) -> Sequence[tuple[int, bool]]:
-            return [(deadmen[name].address, name != route) for name in names]
-
-        def limit(plan: RoutePlan, target: TargetPlan) -> c.Limit:
-            assert target.max_rate is not None  # noqa: S101 - asked for by the caller
-            return state.keep(("limit", plan.route, plan.topic, target), partial(open_limit, target.max_rate))
-
-        bandwidths = {each.name: each.bandwidth for each in program.senders if each.bandwidth is not None}
-        deferrals = Deferrals(self._library, state, fixed.senders, fixed.publications, bandwidths)
+        group = DeadmanGroup(self._library, self._opened.timers, self._names)
+        deadmen = {plan.route: group.kept(plan, program.counters, fixed.senders, state) for plan in program.deadmen}
         outlets = Outlets(
-            listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
-            senders={name: sender.address for name, sender in fixed.senders.items()},
-            publications=fixed.publications,
-            feeds=feeds,
-            limit=limit,
-            deferral=deferrals.deferral,
-            collector=partial(kept_collector, self._library, state),
+            library=self._library,
+            state=state,
             names=self._names,
+            listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
+            senders=fixed.senders,
+            publications=fixed.publications,
+            deadmen=deadmen,
+            bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=fixed.boards,
         )
-        return _Bound(outlets, deadmen, [Adoption(pacer.address) for pacer in deferrals.pacers()])
+        return _Bound(outlets, deadmen, outlets.pacers())
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
         return state.keep(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
-
-    def _deadman(
-        self, plan: DeadmanPlan, program: Program, senders: Mapping[str, _Sender], state: State
-    ) -> NativeDeadman:
-        fed = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
-
-        def deadman() -> NativeDeadman:
-            group, outlets = self._opened.timers, {name: {"sender": sender.address} for name, sender in fed.items()}
-            address = open_deadman(self._library, group, self._names, program.counters, plan, outlets)
-            return NativeDeadman(self._library, group, address, plan, fed)
-
-        return state.keep(("deadman", plan, tuple(fed.values())), deadman)
 
 
 class _Opened:
@@ -345,12 +313,13 @@ class _Running:
         for states in (self.native.states, self._from_ros.states):
             states.release()
 
-    def timer_change(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
+    def timers(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
         """What timers are to do that hold messages back, for topics or for endpoints; `ended` end as well."""
-        adopted = [each for each in self.adopted if each.is_topic is of_topics]
-        kept = {each.timer for each in adopted}
-        before = [each.timer for each in earlier.adopted if each.is_topic is of_topics] if earlier else []
-        return timer_change(adopted, [*(each for each in before if each not in kept), *ended])
+        now, before = (
+            [each for each in adopted if each.is_topic is of_topics]
+            for adopted in (self.adopted, earlier.adopted if earlier else ())
+        )
+        return timer_change(now, before, ended)
 
 
 def _number(host: str) -> int:

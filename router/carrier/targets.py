@@ -61,10 +61,7 @@ class TargetStates:
                 native.limit = ctypes.pointer(limit)
                 self._kept.append(limit)
             if target.deadmen:
-                feeds = [
-                    c.Feed(deadman=deadman, disarms=disarms)
-                    for deadman, disarms in outlets.feeds(plan.route, target.deadmen)
-                ]
+                feeds = outlets.feeds(plan, target)
                 native.feeds, native.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
 
     def _bind_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
@@ -144,7 +141,7 @@ class TargetWriter:
 
     def _destination(self, target: TargetPlan) -> c.Target:
         made = c.Target(
-            sender=self.outlets.senders[target.label],
+            sender=self.outlets.senders[target.label].address,
             trims=self.program.table.endpoints[target.label].trim_trailing_zeros,
         )
         if self.outlets.boards is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
@@ -47,31 +47,38 @@ Mirrored = tuple[int, str, Peer, str, str, bytes]
 Consumer = Callable[[Sequence[Mirrored]], None]
 
 
+class Source(Protocol):
+    """What receives."""
+
+    def observe(self, *, is_observed: bool) -> None:
+        """Called when the first consumer has attached, and when the last one has detached."""
+
+    def take(self) -> Sequence[Mirrored]:
+        """What was received since the last call."""
+
+    @property
+    def lost(self) -> int:
+        """Datagrams that were routed, but not mirrored."""
+
+
 class Mirror:
     """One thread calls the consumers, up to PERIOD after a datagram; none may keep it for long.
 
-    `rewire` is called when the first consumer has attached and when the last one has detached. What a consumer raises
-    goes to `failed`.
+    What a consumer raises goes to `failed`.
     """
 
-    def __init__(self, rewire: Callable[[], None], failed: Callable[[Exception], None]) -> None:
-        self._rewire = rewire
+    def __init__(self, source: Source, failed: Callable[[Exception], None]) -> None:
+        self._source = source
         self._failed = failed
-        self._drain: Callable[[], Sequence[Mirrored]] = tuple
-        self._lost: Callable[[], int] = int
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
         self._stopping = threading.Event()
         self._thread: Thread | None = None
 
-    def show(self, drain: Callable[[], Sequence[Mirrored]], lost: Callable[[], int]) -> None:
-        """Show what `drain` returns: what was received since its last call. `lost` is how many were not mirrored."""
-        self._drain, self._lost = drain, lost
-
     @property
     def lost(self) -> int:
         """Datagrams that were routed, but not mirrored."""
-        return self._lost()
+        return self._source.lost
 
     @property
     def is_observed(self) -> bool:
@@ -91,7 +98,7 @@ class Mirror:
                 self._stopping, self._thread = stopping, thread
             self._consumers = (*self._consumers, consumer)
             if len(self._consumers) == 1:
-                self._rewire()
+                self._source.observe(is_observed=True)
 
         def detach() -> None:
             with self._attaching:
@@ -101,8 +108,8 @@ class Mirror:
                     self._end()
                 self._consumers = tuple(each for each in self._consumers if each is not consumer)
                 if not self._consumers:
-                    self._rewire()
-                    self._drain()
+                    self._source.observe(is_observed=False)
+                    self._source.take()
 
         return detach
 
@@ -124,7 +131,7 @@ class Mirror:
 
     def _deliver(self) -> None:
         """Called by the thread, and after its end by the thread that joined it: never by two at once."""
-        batch = self._drain()
+        batch = self._source.take()
         if not batch:
             return
         for consumer in self._consumers:

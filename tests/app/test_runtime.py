@@ -21,9 +21,9 @@ from structlog.testing import capture_logs
 from router import threads
 from router.app import Router
 from router.app.plane import Plane
-from router.app.publishing import Publishing
 from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
+from router.carrier.publishing import PublishThread
 from router.compiler.metrics import REJECT_REASONS
 from router.declared import MAX_DATAGRAM
 from router.errors import StartError
@@ -212,7 +212,7 @@ def test_a_scrape_reads_what_was_published_before_what_was_received(
     """Else what is received and published in between would be published without having waited."""
     read: list[str] = []
 
-    def noted(kind: type[Carrier | Publishing]) -> None:
+    def noted(kind: type[Carrier | PublishThread]) -> None:
         original = kind.counters
 
         def note(of: Any, size: int) -> Any:
@@ -222,10 +222,10 @@ def test_a_scrape_reads_what_was_published_before_what_was_received(
         monkeypatch.setattr(kind, "counters", note)
 
     noted(Carrier)
-    noted(Publishing)
+    noted(PublishThread)
     with Router(site.program(ROUTE)) as router:
         list(router.collect())
-    assert read == ["Publishing", "Carrier"]
+    assert read == ["PublishThread", "Carrier"]
 
 
 def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(

@@ -8,24 +8,21 @@ import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint, c_void_p
+from dataclasses import replace
 from pathlib import Path
 from struct import Struct
-from typing import Any, cast
+from typing import Any
 
-import pytest
-
-from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen, NativeDeadman
-from router.carrier.deferrals import Adoption, Deferrals, timer_change
-from router.carrier.from_ros import FromRosThread, native_from_ros
-from router.carrier.limits import open_limit
+from router.carrier.deferrals import timer_change
+from router.carrier.from_ros import FromRosThread
 from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
-from router.carrier.sender import NativeSender
+from router.carrier.ros_routes import native_from_ros
 from router.carrier.state import State
-from router.compiler.program import Program, RoutePlan, TargetPlan
+from router.compiler.program import Program
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 16
@@ -139,41 +136,34 @@ class Commanding:
         for board in self.boards.values():
             stack.callback(board.close)
         self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self.names)
-        senders = cast("Mapping[str, NativeSender]", self.boards)
         self.by_route: dict[str, NativeDeadman] = {
-            plan.route: self.deadmen.add(plan, program.counters, senders) for plan in program.deadmen
+            plan.route: self.deadmen.add(plan, program.counters, self.boards) for plan in program.deadmen
         }
-        self._limits: dict[object, c.Limit] = {}
-        bandwidths = {plan.name: plan.bandwidth for plan in program.senders if plan.bandwidth is not None}
-        self._deferrals = Deferrals(library, State(), senders, {}, bandwidths)
         outlets = Outlets(
-            listeners={},
-            senders={endpoint: board.address for endpoint, board in self.boards.items()},
-            publications={},
-            feeds=lambda route, names: [(self.by_route[name].address, name != route) for name in names],
-            limit=self._limit,
-            deferral=self._deferrals.deferral,
-            collector=lambda _: pytest.fail("no route from ROS has one"),
+            library=library,
+            state=State(),
             names=self.names,
+            listeners={},
+            senders=self.boards,
+            publications={},
+            deadmen=self.by_route,
+            bandwidths={plan.name: plan.bandwidth for plan in program.senders if plan.bandwidth is not None},
             boards=NativeBoards(program.boards),
         )
         self.messages = native_from_ros(program, 1, outlets)
-        pacers = [Adoption(pacer.address) for pacer in self._deferrals.pacers()]
-        timers = timer_change([*pacers, *self.messages.states.adopted], ())
+        self.messages.arrays.append(outlets)
+        timers = timer_change([*outlets.pacers(), *self.messages.states.adopted])
         library.timers_change(self.deadmen.address, ctypes.byref(timers))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
         assert take
         assert reset
-        self.thread = FromRosThread(library, self.deadmen.address, self.counters, self.events, take, reset)
+        self.thread = FromRosThread(library, self.deadmen.address, self.counters, self.events)
+        self.thread.start(take, reset)
         stack.callback(self.thread.stop)
 
-    def _limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
-        assert target.max_rate is not None
-        return self._limits.setdefault((plan.route, plan.topic, target), open_limit(target.max_rate))
-
     def serve(self, subscriptions: Mapping[str, Subscription] | None = None) -> None:
-        self.thread.serve(self.messages, subscriptions or self.subscriptions)
+        self.thread.serve(replace(self.messages, subscriptions=subscriptions or self.subscriptions))
 
     def ledger(self) -> Ledger:
         size = max(index for _, index in self.program.counters.series()) + 1

@@ -79,7 +79,7 @@ class Deferring:
         """Add a target with `on_limit: latest` if `hertz` is given, and with the bandwidth if there is one."""
         if self._pacer is not None and not self._deferrals:
             self._functions.seam_adopt(self._address, self._pacer.address, 0)
-        self._deferrals.append(NativeDeferral(self._library, None if is_topic else self._pacer, is_topic=is_topic))
+        self._deferrals.append(NativeDeferral(self._library, None if is_topic else self._pacer))
         return self._add(self._deferrals[-1], hertz, priority, is_topic=is_topic)
 
     def change(self, target: int, hertz: float | None, priority: Priority = Priority.COMMAND) -> int:

@@ -12,9 +12,9 @@ from typing import NamedTuple, Union
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.collectors import NativeCollector, native_collect
-from router.carrier.from_ros import native_for_each
 from router.carrier.lowered import Routines, native_values
 from router.carrier.reasons import LOSSES
+from router.carrier.ros_routes import native_for_each
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.declared import NONE
 from tests.carrier.building import MEMORY, sanitizing

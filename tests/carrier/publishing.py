@@ -7,7 +7,6 @@ import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from ctypes import c_int64, c_void_p
-from functools import partial
 from struct import Struct
 from time import monotonic, sleep
 from types import SimpleNamespace
@@ -15,16 +14,14 @@ from typing import Any, cast
 
 from router import declared as c
 from router.carrier.carrier import Carrier
-from router.carrier.collectors import NativeCollector, kept_collector
 from router.carrier.deadmen import Deadmen
-from router.carrier.deferrals import Deferrals, NativeDeferral, timer_change
-from router.carrier.limits import open_limit
+from router.carrier.deferrals import timer_change
 from router.carrier.outlets import Names, Outlets
-from router.carrier.program import NativeProgram, native_program
+from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.carrier.state import State
-from router.compiler.program import Program, RoutePlan, TargetPlan
+from router.compiler.program import Program
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 12
@@ -77,15 +74,15 @@ class Publishing:
         self._deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self._names)
         self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
         self._peer = stack.enter_context(_bound())
-        self._limits: dict[object, c.Limit] = {}
         self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
         self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
         self._changes: list[c.PublishChange] = []
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
-        self.thread = PublishThread(library, self._ring, self._published, self._events, cast("Any", addresses))
+        self.thread = PublishThread(library, self._ring, self._published, self._events, self._names)
+        self.thread.start(cast("Any", addresses))
         stack.callback(self._close)
         self._change_topics()
-        self._carrier.start(self._programs[0], timer_change((), ()))
+        self._carrier.start(change_to(self._programs[0], timer_change(())))
         self.sent = 0
 
     def send(self, *datagrams: bytes, listener: str = "exact") -> None:
@@ -100,14 +97,12 @@ class Publishing:
         self._state = State(self._state)
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
-        self._carrier.change(self._programs[-1], (), timer_change((), ()))
+        self._carrier.change(change_to(self._programs[-1], timer_change(())))
         self.thread.advance(generation)
 
     def _change_topics(self) -> None:
-        kinds = NativeCollector, NativeDeferral
-        made, left = self._programs[-1], [each for each in self._state.left() if isinstance(each, kinds)]
-        timers = timer_change(made.states.adopted, [each.address for each in left])
-        made.arrays.append(left)
+        made, before = self._programs[-1], self._programs[-2].states.adopted if len(self._programs) > 1 else ()
+        timers = timer_change(made.states.adopted, before)
         self._changes.append(c.PublishChange(timers=timers, generation=made.generation))
         self.thread.change(self._changes[-1])
 
@@ -144,26 +139,21 @@ class Publishing:
 
     def stalled(self) -> tuple[str, float] | None:
         """The topic in whose publisher the thread is now, and for how many seconds."""
-        stalled = self.thread.stalled()
-        return (self._names.name(stalled[0]), stalled[1]) if stalled else None
+        return self.thread.stalled()
 
     def _made(self, program: Program, generation: int) -> NativeProgram:
         listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         outlets = Outlets(
+            library=self._library,
+            state=self._state,
+            names=self._names,
             listeners=cast("Any", listening),
             senders={},
             publications=self.publishers,
-            feeds=lambda _route, _names: (),
-            limit=self._limit,
-            deferral=Deferrals(self._library, self._state, {}, self.publishers, {}).deferral,
-            collector=partial(kept_collector, self._library, self._state),
-            names=self._names,
+            deadmen={},
+            bandwidths={},
         )
         return native_program(program, generation, outlets)
-
-    def _limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
-        assert target.max_rate is not None
-        return self._limits.setdefault((plan.route, target), open_limit(target.max_rate))
 
 
 def wait_until(condition: Callable[[], object]) -> None:

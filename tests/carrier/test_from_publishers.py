@@ -22,10 +22,12 @@ if SANITIZED in os.environ:
 from rclpy.node import Node
 
 from router.carrier.deadmen import Deadmen
-from router.carrier.from_ros import FromRosThread, native_from_ros
+from router.carrier.from_ros import FromRosThread
 from router.carrier.outlets import Names, Outlets
 from router.carrier.ring import Ring
+from router.carrier.ros_routes import native_from_ros
 from router.carrier.sender import NativeSender
+from router.carrier.state import State
 from router.compiler.program import Program
 from router.ros.node import close_node, open_node
 from router.ros.qos import qos_profile
@@ -90,23 +92,23 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
             stack.callback(sender.close)
         counters = (ctypes.c_int64 * (1 << 12))()
         deadmen = Deadmen(library, (ctypes.c_int64 * (1 << 12))(), Ring(library, 1 << 12), names)
-        (deadman,) = (deadmen.add(plan, made.counters, senders) for plan in made.deadmen)
         outlets = Outlets(
-            listeners={},
-            senders={endpoint: sender.address for endpoint, sender in senders.items()},
-            publications={},
-            feeds=lambda *_: [(deadman.address, False)],
-            limit=lambda *_: pytest.fail("no target has one"),
-            deferral=lambda *_: None,
-            collector=lambda _: pytest.fail("no route has one"),
+            library=library,
+            state=State(),
             names=names,
+            listeners={},
+            senders=senders,
+            publications={},
+            deadmen={plan.route: deadmen.add(plan, made.counters, senders) for plan in made.deadmen},
+            bandwidths={},
         )
         (plan,) = made.subscriptions
         subscription = RawSubscription(node, installed_class(TYPE), plan.topic, qos_profile(plan.qos))
         stack.callback(subscription.close)
-        thread = FromRosThread(library, deadmen.address, counters, Ring(library, 1 << 12), TAKE, RESET)
+        thread = FromRosThread(library, deadmen.address, counters, Ring(library, 1 << 12))
+        thread.start(TAKE, RESET)
         stack.callback(thread.stop)
-        thread.serve(native_from_ros(made, 1, outlets), {plan.label: subscription})
+        thread.serve(native_from_ros(made, 1, outlets, {plan.label: subscription}))
         yield Router(made, library, thread, deadmen, board)
 
 

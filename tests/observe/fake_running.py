@@ -48,12 +48,17 @@ class FakeRunning:
         self.reloads = RELOADED
         self.failures: list[Exception] = []
         self.collected = 0
-        self.mirror = Mirror(lambda: None, self.failures.append)
+        self.mirror = Mirror(self, self.failures.append)
         self.lost = 0
         self.waiting: deque[Mirrored] = deque()
-        self.mirror.show(lambda: [self.waiting.popleft() for _ in range(len(self.waiting))], lambda: self.lost)
         self.counts = program.counters.fresh_counts()
         self._turns = 0
+
+    def observe(self, *, is_observed: bool) -> None:
+        pass
+
+    def take(self) -> list[Mirrored]:
+        return [self.waiting.popleft() for _ in range(len(self.waiting))]
 
     def count(self, metric: str, *labels: str, to: float) -> None:
         """Times are in ns, as in the counters."""

@@ -18,20 +18,20 @@ class Source:
 
     def __init__(self) -> None:
         self.failures: list[Exception] = []
-        self.mirror = Mirror(self._rewire, self.failures.append)
-        self.mirror.show(self._drain, lambda: 7)
-        self.rewired = 0
+        self.mirror = Mirror(self, self.failures.append)
+        self.lost = 7
+        self.observed: list[bool] = []
         self._kept: deque[Mirrored] = deque()
 
     def receive(self, data: bytes) -> None:
         if self.mirror.is_observed:
             self._kept.append((len(self._kept), "rover", PEER, "board", "", data))
 
-    def _drain(self) -> list[Mirrored]:
+    def take(self) -> list[Mirrored]:
         return [self._kept.popleft() for _ in range(len(self._kept))]
 
-    def _rewire(self) -> None:
-        self.rewired += 1
+    def observe(self, *, is_observed: bool) -> None:
+        self.observed.append(is_observed)
 
 
 def into(got: queue.SimpleQueue[MirroredDatagram]) -> Consumer:
@@ -59,14 +59,14 @@ def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> 
     assert source.mirror.lost == 7
 
 
-def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> None:
+def test_the_source_is_told_when_the_first_comes_and_the_last_goes(source: Source) -> None:
     first, second = (source.mirror.attach(lambda _: None) for _ in range(2))
-    assert source.rewired == 1
+    assert source.observed == [True]
     first()
     first()
-    assert source.rewired == 1
+    assert source.observed == [True]
     second()
-    assert source.rewired == 2
+    assert source.observed == [True, False]
 
 
 def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) -> None:

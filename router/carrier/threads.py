@@ -1,0 +1,39 @@
+"""What native threads have in common: an array that each counts in, and a ring for what it tells."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from threading import Lock
+
+from router.carrier.ring import Ring
+
+
+class NativeThread:
+    """A thread that counts in `counts` and writes to `events`.
+
+    `_address` is that of its structure, 0 while there is none; `copy` is the C function that copies counters of it.
+    """
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        counts: ctypes.Array[ctypes.c_int64],
+        events: Ring,
+        copy: Callable[..., None] | None = None,
+    ) -> None:
+        self.counts = counts
+        self.events = events
+        self._library = library
+        self._copy = copy
+        self._in_use = Lock()  # for those who call while it may be stopped
+        self._address = 0
+
+    def counters(self, count: int) -> list[int]:
+        """Return the first counters, as they are between two messages."""
+        with self._in_use:
+            if self._copy is None or not self._address:
+                return self.counts[:count]
+            copied = (ctypes.c_int64 * count)()
+            self._copy(self._address, copied, count)
+        return list(copied)
