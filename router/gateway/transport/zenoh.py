@@ -207,6 +207,7 @@ class ZenohTransport:
                 is_there = sample.kind == zenoh.SampleKind.PUT
                 self._loop.call_soon_threadsafe(self._on_token, owner, is_there)
 
+        # First, since Zenoh answers from what a subscriber has received as soon as there is one.
         others = owners(session, self._key)
         session.liveliness().declare_subscriber(all_tokens(self._key), on_sample, history=True)
         return others
