@@ -17,13 +17,10 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, NoReturn, TextIO, TypeAlias
+from typing import NoReturn, TextIO, TypeAlias
 
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
-
-if TYPE_CHECKING:
-    from _typeshed import SupportsWrite
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -33,7 +30,7 @@ BAD_USAGE = 2
 UNWRITTEN = 74
 """EX_IOERR: stdout is a file on a full disk."""
 BAD_TABLE = 78
-"""EX_CONFIG: systemd is told not to restart into it."""
+"""EX_CONFIG, after which the systemd unit does not restart."""
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 
@@ -43,16 +40,16 @@ DEFAULT_TABLE = Path("routes/rover.yaml")
 
 GROUPS = {
     "Check": {
-        "validate": "say what is wrong with route tables",
-        "test": "prove what tables do, without network or ROS",
+        "validate": "report the errors and warnings of route tables",
+        "test": "run the tests of tables, without network or ROS",
         "explain": "show what a route does, field by field",
         "graph": "draw what a table routes",
-        "doctor": "look for what keeps a router from working here",
+        "doctor": "check this computer for what keeps a router from working",
     },
     "Run": {
         "run": "run a route table between UDP and ROS 2",
-        "status": "say in a line whether the router runs and is healthy",
-        "reload": "have the running router take its changed table",
+        "status": "print in one line whether the router runs and is healthy",
+        "reload": "make the running router reload its table",
     },
     "Watch": {
         "top": "watch rates, drops and ages of the running router",
@@ -64,14 +61,14 @@ GROUPS = {
         "replay": "send a recording again, or run it through two tables",
     },
     "Try": {
-        "demo": "play boards and router on this computer until Ctrl-C",
+        "demo": "run router and simulated boards on this computer",
         "init": "write a first table into a folder",
-        "sim": "play the boards and the basestation of a table",
+        "sim": "simulate the boards and the basestation of a table",
         "send": "send envelopes with payloads of your choice",
     },
     "Protocol": {
         "new": "add a message: proto, lock, ROS message, route and test",
-        "schema": "keep the field numbers of the wire types",
+        "schema": "lock the field numbers of the protobuf messages",
     },
 }
 VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.items()}
@@ -79,7 +76,7 @@ VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.i
 SHELLS = ("bash", "zsh", "fish")
 _OPTIONS = {
     "--version": "show the version and exit",
-    f"--completion {'|'.join(SHELLS)}": "print what completes verbs and options: eval it where your shell starts",
+    f"--completion {'|'.join(SHELLS)}": "print the shell's completion script, to be run by eval in its start-up file",
 }
 _INDENT = " " * 12
 
@@ -104,16 +101,7 @@ class _Completion(argparse.Action):
         parser.exit()
 
 
-class _Parser(argparse.ArgumentParser):
-    """Fails if its help cannot be written. argparse ignores that, and the buffer of stdout is not there to fail later
-    if Python writes without one (PYTHONUNBUFFERED).
-    """
-
-    def print_help(self, file: SupportsWrite[str] | None = None) -> None:
-        print(self.format_help(), end="", file=file)
-
-
-class _MainParser(_Parser):
+class _MainParser(argparse.ArgumentParser):
     """The verbs in groups, in place of one long list."""
 
     def format_help(self) -> str:
@@ -165,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a character is no reason to fail
+            stream.reconfigure(errors="backslashreplace")  # for terminals without Unicode
     try:
         try:
             code = _run(arguments)
@@ -221,7 +209,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = _MainParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
-    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_Parser)
+    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
     if "_ARGCOMPLETE" in os.environ:
         _complete(parser, subparsers)
     chosen = _verb(arguments)

@@ -24,7 +24,7 @@ _ROVER = {
 }
 _DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
 the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change
-them. Where there is one of the folders already, nothing is written."""
+them. If one of the folders exists already, nothing is written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

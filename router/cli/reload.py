@@ -1,4 +1,4 @@
-"""`router reload`: a running router reads its table again, and takes it over if it is good."""
+"""`router reload`: a running router reads its table again, and changes to it unless it has errors."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PATIENCE = 60.0
 """Seconds; a large table takes one to compile where there is much traffic."""
 
 _DESCRIPTION = f"""\
-Have a running router read its table again, with all files that the table names, and take it over between two datagrams:
-nothing is lost, and what has not changed goes on as it is. A table with errors changes nothing; its findings are
-printed. SIGHUP does the same, and tells in the log.
+Make a running router read its table again, with all files that the table names. It changes to the new table between two
+datagrams: no message is lost, and unchanged parts keep running. A table with errors is rejected, and its findings are
+printed. SIGHUP does the same, and logs the result.
 
-Exit code: {OK} it was taken over, {BAD_USAGE} wrong usage, {BAD_TABLE} it was not, 1 no router answers."""
+Exit code: {OK} reloaded, {BAD_USAGE} wrong usage, {BAD_TABLE} rejected, 1 no router answers."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

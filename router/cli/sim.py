@@ -25,7 +25,7 @@ CHANGES_SHOWN = 3
 
 
 _DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards
-obey commands, halt for a deadman, and stop when left alone for a second. The endpoints' addresses must be this
+obey commands, halt for a deadman, and stop after a second without commands. The endpoints' addresses must be this
 machine's, as they are in routes/sim.yaml."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",

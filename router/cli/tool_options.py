@@ -107,7 +107,7 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
 
 
 def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
-    """The messages, of a table if there is one, and there has to be one if `place` is a name.
+    """The messages, and the table if one is used, which `place` requires if it is a name.
 
     Raises TableError and UsageError.
     """
@@ -158,7 +158,7 @@ def add_count(parser: argparse.ArgumentParser, about: str = "end after N message
 
 @contextmanager
 def until_interrupted() -> Iterator[None]:
-    """Go on until Ctrl-C or SIGTERM, which end what is inside, and are no error."""
+    """End the block at Ctrl-C or SIGTERM, without an error."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

@@ -32,7 +32,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     about = "between two looks, as 500ms (default: 1s)"
     parser.add_argument("--interval", type=seconds, default=1.0, metavar="DURATION", help=about)
-    parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
+    parser.add_argument("--once", action="store_true", help="print once and end (the default without a terminal)")
     parser.add_argument("--json", action="store_true", help="once, as a JSON object")
 
 
@@ -83,11 +83,11 @@ def _look(url: str, interval: float) -> View:
 
 
 _PLAIN_WIDTH = 160
-"""Columns where there is no terminal to say."""
+"""Columns without a terminal."""
 
 
 def _show(url: str, order: Order, interval: float) -> None:
-    """Until `q` or Ctrl-C. A router that does not answer is asked again: it may be just starting."""
+    """Until `q` or Ctrl-C. Tries again if the router does not answer: it may be starting."""
     from rich.console import Console
     from rich.live import Live
 

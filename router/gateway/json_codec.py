@@ -36,11 +36,11 @@ Decode = Callable[[bytes], bytes]
 
 
 class UnreadableError(ValueError):
-    """The bytes are no message of the type, or hold text that is no Unicode."""
+    """The bytes are not a message of the type, or contain text that is not Unicode."""
 
 
 class InvalidMessageError(ValueError):
-    """A client's text is no JSON, or no message of the type. The text of the error is short and printable."""
+    """A client's text is not JSON, or not a message of the type. The text of the error is short and printable."""
 
 
 # -- CDR to JSON ------------------------------------------------------------------------------------------------------

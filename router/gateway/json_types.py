@@ -17,7 +17,7 @@ class Style(enum.Enum):
     """How values are written. There are no spaces in either style, and keys are sorted."""
 
     WRAPPED = enum.auto()
-    """The style of the C++ gateway: whatever is no array is an array of one; a wstring is a list of UTF-16 units."""
+    """The style of the C++ gateway: single values are arrays of one; a wstring is a list of UTF-16 units."""
     PLAIN = enum.auto()
     """Scalars and messages bare; a wstring is a string."""
 

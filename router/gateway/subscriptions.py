@@ -143,7 +143,7 @@ class TopicSubscription:
         self._serve()
 
     def _serve(self) -> None:
-        """Take messages; of those counted by now, what is not there to take was lost."""
+        """Take messages. Messages that were counted and cannot be taken were lost."""
         if self._take(PER_TURN) == PER_TURN:
             self._turn = self._loop.call_soon(self._on_turn)
         elif self._is_synchronised:

@@ -27,7 +27,7 @@ MOST_TURNS = 20
 buffer lose some of a burst of two hundred."""
 
 SHORTEST_PAUSE_S = 0.1
-"""Between two discoveries, however many clients come."""
+"""Seconds between two discoveries at least, also when many clients come."""
 
 SHORTEST_TURN = 10_000_000
 """ns between turns, at least: more often costs more than it spreads."""

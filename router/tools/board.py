@@ -149,10 +149,10 @@ def boards(
 
 
 PART = ("frame_id", "total_count", "index")
-"""The fields by which a payload says which frame it belongs to, of how many parts, and which of them it is."""
+"""Fields of a payload that is a part of a frame: number of the frame, number of its parts, index of this one."""
 
 FRAME_TIMEOUT = 1_000_000_000
-"""Nanoseconds from the first part of a frame after which the others are given up."""
+"""Nanoseconds after the first part of a frame when the frame is given up."""
 
 MOST_FRAMES, MOST_PARTS = 64, 8192
 """Frames that are assembled at a time, and parts of one."""
@@ -170,9 +170,9 @@ class Frames:
         self.incomplete = 0
         self.astray = 0
         self._missing: dict[tuple[int, int], tuple[float, set[int]]] = {}
-        """By number of the frame and of its parts, the oldest first: until when which parts are waited for.
+        """Deadline and missing parts by number of the frame and number of its parts, the oldest first.
 
-        A complete frame stays as long: what comes of it then are copies.
+        A complete frame is kept until its deadline, so that copies of its parts are recognised.
         """
 
     def take(self, now: int, part: Any) -> None:

@@ -53,7 +53,7 @@ def warning(about: str, text: str, remedy: str) -> CheckResult:
 
 
 def problem(about: str, text: str, remedy: str) -> CheckResult:
-    """The router does not start, or what the table wants does not happen."""
+    """The router does not start, or does not do what the table says."""
     return CheckResult(Grade.PROBLEM, about, text, remedy)
 
 
@@ -318,7 +318,7 @@ def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
             pinging.settimeout(left)
             try:
                 reply, (host, _) = pinging.recvfrom(1500)
-            except OSError:  # a timeout is one
+            except OSError:  # or a timeout
                 continue
             if pinging.type == socket.SOCK_RAW:
                 reply = reply[(reply[0] & 0xF) * 4 :]  # what follows the IP header

@@ -411,10 +411,9 @@ def _publishers(types: Iterable[str]) -> str:
 
 
 def diff(old: Checked, new: Checked) -> Iterator[str]:
-    """A unified diff of what is said of two tables without errors, a hunk for each part that differs.
+    """A unified diff of the explanations of two tables without errors, a hunk for each part that differs.
 
-    Places and the width of columns are not compared, addresses only where endpoints are. Executors are not: they follow
-    from the rest, and one condition may change those of many routes.
+    Places and the width of columns are not compared, addresses only of endpoints.
     """
     before, after = _parts(old), _parts(new)
     for name in dict.fromkeys((*after, *before)):

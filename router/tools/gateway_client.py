@@ -17,7 +17,7 @@ PATIENCE = 0.2
 """Seconds that a source waits at most, so that Ctrl-C and `seconds` are noticed."""
 
 ASK_AGAIN = 1.0
-"""Seconds after which schemas are asked for again."""
+"""Seconds between two requests for schemas."""
 
 
 @dataclass(slots=True)

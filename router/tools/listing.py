@@ -259,7 +259,7 @@ _OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
     Op.WRITE_DOUBLE: _write,
     Op.WRITE_BYTES: _write,
 }
-"""What is said of an operation; of others, which integers are unsigned."""
+"""How the operands of an operation are shown. Of other operations, unsigned integers are named."""
 
 
 def _slot(slot: int, layout: Layout) -> str:

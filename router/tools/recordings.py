@@ -49,7 +49,7 @@ class TapRecording:
         return self._file.size
 
     def take(self, batch: Iterable[MirroredDatagram | Lost]) -> None:
-        """Batches have to come once a second, be they empty, so that what came before is written."""
+        """Add a batch. Call it every second, also with an empty batch, so that earlier ones are written."""
         datagrams: list[MirroredDatagram] = []
         for each in batch:
             if isinstance(each, Lost):
@@ -98,7 +98,7 @@ def on_time(recording: Recording, speed: float) -> Iterator[Recorded]:
 
 @dataclass(slots=True)
 class Resent:
-    """What was sent. `refused` counts answers that nobody listens at the destination.
+    """What was sent. `refused` counts ICMP answers that the destination port is closed.
 
     `elsewhere` has the senders whose address this computer does not have, with that address.
     """

@@ -128,8 +128,8 @@ class Statistics:
 
 
 class Simulator:
-    """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had, or for a
-    table without listeners.
+    """Simulates the endpoints of a table. Binds all addresses at once. Raises UsageError if one cannot be bound, and
+    for a table without listeners.
 
     `deadmen` are those of the compiled program; boards halt on what they send.
     """

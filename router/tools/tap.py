@@ -59,7 +59,7 @@ class Condition:
 
     @property
     def cases(self) -> frozenset[str]:
-        """Those that it can be asked of."""
+        """The payload cases that have all fields of the expression."""
         return frozenset(self._conditions)
 
     def holds(self, case: str, payload: Message, source: str, received_at: int) -> bool:
@@ -84,7 +84,7 @@ def _checked(text: str, message: MessageType) -> Node:
 
 
 def _enums(message: MessageType) -> Iterator[Enum]:
-    """All that the fields of a message, and of what is in it, can be; each once."""
+    """The enum types of all fields of a message and of the messages in it, each once."""
     waiting: list[Type] = [message]
     found: dict[str, Type] = {}
     while waiting:
@@ -104,7 +104,7 @@ PATIENCE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class TappedDatagram:
-    """One datagram: when (local time), from whom, its bytes, and what it means or why it means nothing.
+    """One datagram: time of arrival (local time), sender, bytes, and its payload or why it cannot be decoded.
 
     `rejected` is the reason why no route of the router took it, if none did.
     """

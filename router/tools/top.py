@@ -13,7 +13,7 @@ from router.observe.health import Kind, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
 WINDOW = 3.0
-"""Seconds over which rates are shown: over less, one message in two seconds is no rate but a flicker."""
+"""Seconds over which rates are computed: with less, the rate of one message in two seconds flickers."""
 
 
 class Order(enum.Enum):
@@ -181,7 +181,7 @@ def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
 
 
 def _has(problems: Sequence[Problem], kind: Kind, route: str = "", **labels: str) -> bool:
-    """Whether there is one of this kind about this, and about messages of the route."""
+    """Whether a problem of this kind has these labels and concerns the route."""
     return any(
         each.kind is kind and labels.items() <= each.labels.items() and (not route or route in each.routes)
         for each in problems

@@ -21,7 +21,7 @@ from router.tools.top_table import RouteTable, reasons_text
 from router.values import age_text, rate_text, shortened
 
 _ENDPOINT_LINES = 4
-"""At most, on a screen; what is silent is also said above them."""
+"""At most, on a screen; silent endpoints are also among the problems above."""
 
 _LETTERS = 24
 """Of the name of an endpoint."""
@@ -69,7 +69,7 @@ def _sleep(seconds: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """At most `height` lines. `note` says what went wrong when the router was last asked.
+    """At most `height` lines. `note` is the error of the last request to the router.
 
     Routes are shown from number `first` on, as far as there is room for them.
     """

@@ -1,7 +1,7 @@
-"""Arrival times of what streams deliver.
+"""Arrival times of messages on streams.
 
-The kernel does not timestamp streams. What the process reads after it stood still (a busy computer, a stopped process)
-would look new, so it counts as arrived when the event loop last ran before that.
+The kernel does not timestamp streams. Messages that are read after a pause (a busy computer, a stopped process) would
+look new, so they count as arrived when the event loop last ran before the pause.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ AWAY_NS = 50_000_000
 """A gap between two ticks from which on the loop counts as having been away."""
 
 CATCH_UP_NS = 100_000_000
-"""How long after such a gap what is read may have been waiting."""
+"""Messages that are read so long after a gap may have been waiting in it."""
 
 
 class LoopClock:
@@ -40,11 +40,11 @@ class LoopClock:
             self._ticking = None
 
     def stamp(self) -> int:
-        """Return the wall-clock time (ns) at which what is read now arrived at the earliest. Thread-safe."""
+        """Return the earliest arrival (wall clock, ns) of a message that is read now. Thread-safe."""
         return wall_ns() - self.delay()
 
     def delay(self) -> int:
-        """Return for how long (ns) what is read now may have been waiting."""
+        """Return for how long (ns) a message that is read now may have been waiting."""
         if self._ticking is None:
             return 0
         now = self._clock_ns()

@@ -21,7 +21,7 @@ MOST_UNACCEPTED = 1024
 """Connections that the kernel keeps until they are accepted: as many clients may come at once."""
 
 RECEIVE_BUFFER = 64 * 1024
-"""Bytes that the kernel buffers of what a client sends: clients send little, and there may be a thousand."""
+"""Bytes of the receive buffer of a client: clients send little, and there may be a thousand."""
 
 
 class Binding:

@@ -17,10 +17,10 @@ from router.table.addresses import Address
 from router.table.units import LARGEST_DATAGRAM
 
 SEND_BUFFER = 4 << 20
-"""Bytes that the kernel is asked to keep for a network that is busy."""
+"""Bytes of the send buffer, for a busy network."""
 
 RECEIVE_BUFFER = 1 << 20
-"""Bytes that the kernel is asked to keep of what the client sends while the loop is busy."""
+"""Bytes of the receive buffer, for a busy loop."""
 
 BURST = 64
 BURST_BYTES = 128 * 1024

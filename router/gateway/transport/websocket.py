@@ -205,7 +205,7 @@ class Page:
 
 
 _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
-"""Addresses, and names that nobody can register for the whole internet."""
+"""Addresses, and names that cannot be registered on the internet."""
 
 
 def _is_from_elsewhere(headers: Headers) -> bool:

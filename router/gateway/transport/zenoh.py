@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from typing import Union
 
 import zenoh
@@ -38,7 +39,7 @@ CLOSING_SECONDS = 2.0
 """How long a session has to end."""
 
 PAUSE_SECONDS = 0.2
-"""Between two changes of the key's owner, however often others come and go."""
+"""Between two changes of the key's owner at least, also when others come and go more often."""
 
 LOOK_AGAIN_SECONDS = 2.0
 """Between two looks for the owner while waiting for the key, in case its going was not received."""
@@ -179,12 +180,12 @@ class ZenohTransport:
 
     async def _mind_key(self, session: zenoh.Session) -> None:
         """Look for owners, then settle who owns the key at each change; look again while waiting for it."""
-        look = self._watch
+        look: Callable[[zenoh.Session], set[Owner] | None] = self._watch
         while True:
             try:
                 if self._client is None and not self._others_changed.is_set():
                     others = await self._loop.run_in_executor(self._session_thread, look, session)
-                    look = self._look
+                    look = partial(owners, key=self._key)
                     if others is not None:
                         self._others.clear()
                         self._meet(others)
@@ -206,13 +207,10 @@ class ZenohTransport:
                 is_there = sample.kind == zenoh.SampleKind.PUT
                 self._loop.call_soon_threadsafe(self._on_token, owner, is_there)
 
-        others = self._look(session)  # first: beside a subscriber Zenoh answers from what that has received until then
+        # First, since Zenoh answers from what a subscriber has received as soon as there is one.
+        others = owners(session, self._key)
         session.liveliness().declare_subscriber(all_tokens(self._key), on_sample, history=True)
         return others
-
-    def _look(self, session: zenoh.Session) -> set[Owner] | None:
-        """Runs in the session's thread. Raises ZError."""
-        return owners(session, self._key)
 
     async def _settle(self, session: zenoh.Session) -> None:
         """Take the key when it is free, give it up to an earlier owner, report other owners. Raises ZError."""
@@ -397,7 +395,7 @@ class ZenohClient:
             self._events.left(self)
 
     def _put(self) -> None:
-        """Put all that waits together; what is written meanwhile goes with the next call."""
+        """Put all waiting frames at once; frames that are written meanwhile go with the next call."""
         frames, self._waiting = self._waiting, []
         size = sum(len(frame.data) for frame in frames)
         self._is_putting = True

@@ -122,7 +122,7 @@ def this_owner(session: zenoh.Session) -> Owner:
 
 
 def owner_of(token: object) -> Owner | None:
-    """Return who declared a token, None where it is no token of a gateway."""
+    """Return the gateway that declared a token; None if it is not a gateway's token."""
     since, session, host, pid = str(token).rsplit("/", 4)[1:]
     if not re.fullmatch("[0-9]{1,19}", since):
         return None
