@@ -192,24 +192,10 @@ def _child(node: Node, step: str | int) -> Node:
 MAP, ELSE, TEXT = "map", "else", "text"
 """The keys of values that are mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
 
-_INDISPENSABLE = frozenset(
-    {
-        "source",
-        "ignore",
-        "none",
-        "for_each",
-        "topic",
-        "type",
-        "endpoint",
-        "timeout",
-        "send",
-        "to",
-        "by",
-        "count",
-        "order",
-        "transport",
-    }
-)
+_INDISPENSABLE = frozenset({
+    "source", "ignore", "none", "for_each", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count",
+    "order", "transport",
+})  # fmt: skip
 """Keys without which a route, a topic, a destination, a deadman, a collect or a gateway has no meaning."""
 
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})

@@ -1,7 +1,7 @@
 """The ROS interface language: the text of one `.msg` file becomes fields and constants.
 
-Other messages stay names here. Quotes, escapes and ranges of constants and default values follow rosidl_adapter, the
-parser that ROS builds its interfaces with. rosbags has such a parser too, but it drops default values and takes
+Other messages are not looked up here. Quotes, escapes and ranges of constants and default values follow rosidl_adapter,
+the parser that ROS builds its interfaces with. rosbags has such a parser too, but it drops default values and takes
 `wstring` for a message.
 """
 
@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from router.types.model import Bool, Float, Int, List, String, Type
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 PRIMITIVES: dict[str, Type] = {
     "bool": Bool(),
@@ -46,45 +47,25 @@ class MsgError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class NamedType:
-    """Another message, as `package/Name`, not yet looked up."""
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class Shape:
-    """An array of something: of a fixed `length`, of at most `bound` elements, or of any number."""
-
-    length: int | None = None
-    bound: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class MsgField:
-    """A field as declared. `shape` is None for a single value, `default` None for the type's zero."""
-
-    name: str
-    element: Type | NamedType
-    shape: Shape | None = None
-    default: object = None
-    comment: str = ""
-    line: int = 1
-
-
-@dataclass(frozen=True, slots=True)
 class MsgDefinition:
-    fields: tuple[MsgField, ...]
-    constants: dict[str, object]
+    """Fields and constants as declared. A field of another message has a MessageType of its name, without fields.
+
+    `lines` are those of the fields, by name.
+    """
+
+    fields: tuple[Field, ...]
+    constants: Mapping[str, object]
+    lines: Mapping[str, int]
 
 
 def parse_msg(package: str, text: str) -> MsgDefinition:
     """The definition in `text`; names without a package are of `package`. Raises MsgError at the first fault."""
-    fields: dict[str, MsgField] = {}
+    fields: dict[str, Field] = {}
+    lines: dict[str, int] = {}
     constants: dict[str, object] = {}
     comments: list[str] = []
     header = True
-    last: MsgField | None = None
+    last: Field | None = None
     for number, raw in enumerate(text.splitlines(), start=1):
         code, sign, comment = raw.partition("#")
         header = header and raw.startswith("#")
@@ -104,15 +85,16 @@ def parse_msg(package: str, text: str) -> MsgDefinition:
             last = line.field(package, _one_line(*comments, comment))
             _refuse_second(last.name, fields, line)
             fields[last.name] = last
+            lines[last.name] = number
         comments = []
-    return MsgDefinition(tuple(fields.values()), constants)
+    return MsgDefinition(tuple(fields.values()), constants, lines)
 
 
 def _one_line(*comments: str) -> str:
     return " ".join(" ".join(comments).replace("#", " ").split())
 
 
-def _refuse_second(name: str, known: dict[str, MsgField] | dict[str, object], line: _Line) -> None:
+def _refuse_second(name: str, known: Mapping[str, object], line: _Line) -> None:
     if name in known:
         raise line.error(f"there are two '{name}'", name)
 
@@ -146,18 +128,18 @@ class _Line:
             raise self.error(f"a constant cannot be of type {self._type}", self._type)
         return name, self._value(type_, text)
 
-    def field(self, package: str, comment: str) -> MsgField:
+    def field(self, package: str, comment: str) -> Field:
         name, _, text = self._rest.partition(" ")
         text = text.strip()
         if not _FIELD_NAME.fullmatch(name):
             raise self.error(f"'{name}' is no name for a field; ROS wants lower case", name)
-        element, shape = self._field_type(package)
-        default = None
-        if text:
-            if isinstance(element, NamedType):
-                raise self.error(f"a field of type {element.name} takes no default value", text)
-            default = self._value(List(element, shape.length, shape.bound) if shape else element, text)
-        return MsgField(name, element, shape, None if is_zero(default) else default, comment, self._number)
+        declared = self._field_type(package)
+        element = declared.element if isinstance(declared, List) else declared
+        if text and isinstance(element, MessageType):
+            short = element.name.replace("/msg/", "/")
+            raise self.error(f"a field of type {short} takes no default value", text)
+        default = self._value(declared, text) if text else None
+        return Field(name, declared, default=None if is_zero(default) else default, comment=comment)
 
     def _value(self, type_: Type, text: str) -> object:
         try:
@@ -165,22 +147,21 @@ class _Line:
         except ValueError as error:
             raise self.error(str(error), text) from None
 
-    def _field_type(self, package: str) -> tuple[Type | NamedType, Shape | None]:
-        declared = _TYPE.fullmatch(self._type)
-        if declared is None:
+    def _field_type(self, package: str) -> Type:
+        found = _TYPE.fullmatch(self._type)
+        if found is None:
             raise self.error(f"'{self._type}' is no type", self._type)
-        shape = Shape(_number(declared["length"]), _number(declared["bound"])) if declared["array"] else None
-        element = PRIMITIVES.get(declared["base"])
+        element = PRIMITIVES.get(found["base"])
         if isinstance(element, String):
-            return String(_number(declared["string_bound"]), element.wide), shape
-        if declared["string_bound"]:
+            element = String(_number(found["string_bound"]), element.wide)
+        elif found["string_bound"]:
             raise self.error(f"'{self._type}' is no type; only strings have a bound of their own", self._type)
-        if element is not None:
-            return element, shape
-        named = _MESSAGE_NAME.fullmatch(declared["base"])
-        if named is None:
-            raise self.error(f"'{self._type}' is no type", self._type)
-        return NamedType(f"{named['package'] or package}/{named['name']}"), shape
+        elif element is None:
+            named = _MESSAGE_NAME.fullmatch(found["base"])
+            if named is None:
+                raise self.error(f"'{self._type}' is no type", self._type)
+            element = MessageType(f"{named['package'] or package}/msg/{named['name']}")
+        return List(element, _number(found["length"]), _number(found["bound"])) if found["array"] else element
 
 
 def _number(digits: str | None) -> int | None:

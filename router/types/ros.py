@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 from router.assets import asset, is_installed
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, shown_path
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
-from router.types.msg import PRIMITIVES, MsgDefinition, MsgError, MsgField, NamedType, Shape, parse_msg
+from router.types.msg import PRIMITIVES, MsgDefinition, MsgError, parse_msg
 
 _TYPE_NAME = re.compile(r"(?P<package>[a-z]\w*)/msg/(?P<name>[A-Z]\w*)", re.ASCII)
 _PLACEHOLDER = "structure_needs_at_least_one_member"
@@ -106,6 +106,7 @@ class RosbagsDefinitions:
             MsgDefinition(
                 tuple(_rosbags_field(name, field, node) for field, node in fields if field != _PLACEHOLDER),
                 {constant: value for constant, _, value in constants},
+                {},
             ),
         )
 
@@ -113,19 +114,21 @@ class RosbagsDefinitions:
         yield from self._definitions
 
 
-def _rosbags_field(message: str, name: str, node: Any) -> MsgField:
+def _rosbags_field(message: str, name: str, node: Any) -> Field:
+    return Field(name, _rosbags_type(node), default=DEFAULTS_MISSING_IN_ROSBAGS.get((message, name)))
+
+
+def _rosbags_type(node: Any) -> Type:
     """A node is (kind, content): BASE (name, bound), NAME full name, ARRAY and SEQUENCE (node, size), 0 for none."""
     kind, content = node
-    shape = None
-    if kind.name in ("ARRAY", "SEQUENCE"):
-        (inner, content), size = content
-        shape = Shape(length=size) if kind.name == "ARRAY" else Shape(bound=size or None)
-        kind = inner
-    default = DEFAULTS_MISSING_IN_ROSBAGS.get((message, name))
+    if kind.name == "ARRAY":
+        return List(_rosbags_type(content[0]), length=content[1])
+    if kind.name == "SEQUENCE":
+        return List(_rosbags_type(content[0]), bound=content[1] or None)
     if kind.name == "NAME":
-        return MsgField(name, NamedType(content.replace("/msg/", "/")), shape)
+        return MessageType(content)
     base, bound = content
-    return MsgField(name, String(bound or None) if base == "string" else PRIMITIVES[base], shape, default)
+    return String(bound or None) if base == "string" else PRIMITIVES[base]
 
 
 class RosInterfaces:
@@ -158,24 +161,17 @@ class RosInterfaces:
         return self._known[name]
 
     def _resolved(self, name: str, found: FoundDefinition, inside: tuple[str, ...]) -> MessageType:
-        fields = tuple(
-            Field(
-                name=field.name,
-                type=self._field_type(field, found.file, (*inside, name)),
-                default=field.default,
-                comment=field.comment,
-            )
-            for field in found.definition.fields
-        )
-        return MessageType(name, fields=fields, constants=found.definition.constants)
+        definition, inside = found.definition, (*inside, name)
+        fields = []
+        for field in definition.fields:
+            span = SourceSpan(found.file, definition.lines.get(field.name, 1))
+            fields.append(replace(field, type=self._known_type(field.type, span, inside)))
+        return MessageType(name, fields=tuple(fields), constants=definition.constants)
 
-    def _field_type(self, field: MsgField, file: str, inside: tuple[str, ...]) -> Type:
-        element = field.element
-        if isinstance(element, NamedType):
-            element = self._nested(element.name.replace("/", "/msg/"), SourceSpan(file, field.line), inside)
-        if field.shape is None:
-            return element
-        return List(element, field.shape.length, field.shape.bound)
+    def _known_type(self, declared: Type, span: SourceSpan, inside: tuple[str, ...]) -> Type:
+        if isinstance(declared, List):
+            return replace(declared, element=self._known_type(declared.element, span, inside))
+        return self._nested(declared.name, span, inside) if isinstance(declared, MessageType) else declared
 
     def _nested(self, name: str, span: SourceSpan, inside: tuple[str, ...]) -> MessageType:
         if name in inside:

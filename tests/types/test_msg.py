@@ -4,46 +4,52 @@ from __future__ import annotations
 
 import importlib.util
 import string
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from router.types.model import Bool, Float, Int, String, Type
-from router.types.msg import PRIMITIVES, MsgError, MsgField, NamedType, Shape, is_zero, parse_msg
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from router.types.msg import PRIMITIVES, MsgError, is_zero, parse_msg
 
 U8 = Int(8, False)
 
 
-def field(declaration: str) -> MsgField:
+def field(declaration: str) -> Field:
     (parsed,) = parse_msg("pkg", declaration).fields
     return parsed
 
 
 @pytest.mark.parametrize(
-    ("declaration", "element", "shape"),
+    ("declaration", "declared"),
     [
-        ("bool x", Bool(), None),
-        ("byte x", U8, None),
-        ("char x", U8, None),
-        ("int8 x", Int(8, True), None),
-        ("uint64 x", Int(64, False), None),
-        ("float32 x", Float(32), None),
-        ("string x", String(), None),
-        ("string<=10 x", String(10), None),
-        ("wstring<=10 x", String(10, wide=True), None),
-        ("uint8[] x", U8, Shape()),
-        ("uint8[3] x", U8, Shape(length=3)),
-        ("uint8[<=3] x", U8, Shape(bound=3)),
-        ("string<=5[<=3] x", String(5), Shape(bound=3)),
-        ("Motor x", NamedType("pkg/Motor"), None),
-        ("std_msgs/Header[2] x", NamedType("std_msgs/Header"), Shape(length=2)),
-        ("\tfloat64\t \tx  ", Float(64), None),
+        ("bool x", Bool()),
+        ("byte x", U8),
+        ("char x", U8),
+        ("int8 x", Int(8, True)),
+        ("uint64 x", Int(64, False)),
+        ("float32 x", Float(32)),
+        ("string x", String()),
+        ("string<=10 x", String(10)),
+        ("wstring<=10 x", String(10, wide=True)),
+        ("uint8[] x", List(U8)),
+        ("uint8[3] x", List(U8, length=3)),
+        ("uint8[<=3] x", List(U8, bound=3)),
+        ("string<=5[<=3] x", List(String(5), bound=3)),
+        ("\tfloat64\t \tx  ", Float(64)),
     ],
 )
-def test_types(declaration: str, element: Type | NamedType, shape: Shape | None) -> None:
+def test_types(declaration: str, declared: Type) -> None:
     parsed = field(declaration)
-    assert (parsed.name, parsed.element, parsed.shape) == ("x", element, shape)
+    assert (parsed.name, parsed.type) == ("x", declared)
+
+
+@pytest.mark.parametrize(
+    ("declaration", "declared"), [("Motor x", "pkg/msg/Motor"), ("std_msgs/Header[2] x", "std_msgs/msg/Header[2]")]
+)
+def test_other_messages(declaration: str, declared: str) -> None:
+    assert str(field(declaration).type) == declared
 
 
 @pytest.mark.parametrize(
@@ -154,16 +160,11 @@ def test_any_text_is_a_definition_or_the_declared_error(text: str) -> None:
 
 names = st.from_regex(r"[a-z]([a-z0-9]|_[a-z0-9]){0,8}", fullmatch=True)
 plain_text = st.text(alphabet=sorted(set(string.printable) - set("#='\"\\\t\n\r\x0b\x0c")), max_size=8)
-shapes = st.one_of(
-    st.none(), st.just(Shape()), st.builds(Shape, length=st.integers(1, 4)), st.builds(Shape, bound=st.integers(1, 4))
-)
-
-
-def spelled(name: str, bound: int | None, shape: Shape | None) -> str:
-    text = name if bound is None else f"{name}<={bound}"
-    if shape is None:
-        return text
-    return f"{text}[{shape.length or (f'<={shape.bound}' if shape.bound else '')}]"
+lists = st.one_of(
+    st.none(), st.just(List(U8)), st.builds(List, st.just(U8), length=st.integers(1, 4)),
+    st.builds(List, st.just(U8), bound=st.integers(1, 4)),
+)  # fmt: skip
+"""Lists of any element."""
 
 
 def values(type_: Type) -> st.SearchStrategy[object]:
@@ -184,44 +185,46 @@ def written(value: object) -> str:
 
 
 @st.composite
-def declarations(draw: st.DrawFn, name: str) -> tuple[str, MsgField]:
+def declarations(draw: st.DrawFn, name: str) -> tuple[str, Field]:
     """A line of a `.msg` file and the field that it declares."""
     base = draw(st.sampled_from([*PRIMITIVES, "Motor", "std_msgs/Header"]))
-    shape = draw(shapes)
-    if base not in PRIMITIVES:
-        named = NamedType(base if "/" in base else f"pkg/{base}")
-        return f"{spelled(base, None, shape)} {name}", MsgField(name, named, shape)
-    element = PRIMITIVES[base]
-    bound = draw(st.none() | st.integers(1, 9)) if isinstance(element, String) else None
+    shape = draw(lists)
+    element: Type = PRIMITIVES.get(base) or MessageType(f"{'pkg/' * ('/' not in base)}{base}".replace("/", "/msg/"))
     if isinstance(element, String):
-        element = String(bound, element.wide)
-    default = draw(st.none() | values(element))
+        element = String(draw(st.none() | st.integers(1, 9)), element.wide)
+    declared = replace(shape, element=element) if shape else element
+    default = None if isinstance(element, MessageType) else draw(st.none() | values(element))
     if default is not None and shape is not None:
         low, high = (shape.length, shape.length) if shape.length else (0, shape.bound or 4)
         items = draw(st.lists(values(element), min_size=low or 0, max_size=high))
         default = tuple(item.strip() if isinstance(item, str) else item for item in items)
-    text = f"{spelled(base, bound, shape)} {name}" + ("" if default is None else f" {written(default)}")
-    return text, MsgField(name, element, shape, None if is_zero(default) else default)
+    spelled = base if isinstance(element, MessageType) else spelling(base, element)
+    text = f"{spelled}{str(declared).removeprefix(str(element))} {name}" + (
+        "" if default is None else f" {written(default)}"
+    )
+    return text, Field(name, declared, default=None if is_zero(default) else default)
+
+
+def spelling(base: str, element: Type) -> str:
+    return f"{base}<={element.bound}" if isinstance(element, String) and element.bound is not None else base
 
 
 @st.composite
-def definitions(draw: st.DrawFn) -> tuple[str, tuple[MsgField, ...]]:
+def definitions(draw: st.DrawFn) -> tuple[str, tuple[Field, ...]]:
     lines = [draw(declarations(name)) for name in draw(st.lists(names, unique=True, max_size=6))]
     return "\n".join(text for text, _ in lines), tuple(parsed for _, parsed in lines)
 
 
 @given(definitions())
-def test_generated_definition_parses_to_what_it_was_written_from(generated: tuple[str, tuple[MsgField, ...]]) -> None:
+def test_generated_definition_parses_to_what_it_was_written_from(generated: tuple[str, tuple[Field, ...]]) -> None:
     text, expected = generated
     parsed = parse_msg("pkg", text).fields
-    assert [(f.name, f.element, f.shape, f.default) for f in parsed] == [
-        (f.name, f.element, f.shape, f.default) for f in expected
-    ]
+    assert [(f.name, str(f.type), f.default) for f in parsed] == [(f.name, str(f.type), f.default) for f in expected]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rosidl_adapter") is None, reason="ROS's own parser is not installed")
 @given(definitions())
-def test_parser_of_ros_reads_the_same(generated: tuple[str, tuple[MsgField, ...]]) -> None:
+def test_parser_of_ros_reads_the_same(generated: tuple[str, tuple[Field, ...]]) -> None:
     from rosidl_adapter.parser import parse_message_string  # type: ignore[import-untyped,import-not-found,unused-ignore]
 
     text, _ = generated
@@ -230,8 +233,10 @@ def test_parser_of_ros_reads_the_same(generated: tuple[str, tuple[MsgField, ...]
         assert ours.name == other.name
         default = tuple(other.default_value) if isinstance(other.default_value, list) else other.default_value
         assert ours.default == (None if is_zero(default) else default)
-        shape = ours.shape or Shape()
-        assert (ours.shape is not None, shape.length or shape.bound) == (other.type.is_array, other.type.array_size)
-        assert isinstance(ours.element, NamedType) == (not other.type.is_primitive_type())
-        if isinstance(ours.element, String):
-            assert ours.element == String(other.type.string_upper_bound, wide=other.type.type == "wstring")
+        declared = ours.type
+        size = (declared.length or declared.bound) if isinstance(declared, List) else None
+        assert (isinstance(declared, List), size) == (other.type.is_array, other.type.array_size)
+        element = declared.element if isinstance(declared, List) else declared
+        assert isinstance(element, MessageType) == (not other.type.is_primitive_type())
+        if isinstance(element, String):
+            assert element == String(other.type.string_upper_bound, wide=other.type.type == "wstring")

@@ -7,9 +7,9 @@ or a field of a message. Computation element by element is an Each, with its lis
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum as Enumeration
-from typing import Union
+from typing import Union, get_args
 
 from router.compiler.expressions.kinds import IntKind, Kind, ListKind
 from router.errors import SourceSpan
@@ -204,6 +204,7 @@ class Call:
 Node = Union[
     Constant, Variable, Read, Present, Element, Listed, Each, Unary, Binary, Compare, Contains, Logic, Choice, Call
 ]
+_NODES = get_args(Node)
 
 
 def constant_of(node: Node) -> bool | int | float | str | None:
@@ -233,31 +234,18 @@ def path_of(node: Node) -> Path | None:
     return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
 
 
-def parts_of(node: Node) -> tuple[Node, ...]:  # noqa: C901 - a case a node
+def parts_of(node: Node) -> Iterator[Node]:
     """The nodes directly in this one."""
-    match node:
-        case Constant() | Variable():
-            return ()
-        case Read() | Present():
-            return (node.holder,)
-        case Element():
-            return (node.values,)
-        case Listed():
-            return node.items
-        case Each():
-            return (*(values for _, values in node.lists), node.element)
-        case Unary():
-            return (node.operand,)
-        case Binary():
-            return node.left, node.right
-        case Compare() | Logic():
-            return node.operands
-        case Contains():
-            return node.sought, node.values
-        case Choice():
-            return node.test, node.body, node.orelse
-        case Call():
-            return node.arguments
+    for each in fields(node):
+        yield from _nodes_of(getattr(node, each.name))
+
+
+def _nodes_of(value: object) -> Iterator[Node]:
+    if isinstance(value, _NODES):
+        yield value
+    elif isinstance(value, tuple):
+        for each in value:
+            yield from _nodes_of(each)
 
 
 def paths_in(node: Node) -> Iterator[Path]:
