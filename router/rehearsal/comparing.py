@@ -31,9 +31,6 @@ from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
 from router.types.framing import restored, trimmed
 from router.types.model import MessageType
 
-_LISTED = 3
-"""So many of the deliveries are listed where their number is not what was expected."""
-
 _TOLD = 12
 """So many lines say what happened in a step."""
 
@@ -167,10 +164,8 @@ class Comparison:
         """Everything that happened in a step, in order, each with its place in the table."""
         lines = []
         for _, same in groupby((*outcome.early, *outcome.events), _what):
-            event, *others = same
-            line, place = self._described(event), self._related(event)
-            if others:
-                line += f", and so on, {len(others) + 1} in all"
+            events = [*same]
+            line, place = self._first_of(events), self._related(events[0])
             if place is not None and place.span.file not in line:  # as it is where an expression has no value
                 line += f" ({place.span})"
             lines.append(line)
@@ -184,8 +179,7 @@ class Comparison:
             if isinstance(event, (Sent, Published, Dropped)):
                 related.setdefault(self._related(event), []).append(event)
         for place, events in related.items():
-            more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
-            message = f"before this step, {self._described(events[0])}{more}; no step expects it"
+            message = f"before this step, {self._first_of(events)}; no step expects it"
             yield Failure(outcome.step.expected.span, message, place)
 
     # what is delivered
@@ -200,13 +194,10 @@ class Comparison:
                 if not explained:
                     yield self._missing(target, deliveries[0].span, outcome)
             elif not deliveries:
-                times = f", {len(events)} times" if len(events) > 1 else ""
-                message = f"{self._described(events[0])}{times}; it is not expected"
+                message = f"{self._first_of(events)}; it is not expected"
                 yield Failure(outcome.step.expected.span, message, self._related(events[0]))
             elif len(deliveries) != len(events):
-                listed = "; ".join(map(self._described, events[:_LISTED]))
-                more = f"; and {len(events) - _LISTED} more" if len(events) > _LISTED else ""
-                message = f"{len(events)} for {target}, not {len(deliveries)}: {listed}{more}"
+                message = f"{len(events)} for {target}, not {len(deliveries)}: {self._first_of(events)}"
                 yield Failure(deliveries[0].span, message, self._related(events[-1]))
             else:
                 for delivery, event in zip(deliveries, events, strict=True):
@@ -299,6 +290,10 @@ class Comparison:
             case Sent() | Published() | Dropped() | Collected():
                 return self._index.target(event.route, event.target)
         return None
+
+    def _first_of(self, events: Sequence[Event]) -> str:
+        more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
+        return self._described(events[0]) + more
 
     def _described(self, event: Event) -> str:
         """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
