@@ -101,7 +101,8 @@ def _assign_element(values: Any, kind: List, index: int | None, path: str, text:
 LARGEST_LIST = 65_507
 """Elements; no list is longer than the largest datagram has bytes."""
 
-_ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Enum: 0, Float: 0.0, String: "", Bytes: b""}
+ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Enum: 0, Float: 0.0, String: "", Bytes: b""}
+"""What a scalar is that nothing has set."""
 
 
 def _extend(values: Any, kind: List, index: int, path: str) -> None:
@@ -114,7 +115,7 @@ def _extend(values: Any, kind: List, index: int, path: str) -> None:
         if isinstance(kind.element, MessageType):
             values.add()
         else:
-            values.append(_ZEROS[type(kind.element)])
+            values.append(ZEROS[type(kind.element)])
 
 
 _TRUTH = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}

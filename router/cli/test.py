@@ -31,7 +31,7 @@ from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, TableError, UsageError, plural, shown_path
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.reading import ENDINGS, find_test_files, read_test_file
-from router.rehearsal.running import Result, run_tests
+from router.rehearsal.running import FailedStep, Result, run_tests
 from router.table import in_order
 
 FAILED = 1
@@ -139,19 +139,28 @@ def _text(results: Sequence[Result], coverages: Collection[Coverage], paint: Pai
     for result in results:
         if result.failures:
             yield f"{paint(BOLD, str(result.test.span))}: {paint(RED, 'failed')}: {visible(result.test.name)}"
-        for failure in result.failures:
-            yield f"{failure.span}: {paint(BOLD, visible(failure.message))}"
-            yield from excerpt(failure.span, paint, RED)
-            if failure.table is not None:
-                yield f"{failure.table.span}: {paint(CYAN, failure.table.note)}"
-                yield from excerpt(failure.table.span, paint, CYAN)
-            yield ""
+        for step in result.failed:
+            yield from _failed_step(step, paint)
     for coverage in coverages:
         for item in coverage.gaps():
             yield f"{item.span}: {paint(YELLOW, 'not covered')}: {item.gap}"
             yield from excerpt(item.span, paint, YELLOW)
         counts = [f"{touched} of {plural(there, kind)}" for kind, (touched, there) in coverage.counts().items()]
         yield f"{shown_path(coverage.path)}: covered {', '.join(counts)}"
+
+
+def _failed_step(step: FailedStep, paint: Paint) -> Iterator[str]:
+    for failure in step.failures:
+        yield f"{failure.span}: {paint(BOLD, visible(failure.message))}"
+        yield from excerpt(failure.span, paint, RED)
+        if failure.table is not None:
+            yield f"{failure.table.span}: {paint(CYAN, failure.table.note)}"
+            yield from excerpt(failure.table.span, paint, CYAN)
+        yield ""
+    if len(step.told) > 1:
+        yield "what happened in this step, in order:"
+        yield from (f"    {visible(line)}" for line in step.told)
+        yield ""
 
 
 # for machines

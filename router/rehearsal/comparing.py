@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedTarget
@@ -14,13 +15,24 @@ from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
 from router.rehearsal.fields import Difference, Path, offset, path_text, shown
-from router.rehearsal.rehearsal import START, Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.rehearsal.rehearsal import (
+    START,
+    Collected,
+    DeadmanChanged,
+    Dropped,
+    Event,
+    Filtered,
+    Published,
+    Received,
+    Rejected,
+    Sent,
+)
 from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
 from router.types.framing import restored, trimmed
 from router.types.model import MessageType
 
-_LISTED = 3
-"""So many of the deliveries are listed where their number is not what was expected."""
+_TOLD = 12
+"""So many lines say what happened in a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +45,12 @@ class Related:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing that a table does not do as a test expects."""
+    """One thing that a table does not do as a test expects; `is_of_field` where only the content is another one."""
 
     span: SourceSpan
     message: str
     table: Related | None = None
+    is_of_field: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +160,18 @@ class Comparison:
         yield from self._dropped(outcome)
         yield from _filtered(expected, events)
 
+    def told(self, outcome: Outcome) -> list[str]:
+        """Everything that happened in a step, in order, each with its place in the table."""
+        lines = []
+        for _, same in groupby((*outcome.early, *outcome.events), _what):
+            events = [*same]
+            line, place = self._first_of(events), self._related(events[0])
+            if place is not None and place.span.file not in line:  # as it is where an expression has no value
+                line += f" ({place.span})"
+            lines.append(line)
+        more = [f"and {len(lines) - _TOLD} lines more"] if len(lines) > _TOLD else []
+        return lines[:_TOLD] + more
+
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
         """What happened since the step before, at no time that a step has."""
         related: dict[Related | None, list[Event]] = {}
@@ -154,8 +179,7 @@ class Comparison:
             if isinstance(event, (Sent, Published, Dropped)):
                 related.setdefault(self._related(event), []).append(event)
         for place, events in related.items():
-            more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
-            message = f"before this step, {self._described(events[0])}{more}; no step expects it"
+            message = f"before this step, {self._first_of(events)}; no step expects it"
             yield Failure(outcome.step.expected.span, message, place)
 
     # what is delivered
@@ -170,13 +194,10 @@ class Comparison:
                 if not explained:
                     yield self._missing(target, deliveries[0].span, outcome)
             elif not deliveries:
-                times = f", {len(events)} times" if len(events) > 1 else ""
-                message = f"{self._described(events[0])}{times}; it is not expected"
+                message = f"{self._first_of(events)}; it is not expected"
                 yield Failure(outcome.step.expected.span, message, self._related(events[0]))
             elif len(deliveries) != len(events):
-                listed = "; ".join(map(self._described, events[:_LISTED]))
-                more = f"; and {len(events) - _LISTED} more" if len(events) > _LISTED else ""
-                message = f"{len(events)} for {target}, not {len(deliveries)}: {listed}{more}"
+                message = f"{len(events)} for {target}, not {len(deliveries)}: {self._first_of(events)}"
                 yield Failure(deliveries[0].span, message, self._related(events[-1]))
             else:
                 for delivery, event in zip(deliveries, events, strict=True):
@@ -186,7 +207,7 @@ class Comparison:
         """With what became of the message instead, where there is an event of it."""
         for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
-                why = f"it was dropped as {event.reason}" + (f" ({event.detail})" if event.detail else "")
+                why = f"it was dropped as {event.reason}{_in_brackets(event.detail)}"
                 return Failure(span, f"nothing for {target}: {why}", self._related(event))
             if isinstance(event, Filtered) and event.target == target:
                 condition = self._index.condition(event.route, target)
@@ -230,7 +251,7 @@ class Comparison:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
         field = self._index.field(event.route, event.target, difference.path) if is_mapped else None
         message = f"{_when(event)}{event.target}: {difference}"
-        return Failure(difference.span, message, field or self._related(event))
+        return Failure(difference.span, message, field or self._related(event), is_of_field=True)
 
     # what is not delivered
 
@@ -262,11 +283,17 @@ class Comparison:
 
     def _related(self, event: Event) -> Related | None:
         match event:
-            case Sent(by_deadman=True):
+            case Sent(by_deadman=True) | DeadmanChanged():
                 return self._index.deadman(event.route)
-            case Sent() | Published() | Dropped() | Filtered():
+            case Filtered():
+                return self._index.condition(event.route, event.target)
+            case Sent() | Published() | Dropped() | Collected():
                 return self._index.target(event.route, event.target)
         return None
+
+    def _first_of(self, events: Sequence[Event]) -> str:
+        more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
+        return self._described(events[0]) + more
 
     def _described(self, event: Event) -> str:
         """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
@@ -280,8 +307,18 @@ class Comparison:
                 inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
                 return f"{when}{inside} is published on {event.target}"
             case Dropped():
-                return f"{when}{event.target} misses one as {event.reason}"
-        return when
+                return f"{when}{event.target} misses one as {event.reason}{_in_brackets(event.detail)}"
+            case Filtered():
+                return f"{when}{event.route} withholds one from {event.target}"
+            case Collected():
+                return f"{when}{event.target} waits for the rest of its frame"
+            case Received():
+                return f"{when}{event.route} takes a message from {event.source}"
+            case Rejected():
+                return f"{when}{event.listener} rejects a datagram as {event.reason}{_in_brackets(event.detail)}"
+            case DeadmanChanged():
+                return f"{when}the deadman of {event.route} {'trips' if event.active else 'is released'}"
+        raise AssertionError(event)
 
     def _datagram(self, data: bytes) -> str:
         try:
@@ -295,8 +332,8 @@ def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failur
     came = Counter(event.reason for event in events)
     wanted = expected.rejected or Located({}, expected.span)
     if came != Counter(wanted.value):
-        detail = events[0].detail if events else ""
-        message = f"rejected: {_listed(came)}, not {_listed(wanted.value)}" + (f" ({detail})" if detail else "")
+        detail = _in_brackets(events[0].detail) if events else ""
+        message = f"rejected: {_listed(came)}, not {_listed(wanted.value)}{detail}"
         yield Failure(wanted.span, message)
 
 
@@ -312,6 +349,16 @@ def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
     if expected.filtered is not None and came != Counter(expected.filtered.value):
         message = f"withheld from: {_listed(came)}, not {_listed(expected.filtered.value)}"
         yield Failure(expected.filtered.span, message)
+
+
+def _what(event: Event) -> tuple[object, ...]:
+    """The same of events that only time and content tell apart."""
+    names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
+    return type(event), *names
+
+
+def _in_brackets(detail: str) -> str:
+    return f" ({detail})" if detail else ""
 
 
 def _when(event: Event) -> str:

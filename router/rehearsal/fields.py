@@ -21,8 +21,8 @@ from router.rehearsal.rehearsal import START
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
-from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
-from router.values import parse, scalar_text
+from router.types.model import Bytes, Field, Float, Int, List, MessageType, String, Type
+from router.values import ZEROS, parse, scalar_text
 
 ANY = "any"
 RECEIVED_AT = "received_at"
@@ -311,16 +311,7 @@ def _default_of(kind: Type, default: object = None) -> Any:
             return {field.name: _default_of(field.type, field.default) for field in kind.fields}
         case List():
             return [_default_of(kind.element) for _ in range(kind.length or 0)]
-        case String():
-            return ""
-        case Bytes():
-            return b""
-        case Float():
-            return 0.0
-        case Bool():
-            return False
-        case _:
-            return 0
+    return ZEROS[type(kind)]
 
 
 def _is_unset(holder: Any, field: Field, value: Any) -> bool:

@@ -17,17 +17,29 @@ from router.rehearsal.steps import Given, Step
 from router.table.reading import InvalidValueError
 
 
+@dataclass(frozen=True, slots=True)
+class FailedStep:
+    """`told` is what happened in it, in order; nothing where only contents are other ones."""
+
+    failures: list[Failure]
+    told: list[str]
+
+
 @dataclass(slots=True)
 class Result:
     """What came of one test. `findings` are mistakes in the test that only show when it runs."""
 
     test: TableTest
-    failures: list[Failure] = field(default_factory=list)
+    failed: list[FailedStep] = field(default_factory=list)
     findings: list[Diagnostic] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
-        return not self.failures and not self.findings
+        return not self.failed and not self.findings
+
+    @property
+    def failures(self) -> list[Failure]:
+        return [failure for step in self.failed for failure in step.failures]
 
 
 def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) -> list[Result]:
@@ -49,7 +61,9 @@ def _run(
             return result
         if coverage is not None:
             coverage.record(outcome)
-        result.failures += comparison.failures(outcome)
+        if failures := list(comparison.failures(outcome)):
+            is_of_fields = all(failure.is_of_field for failure in failures)
+            result.failed.append(FailedStep(failures, [] if is_of_fields else comparison.told(outcome)))
     return result
 
 

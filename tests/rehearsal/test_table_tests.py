@@ -348,6 +348,27 @@ def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
         assert failure.table.note == "sent by this deadman"
 
 
+def test_what_happened_in_a_failed_step_is_told_in_order_with_its_places(tmp_path: Path) -> None:
+    tests = f"""
+        missing:
+          given: {given("{accel_x: 0.5}")}
+          expect: {{sent: [basestation, recorder], published: {QUIET}}}
+        other content:
+          given: {given("{accel_x: 2, accel_y: 1}")}
+          expect: {{sent: {{basestation: any, recorder: {{imu_info: {{accel_x: 3, accel_y: 1}}}}}}, published: {QUIET}}}
+        """
+    missing, other = run_tests(written(tmp_path, IMU, tests))
+    (step,) = missing.failed
+    assert [line.replace(f"{tmp_path}/", "") for line in step.told] == [
+        "imu_info takes a message from sensor_board",
+        "imu_info {accel_x: 0.5} is sent to basestation (table.yaml:17:20)",
+        "imu_info withholds one from recorder (table.yaml:17:60)",
+        "{accel_x: 0.5} is published on imu_data (table.yaml:19:10)",
+        "imu/data_raw misses one as mapping_error (table.yaml:24:53: angular_velocity.y)",
+    ]
+    assert [step.told for step in other.failed] == [[]]
+
+
 # what is no test
 
 
