@@ -6,7 +6,6 @@ Most tests share one router with a gateway for each transport; each has topics o
 from __future__ import annotations
 
 import json
-import socket
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -20,7 +19,6 @@ from backports import zstd
 
 from router.gateway.packets import unbatched
 from tests.acceptance.gateway_clients import (
-    HEAD,
     Dashboard,
     Headset,
     Scene,
@@ -33,7 +31,7 @@ from tests.acceptance.gateway_clients import (
 )
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE
-from tests.acceptance.site import RouterProcess, key, site, total, udp, wait_until
+from tests.acceptance.site import key, total, udp, wait_until
 
 SHOWN = """\
     topics: {include: ["/gw/**"], exclude: ["/gw/secret/**"]}
@@ -290,15 +288,6 @@ def test_a_headset_sends_what_it_receives_in(now: Scene) -> None:
 def test_an_address_that_is_not_there_yet_is_waited_for(now: Scene) -> None:
     """All other gateways of this module run meanwhile."""
     assert f"192.0.2.1:{now.ports['RECEIVE']}" in now.router.text()
-
-
-def test_an_address_that_another_has_ends_the_start(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.5", 0)) as other, site(tmp_path) as place:
-        text = LOGGER.replace("LOGGER", str(other.getsockname()[1])).replace("{", "{{").replace("}", "}}")
-        router = RouterProcess(tmp_path, place.table(HEAD + text))
-        assert router.wait() == 78
-        assert "logger" in router.text()
-        assert "table.yaml:" in router.text()
 
 
 def test_small_messages_share_a_datagram_and_what_none_holds_is_dropped(now: Scene) -> None:

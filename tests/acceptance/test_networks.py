@@ -229,11 +229,3 @@ def test_brakes_leave_although_the_listeners_address_has_gone(site: Rover) -> No
         new_address(site)
         wait_until(lambda: bool(router.events(THERE)), "the return")
         drives(site)
-
-
-def test_a_port_that_is_taken_still_ends_the_start(site: Rover) -> None:
-    with udp(site.rover, LAN):
-        path = site.table(TABLE)
-        refused = site.rover.inside(lambda: RouterProcess(site.folder, path))
-        assert refused.wait() == 78
-        assert "has the port" in refused.text()

@@ -180,24 +180,6 @@ def listener(held: socket.socket, stack: ExitStack, monkeypatch: pytest.MonkeyPa
     return stack.enter_context(closing(Listener(plan_of(held))))
 
 
-def test_a_listener_takes_the_socket_that_has_its_address(held: socket.socket, listener: Listener) -> None:
-    assert listener.is_inherited
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
-        board.sendto(b"hello", held.getsockname())
-    assert listener.socket.recvfrom(100)[0] == b"hello"
-
-
-def test_the_next_one_finds_what_the_last_one_left(held: socket.socket, listener: Listener) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
-        for word in (b"first", b"second"):
-            board.sendto(word, held.getsockname())
-    assert listener.socket.recv(100) == b"first"
-    listener.end_input()
-    listener.close()
-    with closing(Listener(plan_of(held))) as successor:
-        assert successor.socket.recv(100) == b"second"
-
-
 def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listener) -> None:
     before = held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     assert before > 2 * 65536

@@ -224,30 +224,6 @@ def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, mon
     assert [again(each) for path in files(tmp_path) for each in read(path)] == first + third
 
 
-def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writer_module, "_RETRY", 1)
-    with running_recorder(tmp_path) as (made, mirror):
-        monkeypatch.setattr(os, "write", _full)
-        show(made, mirror, now(imu(1)))
-        show(made, mirror, now(imu(2)))
-        monkeypatch.undo()
-    assert files(tmp_path) == []
-
-
-def test_a_disk_with_room_for_the_head_of_a_file_only_gets_no_empty_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writer_module, "_RETRY", 1)
-    with running_recorder(tmp_path) as (made, mirror):
-        monkeypatch.setattr(os, "write", _full_after_the_head)
-        show(made, mirror, now(imu(1)))
-        show(made, mirror, now(imu(2)))
-        assert files(tmp_path) == []
-        monkeypatch.undo()
-
-
 def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,6 +272,19 @@ def _full(descriptor: int, data: bytes) -> int:
 
 def _full_after_the_head(descriptor: int, data: bytes, real: Callable[[int, bytes], int] = os.write) -> int:
     return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
+
+
+@pytest.mark.parametrize("write", [_full, _full_after_the_head])
+def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[int, bytes], int]
+) -> None:
+    monkeypatch.setattr(writer_module, "_RETRY", 1)
+    with running_recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "write", write)
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        assert files(tmp_path) == []
+        monkeypatch.undo()
 
 
 def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -368,18 +357,6 @@ def test_what_comes_while_saving_takes_its_time_is_written_all_the_same(
         monkeypatch.setattr(RecordingFile, "write", slowly)
         made.save("http")
     assert written == [2, 3]
-
-
-def test_trips_that_came_too_soon_are_saved_at_the_end(tmp_path: Path) -> None:
-    with running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
-        mirror.show(now(imu(1)))
-        made.deadman_tripped("drive_motor")
-        while not files(tmp_path):  # the trip's, perhaps unfinished
-            sleep(0.01)
-        made.save("first")  # one thread saves: it has finished that one before
-        made.deadman_tripped("drive_motor")  # too soon: kept for the end
-        mirror.show(now(imu(2), b"bad"))
-    assert [len(read(path)) for path in files(tmp_path)] == [1, 1, 3]
 
 
 def test_a_disk_that_hangs_holds_up_a_stop_for_a_moment_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
