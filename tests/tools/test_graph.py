@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
@@ -13,7 +12,7 @@ import pytest
 from router.compiler import check_table
 from router.observe.route_map import NodeKind, nodes_and_edges
 from router.table.model import RouteTable
-from router.tools.graph import LEGEND, dot, mermaid, svg
+from router.tools.graph import LEGEND, dot, svg
 from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
@@ -58,13 +57,6 @@ def test_the_picture_names_everything_and_says_under_the_pointer_what_it_is(tabl
     assert set(LEGEND) == set(NodeKind)
 
 
-def test_routes_that_halt_boards_are_marked() -> None:
-    table = checked_table(ROUTES / "rover.yaml")
-    guarded = sum(route.ttl is not None or route.deadman is not None for route in table.routes)
-    assert 0 < guarded < len(table.routes)
-    assert dot(table, "").count("class=guarded") == guarded + 1  # and one in the legend
-
-
 @needs_graphviz
 def test_the_picture_refers_to_nothing_outside_itself_and_is_light_or_dark(table: RouteTable) -> None:
     text = svg(table, "title").replace("http://www.w3.org/2000/svg", "").replace(XLINK, "")
@@ -83,23 +75,3 @@ def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
     explained = len({node.kind for node in nodes}) + any(node.is_guarded for node in nodes)
     assert drawn.stdout.count("\nnode ") == len(nodes) + explained
     assert drawn.stdout.count("\nedge ") == len(edges)
-
-
-def test_mermaid_has_a_line_for_every_node_and_edge(table: RouteTable) -> None:
-    nodes, edges = nodes_and_edges(table)
-    lines = mermaid(table, "it's").splitlines()
-    assert lines[:4] == ["---", "title: 'it''s'", "---", "flowchart LR"]
-    label = r'(\["{text}"\]|\(\["{text}"\]\)|>"{text}"\]|\{{\{{"{text}"\}}\}}|\[\["{text}"\]\])'.format(text='[^"]*')
-    drawn = [line for line in lines if re.fullmatch(rf"    n\d+{label}", line)]
-    links = [line for line in lines if re.fullmatch(r'  n\d+ (-->|-\.->\|"[^"#<>]*"\|) n\d+', line)]
-    explained = [line for line in lines if re.fullmatch(rf"    [a-z]+{label}", line)]
-    assert (len(drawn), len(links)) == (len(nodes), len(edges))
-    assert len(explained) == len({node.kind for node in nodes})
-
-
-@needs_graphviz
-def test_a_condition_is_shown_as_it_is_written_on_one_line(tmp_path: Path) -> None:
-    table = checked_table(tmp_path / "hostile.yaml")
-    drawn = subprocess.run([str(DOT), "-Tsvg"], input=dot(table, ""), capture_output=True, text=True, check=True)
-    assert "#&lt;b&gt;&amp;lt;|" in drawn.stdout
-    assert "and accel_x &gt; 1, at most 5 Hz" in drawn.stdout.replace("&#160;", " ").replace("&#45;", "-")
