@@ -1,4 +1,4 @@
-"""The picture of a table, and its text for other programs, have a box and a line for everything."""
+"""The picture of a table has a box and a line for everything; tests/transcripts/graph.md has the text of a table."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from router.cli import OK, main
 from router.compiler import check_table
 from router.observe.route_map import NodeKind, nodes_and_edges
 from router.table.model import RouteTable
@@ -75,3 +76,9 @@ def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
     explained = len({node.kind for node in nodes}) + any(node.is_guarded for node in nodes)
     assert drawn.stdout.count("\nnode ") == len(nodes) + explained
     assert drawn.stdout.count("\nedge ") == len(edges)
+
+
+@needs_graphviz
+def test_the_verb_writes_the_picture(tmp_path: Path) -> None:
+    assert main(["graph", str(ROUTES / "rover.yaml"), "-o", str(tmp_path / "routes.svg")]) == OK
+    assert (tmp_path / "routes.svg").read_text(encoding="utf-8").startswith("<svg ")
