@@ -97,15 +97,7 @@ def test_a_wrong_table_is_shown_with_its_place(verb: str, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb not in {*WITHOUT_TABLE, "replay"}])
-def test_a_table_that_is_not_there_is_said(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main([*words(verb), "-t", "gone.yaml"])
-    told = "".join(capsys.readouterr())
-    assert "gone.yaml" in told
-    assert code == BAD_TABLE
-
-
-@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb not in {*WITHOUT_TABLE, "replay"}])
-def test_the_environment_may_name_the_table(
+def test_a_table_that_the_environment_names_and_is_not_there_is_said(
     verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("ROUTER_TABLE", "gone.yaml")

@@ -228,18 +228,6 @@ def test_there_is_no_table_without_an_envelope_or_routes(tmp_path: Path, key: st
     assert Code.WRONG_TYPE in [finding.code for finding in findings]
 
 
-def test_every_finding_is_reported_at_once(tmp_path: Path) -> None:
-    text = (
-        GOOD.replace("depth: 5", "depht: 5")
-        .replace("500ms", "500")
-        .replace("0.5", "yes")
-        .replace("${BASESTATION", "${")
-    )
-    _, findings = load(tmp_path, text)
-    codes = [Code.BAD_VALUE, Code.UNKNOWN_KEY, Code.WRONG_TYPE, Code.AMBIGUOUS_SCALAR]
-    assert [finding.code for finding in findings] == codes
-
-
 def test_the_environment_is_the_process_environment_unless_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,12 +248,6 @@ def test_of_a_route_with_a_broken_deadman_the_rest_is_left(tmp_path: Path, right
     drive = route(table, "manual_drive")
     assert (drive.deadman, drive.no_deadman, len(drive.destinations)) == (None, None, 1)
     assert table.broken == {"routes/manual_drive"}  # which tells it from one that has none
-
-
-def test_of_a_deadman_with_a_broken_repeat_the_rest_is_left(tmp_path: Path) -> None:
-    table, [finding] = parts(tmp_path, GOOD.replace("300 ms, send", "300 ms, repeat: often, send"))
-    assert finding.code is Code.BAD_VALUE
-    assert route(table, "manual_drive").deadman
 
 
 def test_of_several_routes_the_valid_ones_and_the_valid_parts_are_left(tmp_path: Path) -> None:

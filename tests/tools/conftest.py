@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -67,3 +68,16 @@ def table_path(tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def table(table_path: Callable[..., Path]) -> RouteTable:
     return read_table(table_path())
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.6.5", 0))
+        opened.settimeout(5)
+        yield opened
+
+
+def place(receiver: socket.socket) -> str:
+    host, port = receiver.getsockname()
+    return f"{host}:{port}"

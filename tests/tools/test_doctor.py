@@ -125,15 +125,6 @@ def test_a_library_that_cannot_be_used_is_a_problem(monkeypatch: pytest.MonkeyPa
     assert (found.grade, found.remedy) == (Grade.PROBLEM, "run 'make setup'")
 
 
-@pytest.mark.parametrize("look", [examine, before_start])
-def test_what_is_wrong_with_the_table_is_told_with_its_place(table: Path, look: type) -> None:
-    table.write_text(table.read_text().replace("[basestation]", "[nobody]"))
-    [first, *_] = found = list(look(table, {}))
-    assert (first.grade, first.about) == (Grade.PROBLEM, "table")
-    assert first.text.startswith(f"{table}:10:")
-    assert all(finding.about == "table" for finding in found)
-
-
 def test_a_port_that_somebody_has_is_told_with_his_name_and_may_be_the_services(
     table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,7 @@
-"""The picture of a table, and its text for other programs, have a box and a line for everything."""
+"""The picture of a table has a box and a line for everything; tests/transcripts/graph.md has the text of a table."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
@@ -10,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from router.cli import OK, main
 from router.compiler import check_table
 from router.observe.route_map import NodeKind, nodes_and_edges
 from router.table.model import RouteTable
-from router.tools.graph import LEGEND, dot, mermaid, svg
+from router.tools.graph import LEGEND, dot, svg
 from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
@@ -58,13 +58,6 @@ def test_the_picture_names_everything_and_says_under_the_pointer_what_it_is(tabl
     assert set(LEGEND) == set(NodeKind)
 
 
-def test_routes_that_halt_boards_are_marked() -> None:
-    table = checked_table(ROUTES / "rover.yaml")
-    guarded = sum(route.ttl is not None or route.deadman is not None for route in table.routes)
-    assert 0 < guarded < len(table.routes)
-    assert dot(table, "").count("class=guarded") == guarded + 1  # and one in the legend
-
-
 @needs_graphviz
 def test_the_picture_refers_to_nothing_outside_itself_and_is_light_or_dark(table: RouteTable) -> None:
     text = svg(table, "title").replace("http://www.w3.org/2000/svg", "").replace(XLINK, "")
@@ -85,21 +78,7 @@ def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
     assert drawn.stdout.count("\nedge ") == len(edges)
 
 
-def test_mermaid_has_a_line_for_every_node_and_edge(table: RouteTable) -> None:
-    nodes, edges = nodes_and_edges(table)
-    lines = mermaid(table, "it's").splitlines()
-    assert lines[:4] == ["---", "title: 'it''s'", "---", "flowchart LR"]
-    label = r'(\["{text}"\]|\(\["{text}"\]\)|>"{text}"\]|\{{\{{"{text}"\}}\}}|\[\["{text}"\]\])'.format(text='[^"]*')
-    drawn = [line for line in lines if re.fullmatch(rf"    n\d+{label}", line)]
-    links = [line for line in lines if re.fullmatch(r'  n\d+ (-->|-\.->\|"[^"#<>]*"\|) n\d+', line)]
-    explained = [line for line in lines if re.fullmatch(rf"    [a-z]+{label}", line)]
-    assert (len(drawn), len(links)) == (len(nodes), len(edges))
-    assert len(explained) == len({node.kind for node in nodes})
-
-
 @needs_graphviz
-def test_a_condition_is_shown_as_it_is_written_on_one_line(tmp_path: Path) -> None:
-    table = checked_table(tmp_path / "hostile.yaml")
-    drawn = subprocess.run([str(DOT), "-Tsvg"], input=dot(table, ""), capture_output=True, text=True, check=True)
-    assert "#&lt;b&gt;&amp;lt;|" in drawn.stdout
-    assert "and accel_x &gt; 1, at most 5 Hz" in drawn.stdout.replace("&#160;", " ").replace("&#45;", "-")
+def test_the_verb_writes_the_picture(tmp_path: Path) -> None:
+    assert main(["graph", str(ROUTES / "rover.yaml"), "-o", str(tmp_path / "routes.svg")]) == OK
+    assert (tmp_path / "routes.svg").read_text(encoding="utf-8").startswith("<svg ")

@@ -21,6 +21,7 @@ from tests.ports import free_port
 from tests.recording.recorder_rig import MILLISECOND, START, again, imu, read, recorded, seen, wire
 from tests.recording.recorder_rig import table as rig_table
 from tests.tables import PROTOS
+from tests.tools.conftest import place
 
 BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
 ELSEWHERE = ("198.51.100.7", 5000)
@@ -40,19 +41,6 @@ endpoints:
   sensor_board: {{address: 127.0.6.31:8, kind: board}}
 routes: {{}}
 """
-
-
-@pytest.fixture
-def receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.6.5", 0))
-        opened.settimeout(5)
-        yield opened
-
-
-def place(receiver: socket.socket) -> str:
-    host, port = receiver.getsockname()
-    return f"{host}:{port}"
 
 
 def received(receiver: socket.socket, count: int) -> list[tuple[bytes, str]]:

@@ -19,21 +19,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from router.cli import main
 from router.table import read_table
+from tests.tools.conftest import place
 
 EMPTY_PLAIN = bytes.fromhex("1200")
-
-
-@pytest.fixture
-def receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        opened.settimeout(5)
-        yield opened
-
-
-def place(receiver: socket.socket) -> str:
-    host, port = receiver.getsockname()
-    return f"{host}:{port}"
 
 
 def test_send_says_what_it_sent_once_or_at_a_rate_trimmed_or_padded(
