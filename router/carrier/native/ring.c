@@ -137,10 +137,6 @@ void ring_wake(struct ring *ring) {
     wake_reader(ring);
 }
 
-uint64_t ring_written(struct ring *ring) { return atomic_load(&ring->written); }
-
-uint64_t ring_taken(struct ring *ring) { return atomic_load(&ring->taken); }
-
 int ring_watch(struct ring *ring) {
     atomic_store(&ring->is_watched, true);
     return ring->wake;
