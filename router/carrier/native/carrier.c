@@ -72,7 +72,7 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
 static int64_t nanoseconds(struct timespec time) { return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec; }
 
 /* The time at which the kernel got the datagram that was just received, by the wall clock; 0 if it does not say. Where the
- * time does not come with each datagram, as in qemu-user, the kernel is asked. */
+ * time does not come with each datagram, as in qemu-user, an ioctl returns it. */
 static int64_t arrival(int fd, struct msghdr *message) {
     struct timespec stamp;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(message); each; each = CMSG_NXTHDR(message, each))
@@ -92,7 +92,7 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     bool is_about_sent = sender_note_errors(fd);
     for (int left = ATTEMPTS; left && length < 0 && errno != EAGAIN; left--)
         length = recvmsg(fd, message, flags | MSG_DONTWAIT);
-    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* a fault: it is not to keep us busy */
+    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* a fault: no busy loop */
     return length;
 }
 
@@ -181,7 +181,7 @@ static bool is_stopping(struct carrier *carrier) {
 
 static bool goes_on(struct carrier *carrier) {
     serve_due(carrier);
-    /* Release: who sees the next turn may free what was read in this one. */
+    /* Release: a thread that sees the next turn may free what was read in this one. */
     atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_release);
     return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
 }
@@ -227,8 +227,9 @@ static void *receive_thread(void *of) {
         else receive_from_many(carrier, carrier->epoll);
         adopt_next(carrier);
     }
-    for (uint32_t index = 0; index < carrier->routing.program->listener_count; index++)
-        if (!carrier->routing.program->listeners[index].keeps_input) drain(carrier, &carrier->routing.program->listeners[index]);
+    const struct program *last = carrier->routing.program;
+    for (uint32_t index = 0; index < last->listener_count; index++)
+        if (!last->listeners[index].keeps_input) drain(carrier, &last->listeners[index]);
     return NULL;
 }
 

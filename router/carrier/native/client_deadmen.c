@@ -16,7 +16,7 @@ struct client_deadmen {
     struct timers *group;
     pthread_t thread;
     pthread_cond_t changed;
-    bool has_started, has_stopped; /* of whoever starts and stops the thread */
+    bool has_started, has_stopped; /* of the thread that starts and stops it */
     bool has_ended;                /* under the lock of the group */
     int wake;                      /* eventfd */
     _Atomic bool is_stopping;

@@ -1,7 +1,7 @@
-/* Deadmen of gateway clients: they publish on topics, which may block. So they are a group of their own, with a thread.
+/* Deadmen of gateway clients: they publish on topics, which may block, so they are a group of their own, with a thread.
  *
- * The thread decides about one deadman under the lock, and then publishes without it. So feeding a deadman, a reload and
- * the stop never wait for the middleware, and whoever is due behind a publisher that blocks is decided about afterwards. */
+ * The thread decides about one deadman under the lock, and then publishes without it. Feeding a deadman, a reload and the
+ * stop never wait for the middleware. A deadman that falls due while a publisher blocks is decided about afterwards. */
 #ifndef CLIENT_DEADMEN_H
 #define CLIENT_DEADMEN_H
 
@@ -35,7 +35,7 @@ bool client_deadmen_have_reached(struct client_deadmen *of, uint32_t generation)
 int64_t client_deadmen_since(struct client_deadmen *of, uint32_t *topic);
 
 /* Have armed deadmen publish a last time, and end the thread, if it was started. Returns false after 1 s: it is stuck in
- * the middleware, and left there with a publisher. Should it return, it ends, and uses nothing else of the caller's. */
+ * the middleware, and abandoned there with a publisher. If it returns, it ends, and uses nothing else of the caller's. */
 bool client_deadmen_stop(struct client_deadmen *of);
 
 #endif

@@ -74,11 +74,15 @@ struct collector {
 
 enum { LONGEST_DETAIL = 80 };
 
-static void lose(const struct collector *collector, int64_t now, const char *detail) {
-    const struct targets *to = collector->to;
+/* All topics of the route lose a datagram or a frame. */
+static void lose_for_all(struct stage *stage, const struct targets *to, int64_t now, struct lost_event lost,
+                         const char *detail) {
     for (uint32_t index = 0; index < to->count; index++)
-        lose_message(collector->timers->stage, to, &to->targets[index], now, (struct lost_event){.reason = LOSS_INCOMPLETE},
-                     detail);
+        lose_message(stage, to, &to->targets[index], now, lost, detail);
+}
+
+static void lose(const struct collector *collector, int64_t now, const char *detail) {
+    lose_for_all(collector->timers->stage, collector->to, now, (struct lost_event){.reason = LOSS_INCOMPLETE}, detail);
 }
 
 static void lose_large(const struct collector *collector, uint64_t count, int64_t now) {
@@ -87,16 +91,13 @@ static void lose_large(const struct collector *collector, uint64_t count, int64_
     lose(collector, now, detail);
 }
 
-static void count_filtered(const struct collector *collector) {
+/* Count a datagram that is kept in a frame, or is a copy. */
+static void count_all(const struct collector *collector, bool is_kept) {
     const struct targets *to = collector->to;
-    for (uint32_t index = 0; index < to->count; index++)
-        stage_count(collector->timers->stage, to->targets[index].filtered, 1);
-}
-
-static void count_collected(const struct collector *collector) {
-    const struct targets *to = collector->to;
-    for (uint32_t index = 0; index < to->count; index++)
-        stage_count(collector->timers->stage, to->targets[index].collected, 1);
+    for (uint32_t index = 0; index < to->count; index++) {
+        const struct target *target = &to->targets[index];
+        stage_count(collector->timers->stage, is_kept ? target->collected : target->filtered, 1);
+    }
 }
 
 /* ---- names ---- */
@@ -273,11 +274,11 @@ static struct frame *offer(struct collector *collector, const struct part *part,
         frame = NULL;
     }
     if (is_closed(collector, &part->name) || (frame && frame->places[part->index])) {
-        count_filtered(collector);
+        count_all(collector, false);
         return NULL;
     }
     if (frame) {
-        count_collected(collector);
+        count_all(collector, true);
     } else {
         if (collector->open == MOST_FRAMES) close_oldest(collector, now);
         frame = open_frame(collector, part, now);
@@ -339,12 +340,11 @@ void collector_close(struct collector *collector) {
 
 /* ---- datagrams ---- */
 
-/* All topics lose a datagram that `collect` refuses. Returns false. */
+/* `collect` refuses a datagram. Returns false. */
 static bool refuse(struct stage *stage, const struct targets *to, const struct message *message, int reason,
                    const char *detail) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
-    for (uint32_t index = 0; index < to->count; index++)
-        lose_message(stage, to, &to->targets[index], message->now, lost, detail);
+    lose_for_all(stage, to, message->now, lost, detail);
     return false;
 }
 

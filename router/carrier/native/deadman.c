@@ -6,7 +6,7 @@
 
 #include "deliver.h"
 
-enum { MOST_REACHED = 64, LONGEST_TEXT = 255 };
+enum { MOST_REACHED = 64 };
 
 /* In ns: after what time a payload of the start that could not leave is sent again; for how long after the start a new
  * subscriber may be one that was there before, as discovery takes less; and after what time a subscriber that was
@@ -32,29 +32,22 @@ struct deadman {
 
 /* What follows, up to the public functions, is called with the lock held. */
 
-static void put_event(struct timers *timers, const struct deadman_event *event) {
+/* Report what no limit applies to: where there is no room, the oldest event goes. */
+static void report_with(struct timers *timers, struct deadman_event event, const char *why) {
     struct deadman_event oldest;
     struct ring *events = timers->stage->reporter.events;
     if (!events) return;
-    while (!ring_put(events, event, event->size)) ring_drop(events, &oldest, sizeof oldest);
+    while (!put_event(events, &event, sizeof event, why)) ring_drop(events, &oldest, sizeof oldest);
 }
 
 static void report(struct timers *timers, enum event_kind kind, const struct deadman *deadman) {
-    struct deadman_event event = {.size = sizeof event, .kind = kind, .deadman = deadman->id};
-    put_event(timers, &event);
+    report_with(timers, (struct deadman_event){.kind = kind, .deadman = deadman->id}, "");
 }
 
 /* A datagram has not left: `error` is an errno, or 0 and `why` says more. */
 static void report_error(struct timers *timers, const struct deadman *deadman, const struct deadman_destination *to,
                          int error, const char *why) {
-    struct {
-        struct deadman_event event;
-        char text[LONGEST_TEXT + 1];
-    } record = {{sizeof record.event, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, ""};
-    size_t length = strnlen(why, LONGEST_TEXT);
-    memcpy(record.text, why, length);
-    if (length) record.event.size += (uint32_t)(length + 8) / 8 * 8;
-    put_event(timers, &record.event);
+    report_with(timers, (struct deadman_event){0, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, why);
 }
 
 /* Send the datagrams. Return a bit for each of the first 64 destinations reached. One that is refused has left: whoever
@@ -261,7 +254,7 @@ void deadman_replace(struct timers *timers, struct deadman *next, struct deadman
     pthread_mutex_unlock(&timers->lock);
 }
 
-void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now) {
+void command_has_left(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now) {
     for (uint32_t index = 0; index < count; index++) {
         if (refused) arm_one(timers, &feeds[index], now);
         else feed_one(timers, &feeds[index], now);
@@ -271,7 +264,7 @@ void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t coun
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
     struct feed feed = {.deadman = deadman};
     pthread_mutex_lock(&timers->lock);
-    deadmen_feed(timers, &feed, 1, 0, now);
+    command_has_left(timers, &feed, 1, 0, now);
     pthread_mutex_unlock(&timers->lock);
 }
 
@@ -312,7 +305,7 @@ int command_send_at(struct timers *timers, struct sender *sender, const void *da
     if (error) return error;
     int refused = sender_take_refused(sender);
     if (!count) return refused;
-    deadmen_feed(timers, feeds, count, refused, now);
+    command_has_left(timers, feeds, count, refused, now);
     return refused;
 }
 

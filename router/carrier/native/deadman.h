@@ -89,6 +89,6 @@ void deadman_settle(struct timers *timers, struct timer *timer, const struct dea
                     int64_t now);
 
 /* A command has left at `now`, and returned `refused`: 0, or an errno about an earlier one. The lock is held. */
-void deadmen_feed(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now);
+void command_has_left(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now);
 
 #endif

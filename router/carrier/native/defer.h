@@ -15,7 +15,7 @@ struct deferral *deferral_open(struct pacer *pacer);
 void deferral_close(struct deferral *deferral);
 
 /* Deliver a message to the target of a deferral, now or later: `data` is the machine's output, or a datagram. Return false
- * if the thread has been given up (ABANDONED). */
+ * if the thread was abandoned. */
 bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now);
 
 #endif

@@ -30,7 +30,7 @@ void lose_message(struct stage *stage, const struct targets *to, const struct ta
     lost.target = target->id;
     lost.counter = target->dropped[lost.reason];
     stage_count(stage, lost.counter, 1);
-    report_loss(&stage->reporter, now, &lost, text);
+    report_loss(&stage->reporter, now, lost, text);
 }
 
 void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {

@@ -114,12 +114,12 @@ struct stage {
     void (*counted)(struct stage *stage, uint32_t index, int64_t amount);
     /* The boot clock, ns. */
     int64_t (*now)(struct stage *stage);
-    /* Send as `command_send` does. */
+    /* Send as `command_send` does. The caller has just checked the age. */
     int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
     /* Send the datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
     int (*brake)(struct stage *stage, const struct deadman_destination *to);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. ABANDONED: the thread was
-     * stuck in the middleware and has been given up, and must not use anything that belongs to others. */
+     * stuck in the middleware and was abandoned, and must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
     struct machine machine; /* last, as it is large */
 };
@@ -148,11 +148,11 @@ void lose_message(struct stage *stage, const struct targets *to, const struct ta
 /* The message is older than `ttl`. Stale commands are only counted: after a stall there are many at once. */
 void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now);
 
-/* Send these bytes, or publish the machine's output, and count that. Return false if the thread has been given up (ABANDONED). */
+/* Send these bytes, or publish the machine's output, and count that. Return false if the thread was abandoned. */
 bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
                  size_t size, int64_t expires, int64_t now);
 
-/* Deliver a message to one of the targets. Return false if the thread has been given up (ABANDONED). */
+/* Deliver a message to one of the targets. Return false if the thread was abandoned. */
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);
 
 /* Deliver it to all of them, likewise. */

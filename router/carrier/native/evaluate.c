@@ -10,7 +10,7 @@
 #include "write_cdr.h"
 #include "write_protobuf.h"
 
-/* ---- lists and enums ---- */
+/* ---- lists ---- */
 
 /* Make one list in cells of the `size` values from `first` on. */
 static bool collect(struct machine *machine, const struct value *first, uint32_t size, struct value *list) {
@@ -27,19 +27,6 @@ static bool unpack(struct machine *machine, struct value *list, enum scalar stor
         if (!list_add(machine, &made, list_next(machine, list, stored))) return false;
     *list = made;
     return true;
-}
-
-/* Whether `number` is one of `count` int32, which ascend. */
-static bool is_member(int64_t number, const uint8_t *numbers, uint32_t count) {
-    uint32_t low = 0, high = count;
-    while (low < high) {
-        uint32_t middle = low + (high - low) / 2;
-        int32_t found = (int32_t)load_little_endian(numbers + (size_t)middle * sizeof found, sizeof found);
-        if (found == number) return true;
-        if (found < number) low = middle + 1;
-        else high = middle;
-    }
-    return false;
 }
 
 /* ---- execution ---- */
@@ -165,7 +152,7 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         case OP_FIT_SIZE: WANT(top->size <= op->integer);
         case OP_UTF8: WANT(is_utf8(top->bytes, top->size));
         case OP_OCTETS: WANT(to_octets(machine, top, op->flag));
-        case OP_MEMBER: WANT(is_member(top->integer, literals + op->integer, op->size));
+        case OP_MEMBER: WANT(is_among(top->integer, literals + op->integer, op->size));
 
         case OP_ELEMENT: WANT(list_element(machine, top, op->flag, op->integer, top));
         case OP_ENTER: top--; WANT(machine_enter(machine, op->slot, top + 1));

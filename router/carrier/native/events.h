@@ -1,5 +1,5 @@
-/* What native threads tell Python for its log, as records of a ring. Ids stand for names that Python knows. At most so many are written per window of time: Python reads in the counter that an event
- * names how many there were. */
+/* Events of native threads for Python's log, as records of a ring. Ids stand for names that Python knows. Only so many are
+ * written per window of time: the counter that an event names says how many there were. */
 #ifndef EVENTS_H
 #define EVENTS_H
 

@@ -54,7 +54,7 @@ static void serve_message(struct from_ros *thread, const struct ros_topic *topic
 /* Take a message, without the lock, and serve it. Return whether there was one. */
 static bool serve_one(struct from_ros *thread, const struct ros_topic *topic) {
     struct message_info info = {0};
-    const void *subscription = topic->subscription; /* the topic may be gone if we are left in the middleware */
+    const void *subscription = topic->subscription; /* the topic may be gone when an abandoned thread returns */
     pthread_mutex_unlock(&thread->lock);
     int error = thread->take(subscription, &thread->message, &info, NULL);
     bool has_failed = error && error != TAKE_FAILED;
@@ -94,7 +94,7 @@ static bool adopt(struct from_ros *thread) {
     const struct ros_set *next = thread->offered;
     if (!next) return false;
     serve_rest(thread, thread->current, next);
-    if (thread->offered != next) return true; /* nobody waits for it any more */
+    if (thread->offered != next) return true; /* it was taken back */
     thread->current = next;
     thread->offered = NULL;
     for (uint32_t index = 0; index < next->count; index++)

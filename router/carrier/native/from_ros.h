@@ -2,7 +2,7 @@
  *
  * It takes serialized messages, and delivers them (deliver.h) as the receive thread delivers datagrams. Neither the
  * interpreter nor a publisher can hold it up. It holds its lock while it serves a message, never while it is in the
- * middleware: so whoever waits for that lock waits for one message at most. */
+ * middleware, so other threads wait for that lock for one message at most. */
 #ifndef FROM_ROS_H
 #define FROM_ROS_H
 
@@ -37,8 +37,8 @@ bool from_ros_serve(struct from_ros *thread, const struct ros_set *set);
 /* Go on where another thread has left subscriptions: what it has served is not served again. */
 void from_ros_follow(struct from_ros *thread, struct from_ros *other);
 
-/* Serve what has arrived, and end the thread. Returns false after 1 s: the thread is stuck in the middleware, and left
- * there with a subscription. Should it return, it ends; it uses nothing else of the caller's. */
+/* Serve what has arrived, and end the thread. Returns false after 1 s: the thread is stuck in the middleware, and
+ * abandoned there with a subscription. If it returns, it ends, and uses nothing else of the caller's. */
 bool from_ros_stop(struct from_ros *thread);
 
 /* How often the middleware refused to hand out a message. */

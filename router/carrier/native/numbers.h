@@ -17,6 +17,20 @@ static inline void store_little_endian(uint8_t *to, uint64_t bits, unsigned size
     for (unsigned index = 0; index < size; index++) to[index] = (uint8_t)(bits >> (8 * index));
 }
 
+/* Whether a number is one of `count` int32 at `numbers`, which ascend and need not be aligned. */
+static inline bool is_among(int64_t number, const void *numbers, uint32_t count) {
+    uint32_t low = 0, high = count;
+    while (low < high) {
+        uint32_t middle = low + (high - low) / 2;
+        int32_t found;
+        memcpy(&found, (const uint8_t *)numbers + (size_t)middle * sizeof found, sizeof found);
+        if (found == number) return true;
+        if (found < number) low = middle + 1;
+        else high = middle;
+    }
+    return false;
+}
+
 static inline double of_float32(uint64_t bits) {
     uint32_t low = (uint32_t)bits;
     float number;

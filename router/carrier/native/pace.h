@@ -15,7 +15,7 @@
 
 #include "deliver.h"
 
-/* Who goes first. */
+/* In which order they leave. */
 enum priority { PRIORITY_COMMAND, PRIORITY_TELEMETRY, PRIORITY_BULK };
 enum { PRIORITIES = PRIORITY_BULK + 1 };
 

@@ -33,22 +33,23 @@ static void take_short_slices(void) {
     take_usual_policy();
 }
 
-/* Whether nobody has chosen a policy for the router. A thread of Python that opens ROS passes on the batch policy. */
-static bool is_ours_to_choose(void) {
+/* Whether the router was started without a policy of its own. A thread of Python that opens ROS passes on the batch
+ * policy. */
+static bool has_usual_policy(void) {
     int inherited = sched_getscheduler(0);
     return inherited == SCHED_OTHER || inherited == SCHED_BATCH;
 }
 
 void run_in_turn(void) {
-    if (is_ours_to_choose()) take_usual_policy();
+    if (has_usual_policy()) take_usual_policy();
 }
 
 void run_soon(void) {
-    if (is_ours_to_choose()) take_short_slices(); /* before Linux 6.12 they change nothing */
+    if (has_usual_policy()) take_short_slices(); /* before Linux 6.12 they change nothing */
 }
 
 bool run_first(void) {
-    if (!is_ours_to_choose()) return false;
+    if (!has_usual_policy()) return false;
     if (take_priority()) return true;
     run_soon();
     return false;

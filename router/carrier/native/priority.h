@@ -1,4 +1,4 @@
-/* When threads run that wake up. Most do so at once, in place of one that computes: they will not compute for long. */
+/* Scheduling of threads that wake up. Most are to run at once, in place of a thread that computes: they compute little. */
 #ifndef PRIORITY_H
 #define PRIORITY_H
 

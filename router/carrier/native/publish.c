@@ -81,7 +81,7 @@ static void reach(struct publish_thread *thread, uint32_t generation) {
     atomic_store(&thread->generation, generation);
 }
 
-/* Serve what was taken. Return false if the thread was left meanwhile. */
+/* Serve what was taken. Return false if the thread was abandoned meanwhile. */
 static bool serve_all(struct publish_thread *thread, size_t size) {
     for (size_t at = 0; at < size;) {
         const struct message_record *record = (const struct message_record *)(thread->records + at);

@@ -37,8 +37,8 @@ bool publish_has_reached(struct publish_thread *thread, uint32_t generation);
 /* The topic in whose publisher the thread is now, by its id, and since when (monotonic); 0 if in none. */
 int64_t publish_since(struct publish_thread *thread, uint32_t *topic);
 
-/* Serve what waits, settle what is kept, and end the thread. Returns false after 1 s: it is stuck in the middleware, and left
- * there with a publisher. Should it return, it ends; it uses nothing else of the caller's. */
+/* Serve what waits, settle what is kept, and end the thread. Returns false after 1 s: it is stuck in the middleware, and
+ * abandoned there with a publisher. If it returns, it ends, and uses nothing else of the caller's. */
 bool publish_stop(struct publish_thread *thread);
 
 /* Copy the first counters as in `counters_copy`. */

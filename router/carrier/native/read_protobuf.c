@@ -70,14 +70,7 @@ static bool read_scalar(struct bytes *from, enum field_type type, struct value *
 static bool is_known(const struct machine *machine, const struct wanted_field *field, const struct value *value) {
     if (field->type != TYPE_CLOSED_ENUM) return true;
     const struct closed_enum *closed = &machine->layout->closed[field->closed];
-    uint32_t low = 0, high = closed->count;
-    while (low < high) {
-        uint32_t middle = low + (high - low) / 2;
-        if (closed->numbers[middle] == value->integer) return true;
-        if (closed->numbers[middle] < value->integer) low = middle + 1;
-        else high = middle;
-    }
-    return false;
+    return is_among(value->integer, closed->numbers, closed->count);
 }
 
 static struct value range(const struct bytes *bytes) {

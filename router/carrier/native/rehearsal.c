@@ -74,7 +74,7 @@ static int send_nowhere(struct stage *stage, const struct target *target, const 
     int64_t now = stage->rehearsal->now;
     if (now > expires) return COMMAND_STALE;
     note_left(stage, RECORD_SENT, target->id, data, size);
-    if (target->feed_count) deadmen_feed(stage->rehearsal->timers, target->feeds, target->feed_count, 0, now);
+    if (target->feed_count) command_has_left(stage->rehearsal->timers, target->feeds, target->feed_count, 0, now);
     return 0;
 }
 

@@ -15,15 +15,19 @@ bool may_report(struct reporter *reporter, int64_t now) {
     return true;
 }
 
-void report_loss(struct reporter *reporter, int64_t now, const struct lost_event *lost, const char *text) {
+bool put_event(struct ring *events, const void *event, size_t size, const char *text) {
     struct {
-        struct lost_event event;
-        char text[LONGEST_TEXT + 1];
-    } record = {.event = *lost};
-    if (!may_report(reporter, now)) return;
+        _Alignas(8) struct event_head head;
+        char rest[sizeof(struct lost_event) + LONGEST_TEXT + 1]; /* no other event that has a text is longer */
+    } record = {0};
     size_t length = strnlen(text, LONGEST_TEXT);
-    memcpy(record.text, text, length);
-    record.event.kind = EVENT_LOST;
-    record.event.size = (uint32_t)(sizeof record.event + (length + 8) / 8 * 8);
-    ring_put(reporter->events, &record, record.event.size);
+    memcpy(&record, event, size);
+    memcpy((char *)&record + size, text, length);
+    record.head.size = padded_to_word(size + (length ? length + 1 : 0));
+    return ring_put(events, &record, record.head.size);
+}
+
+void report_loss(struct reporter *reporter, int64_t now, struct lost_event lost, const char *text) {
+    lost.kind = EVENT_LOST;
+    if (may_report(reporter, now)) put_event(reporter->events, &lost, sizeof lost, text);
 }

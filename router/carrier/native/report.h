@@ -3,6 +3,7 @@
 #define REPORT_H
 
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
 #include "events.h"
@@ -18,7 +19,10 @@ struct reporter {
 /* Whether another event may be written at `now` (boot clock). If so, the caller writes one. */
 bool may_report(struct reporter *reporter, int64_t now);
 
-/* Report a loss, with a text that gives details, or "". Fills in the size and kind of the event. */
-void report_loss(struct reporter *reporter, int64_t now, const struct lost_event *lost, const char *text);
+/* Write an event of `size` bytes with a text behind it, unless that is empty; sets its size. Return whether there was room. */
+bool put_event(struct ring *events, const void *event, size_t size, const char *text);
+
+/* Report a loss, with a text that gives details, or "". Its kind is filled in. */
+void report_loss(struct reporter *reporter, int64_t now, struct lost_event lost, const char *text);
 
 #endif

@@ -49,8 +49,8 @@ static uint32_t size_at(struct ring *ring, uint64_t position) {
 
 /* Wake the reader, if it sleeps or is going to, once for all that is written until then. The full fences here and in
  * `ring_take` stand between what either side stores and what it loads then: either the reader sees the record or the
- * request, or we see that it waits. Sequentially consistent stores and loads would do on a processor, but qemu-user for
- * aarch64 reorders them. */
+ * request, or the writer sees that it waits. Sequentially consistent stores and loads would do on a processor, but
+ * qemu-user for aarch64 reorders them. */
 static void wake_reader(struct ring *ring) {
     atomic_thread_fence(memory_order_seq_cst);
     if (atomic_load_explicit(&ring->is_watched, memory_order_relaxed)) eventfd_write(ring->wake, 1);
@@ -136,10 +136,6 @@ void ring_wake(struct ring *ring) {
     atomic_store_explicit(&ring->is_woken, true, memory_order_release);
     wake_reader(ring);
 }
-
-uint64_t ring_written(struct ring *ring) { return atomic_load(&ring->written); }
-
-uint64_t ring_taken(struct ring *ring) { return atomic_load(&ring->taken); }
 
 int ring_watch(struct ring *ring) {
     atomic_store(&ring->is_watched, true);

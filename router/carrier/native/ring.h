@@ -43,7 +43,4 @@ void ring_wake(struct ring *ring);
  * and takes with a timeout of 0. */
 int ring_watch(struct ring *ring);
 
-uint64_t ring_written(struct ring *ring);
-uint64_t ring_taken(struct ring *ring);
-
 #endif

@@ -48,12 +48,8 @@ static void drop_oldest(struct routing *routing, int64_t now) {
     if (!ring_drop(routing->published, &oldest, sizeof oldest)) return;
     for (uint32_t index = 0; index < oldest.to->count; index++) {
         const struct target *target = &oldest.to->targets[index];
-        uint32_t dropped = target->dropped[LOSS_QUEUE_FULL];
         stage_count(&routing->stage, target->waiting, -1);
-        stage_count(&routing->stage, dropped, 1);
-        struct lost_event lost = {.route = oldest.to->route, .topic = NO_NAME, .target = target->id,
-                                  .reason = LOSS_QUEUE_FULL, .counter = dropped};
-        report_loss(&routing->stage.reporter, now, &lost, "");
+        lose_message(&routing->stage, oldest.to, target, now, (struct lost_event){.reason = LOSS_QUEUE_FULL}, "");
     }
 }
 

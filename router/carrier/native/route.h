@@ -50,8 +50,7 @@ int route_datagram(struct routing *routing, struct received *received);
 /* Adopt another program between two datagrams: deadmen pass from the earlier one to it, or end. */
 void route_by(struct routing *routing, const struct change *change);
 
-/* Deliver a message that `route_datagram` has put into the ring. Return false if the thread has been
- * given up (ABANDONED). */
+/* Deliver a message that `route_datagram` has put into the ring. Return false if the thread was abandoned. */
 bool route_to_topics(struct stage *stage, const struct message_record *record);
 
 #endif

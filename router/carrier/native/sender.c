@@ -79,13 +79,13 @@ static void discard_errors(int fd) {
     for (int wanted = 0; wanted <= 1; wanted++) setsockopt(fd, IPPROTO_IP, IP_RECVERR, &wanted, sizeof wanted);
 }
 
-/* Return whether the sender has taken the error: it holds one at a time. */
+/* Return false if the sender has an error already: it keeps one at a time. */
 static bool note(struct sender *sender, int refused) {
     int none = 0;
     return atomic_compare_exchange_strong(&sender->refused, &none, refused);
 }
 
-/* Of several senders to one address, the first that has no error yet is told. */
+/* Of several senders to one address, the error goes to the first that has none yet. */
 static void note_by_address(const struct sockaddr_in *address, int refused) {
     pthread_mutex_lock(&list_lock);
     for (struct sender *each = first; each; each = each->next)

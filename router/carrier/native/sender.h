@@ -44,7 +44,7 @@ int sender_take_refused(struct sender *sender);
  * would get that error. One thread at a time may send so. */
 int sender_send_checked(struct sender *sender, const void *data, size_t size);
 
-/* Read the ICMP errors that a listener has, and tell the senders whose datagrams they are about. Return whether there
+/* Read the ICMP errors that a listener has, for the senders whose datagrams they are about. Return whether there
  * were any. A flood of them is cut short. */
 bool sender_note_errors(int listener);
 

@@ -19,9 +19,9 @@ int thread_start(pthread_t *thread, const char *name, void *(*run)(void *), void
 void condition_open(pthread_cond_t *condition);
 struct timespec patience(void);
 
-/* Wait for a thread that was asked to end: with `lock` held, it sets `has_ended` and signals `changed`. If that takes more
- * than a second, it is stuck: it is abandoned, and so set `is_abandoned`, after which it uses nothing of others any more. Return
- * whether it has ended. */
+/* Wait for a thread that is to end: with `lock` held, it sets `has_ended` and signals `changed`. If that takes more than a
+ * second, it is stuck, and abandoned: `is_abandoned` is set, and it uses nothing of others from then on. Return whether it has
+ * ended. */
 bool thread_end(pthread_t thread, pthread_mutex_t *lock, pthread_cond_t *changed, const bool *has_ended, bool *is_abandoned);
 
 /* Of a thread that publishes: */

@@ -78,7 +78,7 @@ static void take_some(int64_t timeout) {
 
 static void *take_all(void *unused) {
     while (!atomic_load(&has_ended)) take_some(-1);
-    while (ring_written(ring) != ring_taken(ring)) take_some(0);
+    while (atomic_load(&ring->written) != atomic_load(&ring->taken)) take_some(0);
     return unused;
 }
 

@@ -284,7 +284,7 @@ static void *send_commands(void *unused) {
 /* Takes messages as the publish thread does, and looks at the targets of each, at times slowly. */
 static void *read_messages(void *unused) {
     static uint64_t records[2048];
-    for (uint32_t turn = 0; !atomic_load(&has_ended) || ring_written(messages) != ring_taken(messages); turn++) {
+    for (uint32_t turn = 0; !atomic_load(&has_ended) || messages->written != messages->taken; turn++) {
         uint32_t now_at = atomic_load(&latest);
         size_t size = ring_take(messages, records, sizeof records, 1000000);
         for (size_t at = 0; at < size;) {
