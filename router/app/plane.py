@@ -288,7 +288,7 @@ class Plane:
             listener.end_input()
         self._carrier.stop_receiving()
         self._is_running = False
-        threads = self._publishing, *self._from_ros
+        threads: list[PublishThread | FromRosThread] = [self._publishing, *self._from_ros]
         stuck = [thread.name for thread in threads if not thread.stop()]
         if stuck:
             logger.error("a thread is stuck, and the router ends without it", threads=stuck)

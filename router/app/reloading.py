@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from router.app.counts import ThreadCounts
 from router.app.process import reloading
 from router.app.runtime import Runtime
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
@@ -31,11 +30,9 @@ class Reloader:
     `replaced` is called when another program runs, and everything of the one before is closed.
     """
 
-    def __init__(
-        self, runtime: Runtime, counts: ThreadCounts, environ: Mapping[str, str] | None, replaced: Callable[[], None]
-    ) -> None:
+    def __init__(self, runtime: Runtime, environ: Mapping[str, str] | None, replaced: Callable[[], None]) -> None:
         self._runtime = runtime
-        self._counts = counts
+        self._counts = runtime.plane.counts
         self._environ = environ
         self._replaced = replaced
         self._is_open = False

@@ -62,7 +62,7 @@ class Router:
         self.mirror = Mirror(plane, self._reporter.failed)
         self._runtime = Runtime(plane, self._reporter, ros_args)
         self._services = Services(self)
-        self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
+        self._reloader = Reloader(self._runtime, environ, self._watch)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._collector: tuple[Program, CountersCollector] | None = None
@@ -162,9 +162,6 @@ class Router:
         self._reporter.deadman_changed(route, active)
         if active:
             self._services.deadman_tripped(route)
-
-    def _program_replaced(self) -> None:
-        self._watch()
 
     def _watch(self) -> None:
         """Watch the table's files if it says so, and the network interfaces that it names."""

@@ -202,7 +202,7 @@ class Runtime:
         if self._ros is None and not _needs_ros(program):
             return None
         if self._ros is None:
-            self._ros = _open_ros(program, self._ros_args, self._incompatible, self._subscriber_joined)
+            self._ros = _open_ros(program, self._ros_args, self._incompatible, self.plane.subscriber_joined)
             undo.callback(self._close_ros)
         change = self._ros.prepare(program.publishers, program.subscriptions, _topic_spans(program))
         undo.callback(self._ros.abandon, change)
@@ -236,9 +236,6 @@ class Runtime:
             return
         for name in _users_of_topics(program).get(topic, ()):
             self._counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
-
-    def _subscriber_joined(self, topic: str) -> None:
-        self.plane.subscriber_joined(topic)
 
     # the end
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable
 from typing import TypeVar, cast
 
 T = TypeVar("T")
@@ -24,10 +24,6 @@ class State:
         if key not in self._kept:
             self._kept[key] = self._previous[key] if key in self._previous else make()
         return cast("T", self._kept[key])
-
-    def left(self) -> Iterator[object]:
-        """The objects that only the previous program has; none after `forget_previous`."""
-        return (value for key, value in self._previous.items() if key not in self._kept)
 
     def forget_previous(self) -> None:
         self._previous = {}
