@@ -13,7 +13,7 @@ from router.declared import WireFlag, WireKind
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope
 from router.types.undecidable import all_fields, all_types
-from router.types.wire import I32, I64, VARINT, delimited, kind_of, parses, validates_text
+from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, validates_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class WireSchema:
 
 def wire_kind(field: FieldDescriptor) -> WireKind:
     """How a field is encoded, of a repeated one an element by itself."""
-    return _BY_TYPE.get(field.type) or _BY_WIRE_TYPE[kind_of(field).wire_type]
+    return _BY_TYPE.get(field.type) or _BY_WIRE_TYPE[encoding_of(field).wire_type]
 
 
 _BY_TYPE: Mapping[int, WireKind] = {

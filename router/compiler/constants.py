@@ -23,6 +23,7 @@ from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Names
 from router.compiler.lowering.protobuf import protobuf_message
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.declared import Op
 from router.errors import MappingError
 from router.types.board_limits import BoardField, BoardMessage
 from router.types.protobuf import PayloadCase
@@ -58,6 +59,7 @@ def cdr_of(plan: Record) -> bytes:
 
 
 def _bytes(placed: Sequence[Placed]) -> bytes:
+    assert all(operation.kind is Op.KNOWN for operation, _ in placed)  # noqa: S101 - the plan has constants only
     return b"".join(operation.data for operation, _ in placed)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.lookup import layout
+from router.compiler.lookup import definitions_of
 from router.compiler.metrics import Counters
 from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
 from router.compiler.series import open_series
@@ -83,7 +83,7 @@ def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan]
 
 
 def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
-    return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
+    return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), definitions_of(declared))
 
 
 def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:

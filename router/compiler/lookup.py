@@ -201,7 +201,7 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
     return found.values()
 
 
-def layout(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
+def definitions_of(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
     """By name of the type and of each type in it, the fields as rclpy spells them: they determine the layout of CDR."""
     return {nested.name: definition(nested) for nested in nested_types(message)}
 

@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
-from router.compiler.lookup import layout
+from router.compiler.lookup import definitions_of
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
 from router.gateway.publishers import Selection, select
@@ -262,7 +262,7 @@ class Subscriptions:
         """Load a type, or return why it cannot be received. Runs in a thread of its own, mostly."""
         try:
             message = self._declared(type_name) or self._topics.installed_type(type_name)
-            return ReadyType(message, self._topics.load(type_name, layout(message)))
+            return ReadyType(message, self._topics.load(type_name, definitions_of(message)))
         except StartError as error:
             return str(error)
 

@@ -18,7 +18,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescrip
 
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
 from router.types.descriptors import container, enum_of, message_of
-from router.types.wire import kind_of, varint
+from router.types.wire import encoding_of, varint
 
 _COMMENT = re.compile(r"//.*|#.*|/\*.*?\*/")
 _OPTION = re.compile(r"(?P<key>\w+)\s*:\s*(?P<value>\"[^\"]*\"|[\w.+-]+)\s*[,;]?\s*")
@@ -219,7 +219,7 @@ def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
 
 
 def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: OptionsOf) -> int:
-    if number := kind_of(field).size:
+    if number := encoding_of(field).size:
         return number
     if field.type == FieldDescriptor.TYPE_ENUM:
         return max(len(varint(value.number)) for value in enum_of(field).values)

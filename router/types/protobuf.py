@@ -34,7 +34,7 @@ from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reac
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
 from router.types.undecidable import undecidable
-from router.types.wire import kind_of, validates_text
+from router.types.wire import encoding_of, validates_text
 
 MessageClass = type[Message]
 
@@ -346,7 +346,7 @@ def _type(
 def _element(
     field: FieldDescriptor, options: BoardOptions, messages: Mapping[str, MessageType], enums: Mapping[str, Enum]
 ) -> Type:
-    if number := kind_of(field).type:
+    if number := encoding_of(field).type:
         return number
     if field.type == FieldDescriptor.TYPE_ENUM:
         return enums[enum_of(field).full_name]

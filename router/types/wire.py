@@ -21,7 +21,7 @@ _LONGEST_VARINT = 10
 _ALL_BITS = (1 << 64) - 1
 
 
-class FieldKind(NamedTuple):
+class Encoding(NamedTuple):
     """How a field of one of protobuf's types is encoded.
 
     `read` and `write` are the carrier's. `size` is the largest encoding of a number in bytes, `type` its type in the
@@ -38,31 +38,31 @@ class FieldKind(NamedTuple):
 _SIGNED_32, _SIGNED_64, _UNSIGNED_32, _UNSIGNED_64 = (
     Int(bits, signed) for signed in (True, False) for bits in (32, 64)
 )
-_KINDS: Mapping[int, FieldKind] = {
-    FieldDescriptor.TYPE_BOOL: FieldKind(VARINT, FieldType.BOOL, Op.WRITE_VARINT, 1, Bool()),
-    FieldDescriptor.TYPE_ENUM: FieldKind(VARINT, FieldType.INT32, Op.WRITE_VARINT),
-    FieldDescriptor.TYPE_INT32: FieldKind(VARINT, FieldType.INT32, Op.WRITE_VARINT, 10, _SIGNED_32),
-    FieldDescriptor.TYPE_INT64: FieldKind(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _SIGNED_64),
-    FieldDescriptor.TYPE_UINT32: FieldKind(VARINT, FieldType.UINT32, Op.WRITE_VARINT, 5, _UNSIGNED_32),
-    FieldDescriptor.TYPE_UINT64: FieldKind(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _UNSIGNED_64),
-    FieldDescriptor.TYPE_SINT32: FieldKind(VARINT, FieldType.SINT32, Op.WRITE_ZIGZAG, 5, _SIGNED_32),
-    FieldDescriptor.TYPE_SINT64: FieldKind(VARINT, FieldType.SINT64, Op.WRITE_ZIGZAG, 10, _SIGNED_64),
-    FieldDescriptor.TYPE_FIXED32: FieldKind(I32, FieldType.FIXED32, Op.WRITE_FIXED32, 4, _UNSIGNED_32),
-    FieldDescriptor.TYPE_SFIXED32: FieldKind(I32, FieldType.SFIXED32, Op.WRITE_FIXED32, 4, _SIGNED_32),
-    FieldDescriptor.TYPE_FIXED64: FieldKind(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _UNSIGNED_64),
-    FieldDescriptor.TYPE_SFIXED64: FieldKind(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _SIGNED_64),
-    FieldDescriptor.TYPE_FLOAT: FieldKind(I32, FieldType.FLOAT, Op.WRITE_FLOAT, 4, Float(32)),
-    FieldDescriptor.TYPE_DOUBLE: FieldKind(I64, FieldType.DOUBLE, Op.WRITE_DOUBLE, 8, Float(64)),
-    FieldDescriptor.TYPE_STRING: FieldKind(LEN, FieldType.BYTES, Op.WRITE_BYTES),
-    FieldDescriptor.TYPE_BYTES: FieldKind(LEN, FieldType.BYTES, Op.WRITE_BYTES),
-    FieldDescriptor.TYPE_MESSAGE: FieldKind(LEN, FieldType.MESSAGE, Op.OPEN),
-    FieldDescriptor.TYPE_GROUP: FieldKind(GROUP, FieldType.GROUP, Op.OPEN),
+_ENCODINGS: Mapping[int, Encoding] = {
+    FieldDescriptor.TYPE_BOOL: Encoding(VARINT, FieldType.BOOL, Op.WRITE_VARINT, 1, Bool()),
+    FieldDescriptor.TYPE_ENUM: Encoding(VARINT, FieldType.INT32, Op.WRITE_VARINT),
+    FieldDescriptor.TYPE_INT32: Encoding(VARINT, FieldType.INT32, Op.WRITE_VARINT, 10, _SIGNED_32),
+    FieldDescriptor.TYPE_INT64: Encoding(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _SIGNED_64),
+    FieldDescriptor.TYPE_UINT32: Encoding(VARINT, FieldType.UINT32, Op.WRITE_VARINT, 5, _UNSIGNED_32),
+    FieldDescriptor.TYPE_UINT64: Encoding(VARINT, FieldType.INT64, Op.WRITE_VARINT, 10, _UNSIGNED_64),
+    FieldDescriptor.TYPE_SINT32: Encoding(VARINT, FieldType.SINT32, Op.WRITE_ZIGZAG, 5, _SIGNED_32),
+    FieldDescriptor.TYPE_SINT64: Encoding(VARINT, FieldType.SINT64, Op.WRITE_ZIGZAG, 10, _SIGNED_64),
+    FieldDescriptor.TYPE_FIXED32: Encoding(I32, FieldType.FIXED32, Op.WRITE_FIXED32, 4, _UNSIGNED_32),
+    FieldDescriptor.TYPE_SFIXED32: Encoding(I32, FieldType.SFIXED32, Op.WRITE_FIXED32, 4, _SIGNED_32),
+    FieldDescriptor.TYPE_FIXED64: Encoding(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _UNSIGNED_64),
+    FieldDescriptor.TYPE_SFIXED64: Encoding(I64, FieldType.FIXED64, Op.WRITE_FIXED64, 8, _SIGNED_64),
+    FieldDescriptor.TYPE_FLOAT: Encoding(I32, FieldType.FLOAT, Op.WRITE_FLOAT, 4, Float(32)),
+    FieldDescriptor.TYPE_DOUBLE: Encoding(I64, FieldType.DOUBLE, Op.WRITE_DOUBLE, 8, Float(64)),
+    FieldDescriptor.TYPE_STRING: Encoding(LEN, FieldType.BYTES, Op.WRITE_BYTES),
+    FieldDescriptor.TYPE_BYTES: Encoding(LEN, FieldType.BYTES, Op.WRITE_BYTES),
+    FieldDescriptor.TYPE_MESSAGE: Encoding(LEN, FieldType.MESSAGE, Op.OPEN),
+    FieldDescriptor.TYPE_GROUP: Encoding(GROUP, FieldType.GROUP, Op.OPEN),
 }
 
 
-def kind_of(field: FieldDescriptor) -> FieldKind:
+def encoding_of(field: FieldDescriptor) -> Encoding:
     """How a field is encoded, of a repeated one an element by itself."""
-    return _KINDS[field.type]
+    return _ENCODINGS[field.type]
 
 
 def varint(value: int) -> bytes:

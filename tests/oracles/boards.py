@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from router.errors import plural
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
-from router.types.wire import GROUP, GROUP_END, I32_SIZE, I64, I64_SIZE, LEN, VARINT, kind_of, read_varint
+from router.types.wire import GROUP, GROUP_END, I32_SIZE, I64, I64_SIZE, LEN, VARINT, encoding_of, read_varint
 
 TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 
@@ -70,7 +70,7 @@ def _fits(size: int, bound: int, is_fixed: bool) -> bool:
 
 def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes] | None:
     """The elements that a field brings, as they are encoded; None if it has another wire type than its own."""
-    own = kind_of(field.descriptor).wire_type
+    own = encoding_of(field.descriptor).wire_type
     if wire_type == own:
         return [value]
     if wire_type != LEN or not field.descriptor.is_repeated:

@@ -25,7 +25,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
     UnboundedWString,
 )
 
-from router.compiler.lookup import layout
+from router.compiler.lookup import definitions_of
 from router.errors import StartError
 from router.ros import types as ros_types
 from router.ros.types import installed_class, installed_type, usable_class
@@ -147,7 +147,7 @@ def test_a_class_describes_what_its_msg_file_declares() -> None:
         declared, described = interfaces.get(name), installed_type(name)
         assert declared
         assert shape(described) == shape(declared), name
-        assert layout(described) == layout(declared), name
+        assert definitions_of(described) == definitions_of(declared), name
 
 
 def test_what_belongs_to_a_service_is_named_so_and_its_class_matches() -> None:
@@ -164,7 +164,7 @@ def test_what_belongs_to_a_service_is_named_so_and_its_class_matches() -> None:
             1,
         ),
     )
-    assert usable_class(event.name, layout(event)) is installed_class(event.name)
+    assert usable_class(event.name, definitions_of(event)) is installed_class(event.name)
 
 
 def test_a_request_without_fields_has_none() -> None:

@@ -19,7 +19,7 @@ from router.declared import NONE, FieldType, ReadKind, Scalar
 from router.types.descriptors import enum_of
 from router.types.model import Field as Member
 from router.types.model import MessageType
-from router.types.wire import kind_of
+from router.types.wire import encoding_of
 
 
 class WantedField(NamedTuple):
@@ -156,7 +156,7 @@ class _ProtobufNumbering(Numbering):
         closed = self._closed(declared)
         return WantedField(
             declared.number,
-            kind_of(declared).read if closed == NONE else FieldType.CLOSED_ENUM,
+            encoding_of(declared).read if closed == NONE else FieldType.CLOSED_ENUM,
             declared.is_repeated,
             slot,
             presence,

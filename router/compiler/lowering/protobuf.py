@@ -19,7 +19,7 @@ from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op
 from router.types.descriptors import container, message_of
 from router.types.protobuf import PayloadCase
-from router.types.wire import GROUP, GROUP_END, LEN, kind_of, varint
+from router.types.wire import GROUP, GROUP_END, LEN, encoding_of, varint
 
 _CLOSE = Operation(Op.CLOSE)
 
@@ -91,7 +91,7 @@ class _Writer:
             data = _encoded(made.constant, to)
             is_written = is_always or _is_set(made.constant, to)
             return at(place, known(varint(tag) * bool(tag) + data)) if is_written else []
-        write = kind_of(to).write
+        write = encoding_of(to).write
         return at(place, self._value(made, write), Operation(write, flag=is_always, size=tag))
 
     def _value(self, made: Leaf, write: Op) -> Routine:
@@ -100,7 +100,7 @@ class _Writer:
 
 
 def _tag(to: FieldDescriptor) -> int:
-    return to.number << 3 | kind_of(to).wire_type
+    return to.number << 3 | encoding_of(to).wire_type
 
 
 # ---- known bytes
@@ -108,7 +108,7 @@ def _tag(to: FieldDescriptor) -> int:
 
 def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
     """A constant without its tag."""
-    write = kind_of(to).write
+    write = encoding_of(to).write
     if write is Op.WRITE_FLOAT:
         return struct.pack("<f", value)
     if write is Op.WRITE_DOUBLE:
@@ -126,7 +126,7 @@ def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
 
 def _is_set(value: bool | float | str | bytes, to: FieldDescriptor) -> bool:
     """Whether a constant is not zero, which has no presence. Minus zero is not."""
-    is_real = kind_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
+    is_real = encoding_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
 
 
