@@ -78,7 +78,7 @@ def _explain(args: argparse.Namespace) -> int:
     for name in args.names or known:
         for route in routes.get(name, ()):
             code = listed_route(route, program) if args.code else ()
-            given = () if args.given is None else tried_route(route, program, args.given)
+            given = () if args.given is None else tried_route(route, checked, program, args.given)
             print(*explained_route(route, checked), *code, *given, sep="\n", end="\n\n")
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")

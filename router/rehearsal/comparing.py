@@ -5,42 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedTarget
-from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.compiler.program import Program
 from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
-from router.rehearsal.fields import Difference, Path, offset, path_text, shown
-from router.rehearsal.rehearsal import (
-    START,
-    Collected,
-    DeadmanChanged,
-    Dropped,
-    Event,
-    Filtered,
-    Published,
-    Received,
-    Rejected,
-    Sent,
-)
+from router.rehearsal.fields import Difference
+from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
+from router.rehearsal.telling import Related, Teller, in_brackets, when
 from router.types.framing import restored, trimmed
-from router.types.model import MessageType
-
-_TOLD = 12
-"""So many lines say what happened in a step."""
-
-
-@dataclass(frozen=True, slots=True)
-class Related:
-    """A stretch of the table, and what it has to do with a failure."""
-
-    span: SourceSpan
-    note: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,77 +42,13 @@ class Outcome:
         return max((time for time, _ in self.given if time <= at), default=at)
 
 
-class TableIndex:
-    """Finds the places of a table by route and target, as events name them."""
-
-    def __init__(self, checked: Checked) -> None:
-        self._routes = {route.route.name: route for route in checked.routes}
-        self._targets: dict[tuple[str, str], list[CheckedTarget]] = {}
-        for route in checked.routes:
-            for target in (
-                *route.targets,
-                *(target for subscription in route.subscriptions for target in subscription.targets),
-            ):
-                self._targets.setdefault((route.route.name, target.label), []).append(target)
-
-    def target(self, route: str, target: str, note: str = "the target") -> Related | None:
-        found = self._targets.get((route, target))
-        return Related(found[0].span, note) if found else None
-
-    def type(self, route: str, topic: str) -> MessageType | None:
-        """Of a topic that a route publishes on."""
-        return next((found.type for found in self._targets.get((route, topic), ())), None)
-
-    def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
-        """The target of this name in one of the `routes` that took a message, or else in any."""
-        taken = [name for name in routes if name in self._routes]
-        found = next((found for name in taken if (found := self.target(name, target))), None)
-        if found is None and taken:
-            found = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
-        return found or next((self.target(*key) for key in self._targets if key[1] == target), None)
-
-    def condition(self, route: str, target: str) -> Related | None:
-        for found in self._targets.get((route, target), ()):
-            if found.when is not None:
-                return Related(found.when.span, "withheld by this condition")
-        return self.target(route, target)
-
-    def deadman(self, route: str) -> Related | None:
-        deadman = self._routes[route].route.deadman if route in self._routes else None
-        return Related(deadman.span, "sent by this deadman") if deadman else None
-
-    def field(self, route: str, target: str, path: Path) -> Related | None:
-        """What fills a field, or else the target that leaves it at its default."""
-        for found in self._targets.get((route, target), ()):
-            if found.plan is None:
-                return Related(found.span, "forwarded here")
-            if (span := _filled(found.plan, path)) is not None:
-                return Related(span, f"what fills {path_text(path)}")
-        return self.target(route, target, "nothing here fills it")
-
-
-def _filled(plan: Plan, path: Path) -> SourceSpan | None:
-    match plan:
-        case Leaf() | Each():
-            return plan.span
-        case Record():
-            inner = next((made for field, made in plan.members if path and field.name == path[0]), None)
-            if inner is None:
-                return plan.span if not path else None
-            return _filled(inner, path[1:])
-        case Items():
-            if path and isinstance(path[0], int) and path[0] < len(plan.items):
-                return _filled(plan.items[path[0]], path[1:])
-            return plan.span
-    return None
-
-
 class Comparison:
-    """Compares the steps of the tests of one table."""
+    """Compares the steps of the tests of one table; `teller` has the words."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
         self._wire = Wire(program.envelope)
-        self._index = TableIndex(checked)
+        self.teller = Teller(checked, program)
+        self._index = self.teller.index
         self._table = program.table
 
     def failures(self, outcome: Outcome) -> Iterator[Failure]:
@@ -160,26 +71,14 @@ class Comparison:
         yield from self._dropped(outcome)
         yield from _filtered(expected, events)
 
-    def told(self, outcome: Outcome) -> list[str]:
-        """Everything that happened in a step, in order, each with its place in the table."""
-        lines = []
-        for _, same in groupby((*outcome.early, *outcome.events), _what):
-            events = [*same]
-            line, place = self._first_of(events), self._related(events[0])
-            if place is not None and place.span.file not in line:  # as it is where an expression has no value
-                line += f" ({place.span})"
-            lines.append(line)
-        more = [f"and {len(lines) - _TOLD} lines more"] if len(lines) > _TOLD else []
-        return lines[:_TOLD] + more
-
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
         """What happened since the step before, at no time that a step has."""
         related: dict[Related | None, list[Event]] = {}
         for event in outcome.early:
             if isinstance(event, (Sent, Published, Dropped)):
-                related.setdefault(self._related(event), []).append(event)
+                related.setdefault(self.teller.related(event), []).append(event)
         for place, events in related.items():
-            message = f"before this step, {self._first_of(events)}; no step expects it"
+            message = f"before this step, {self.teller.first_of(events)}; no step expects it"
             yield Failure(outcome.step.expected.span, message, place)
 
     # what is delivered
@@ -194,11 +93,11 @@ class Comparison:
                 if not explained:
                     yield self._missing(target, deliveries[0].span, outcome)
             elif not deliveries:
-                message = f"{self._first_of(events)}; it is not expected"
-                yield Failure(outcome.step.expected.span, message, self._related(events[0]))
+                message = f"{self.teller.first_of(events)}; it is not expected"
+                yield Failure(outcome.step.expected.span, message, self.teller.related(events[0]))
             elif len(deliveries) != len(events):
-                message = f"{len(events)} for {target}, not {len(deliveries)}: {self._first_of(events)}"
-                yield Failure(deliveries[0].span, message, self._related(events[-1]))
+                message = f"{len(events)} for {target}, not {len(deliveries)}: {self.teller.first_of(events)}"
+                yield Failure(deliveries[0].span, message, self.teller.related(events[-1]))
             else:
                 for delivery, event in zip(deliveries, events, strict=True):
                     yield from self._differences(delivery, event, outcome)
@@ -207,8 +106,8 @@ class Comparison:
         """With what became of the message instead, where there is an event of it."""
         for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
-                why = f"it was dropped as {event.reason}{_in_brackets(event.detail)}"
-                return Failure(span, f"nothing for {target}: {why}", self._related(event))
+                why = f"it was dropped as {event.reason}{in_brackets(event.detail)}"
+                return Failure(span, f"nothing for {target}: {why}", self.teller.related(event))
             if isinstance(event, Filtered) and event.target == target:
                 condition = self._index.condition(event.route, target)
                 return Failure(span, f"nothing for {target}: it was withheld", condition)
@@ -225,12 +124,12 @@ class Comparison:
             trims = self._table.endpoints[event.target].trim_trailing_zeros
             wholes = [restored(data) for _, data in outcome.given]
             if event.data not in [trimmed(whole) if trims else whole for whole in wholes]:
-                message = f"{self._described(event)}, not what was given"
-                yield Failure(expected.span, message, self._related(event))
+                message = f"{self.teller.described(event)}, not what was given"
+                yield Failure(expected.span, message, self.teller.related(event))
         elif expected.data is not None:
             if event.data != expected.data:
                 message = f"{event.target} gets the bytes {event.data.hex(' ')}, not {expected.data.hex(' ')}"
-                yield Failure(expected.span, message, self._related(event))
+                yield Failure(expected.span, message, self.teller.related(event))
         elif expected.case is not None:
             yield from self._different_payload(expected, expected.case.name, event, outcome)
 
@@ -238,10 +137,10 @@ class Comparison:
         try:
             decoded = self._wire.decode(event.data)
         except DecodeError as error:
-            yield Failure(expected.span, f"{event.target} gets no envelope: {error}", self._related(event))
+            yield Failure(expected.span, f"{event.target} gets no envelope: {error}", self.teller.related(event))
             return
         if decoded.case.name != case:
-            yield Failure(expected.span, f"{self._described(event)}, not {case}", self._related(event))
+            yield Failure(expected.span, f"{self.teller.described(event)}, not {case}", self.teller.related(event))
         elif expected.fields is not None:
             now = outcome.given_at(event.at)
             for difference in expected.fields.differences((), decoded.case.type, decoded.message, now):
@@ -250,8 +149,8 @@ class Comparison:
     def _different_field(self, difference: Difference, event: Sent | Published) -> Failure:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
         field = self._index.field(event.route, event.target, difference.path) if is_mapped else None
-        message = f"{_when(event)}{event.target}: {difference}"
-        return Failure(difference.span, message, field or self._related(event), is_of_field=True)
+        message = f"{when(event)}{event.target}: {difference}"
+        return Failure(difference.span, message, field or self.teller.related(event), is_of_field=True)
 
     # what is not delivered
 
@@ -272,7 +171,7 @@ class Comparison:
             if counts != Counter(wanted.value) and not is_reported:
                 detail = next((f" ({event.detail})" for event in dropped if event.detail), "")
                 message = f"dropped for {target}: {_listed(counts)}, not {_listed(wanted.value)}{detail}"
-                related = self._related(dropped[0]) if dropped else self._of_name(target, outcome)
+                related = self.teller.related(dropped[0]) if dropped else self._of_name(target, outcome)
                 yield Failure(wanted.span, message, related)
 
     # places and words
@@ -281,58 +180,12 @@ class Comparison:
         """Where the table should have delivered what was given to a target that got nothing of it."""
         return self._index.of_name(target, (each.route for each in outcome.events if isinstance(each, Received)))
 
-    def _related(self, event: Event) -> Related | None:
-        match event:
-            case Sent(by_deadman=True) | DeadmanChanged():
-                return self._index.deadman(event.route)
-            case Filtered():
-                return self._index.condition(event.route, event.target)
-            case Sent() | Published() | Dropped() | Collected():
-                return self._index.target(event.route, event.target)
-        return None
-
-    def _first_of(self, events: Sequence[Event]) -> str:
-        more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
-        return self._described(events[0]) + more
-
-    def _described(self, event: Event) -> str:
-        """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
-        when = _when(event)
-        match event:
-            case Sent():
-                by = f" by the deadman of {event.route}" if event.by_deadman else ""
-                return f"{when}{self._datagram(event.data)} is sent to {event.target}{by}"
-            case Published():
-                kind = self._index.type(event.route, event.target)
-                inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
-                return f"{when}{inside} is published on {event.target}"
-            case Dropped():
-                return f"{when}{event.target} misses one as {event.reason}{_in_brackets(event.detail)}"
-            case Filtered():
-                return f"{when}{event.route} withholds one from {event.target}"
-            case Collected():
-                return f"{when}{event.target} waits for the rest of its frame"
-            case Received():
-                return f"{when}{event.route} takes a message from {event.source}"
-            case Rejected():
-                return f"{when}{event.listener} rejects a datagram as {event.reason}{_in_brackets(event.detail)}"
-            case DeadmanChanged():
-                return f"{when}the deadman of {event.route} {'trips' if event.active else 'is released'}"
-        raise AssertionError(event)
-
-    def _datagram(self, data: bytes) -> str:
-        try:
-            decoded = self._wire.decode(data)
-        except DecodeError:
-            return data.hex(" ")
-        return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
-
 
 def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
     came = Counter(event.reason for event in events)
     wanted = expected.rejected or Located({}, expected.span)
     if came != Counter(wanted.value):
-        detail = _in_brackets(events[0].detail) if events else ""
+        detail = in_brackets(events[0].detail) if events else ""
         message = f"rejected: {_listed(came)}, not {_listed(wanted.value)}{detail}"
         yield Failure(wanted.span, message)
 
@@ -349,21 +202,6 @@ def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
     if expected.filtered is not None and came != Counter(expected.filtered.value):
         message = f"withheld from: {_listed(came)}, not {_listed(expected.filtered.value)}"
         yield Failure(expected.filtered.span, message)
-
-
-def _what(event: Event) -> tuple[object, ...]:
-    """The same of events that only time and content tell apart."""
-    names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
-    return type(event), *names
-
-
-def _in_brackets(detail: str) -> str:
-    return f" ({detail})" if detail else ""
-
-
-def _when(event: Event) -> str:
-    """`at 500 ms `, nothing at the beginning of the test."""
-    return f"at {offset(event.at - START)} " if event.at != START else ""
 
 
 def _listed(counts: Counts) -> str:

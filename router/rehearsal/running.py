@@ -63,7 +63,8 @@ def _run(
             coverage.record(outcome)
         if failures := list(comparison.failures(outcome)):
             is_of_fields = all(failure.is_of_field for failure in failures)
-            result.failed.append(FailedStep(failures, [] if is_of_fields else comparison.told(outcome)))
+            happened = () if is_of_fields else (*outcome.early, *outcome.events)
+            result.failed.append(FailedStep(failures, comparison.teller.lines(happened)))
     return result
 
 

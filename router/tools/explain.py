@@ -20,9 +20,9 @@ from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
 from router.errors import StartError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
-from router.rehearsal.cdr import deserialize
 from router.rehearsal.fields import shown
-from router.rehearsal.rehearsal import Collected, Dropped, Filtered, Published, Rehearsal, Sent
+from router.rehearsal.rehearsal import Received, Rehearsal
+from router.rehearsal.telling import Teller
 from router.ros.environment import check_environment, ros_remedy
 from router.table.keys import flat, phrases
 from router.table.model import (
@@ -82,7 +82,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
             yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
 
 
-def tried_route(checked: CheckedRoute, program: Program, words: Sequence[str]) -> Iterator[str]:
+def tried_route(checked: CheckedRoute, everything: Checked, program: Program, words: Sequence[str]) -> Iterator[str]:
     """What becomes of one payload with these `field=value` words from the first source, on a router that just started.
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
@@ -95,22 +95,10 @@ def tried_route(checked: CheckedRoute, program: Program, words: Sequence[str]) -
     listener = endpoint.listener.value if endpoint and endpoint.listener else next(iter(table.listeners))
     rehearsal = Rehearsal(program)
     rehearsal.datagram(listener, origin(source if endpoint else LOOPBACK, table), wire.encode(case, message))
-    types = {served.label: served.type for served in checked.targets}
     yield ""
     yield f"  given {shown(case.type, message)} from {source}:"
-    for event in rehearsal.events:
-        match event:
-            case Sent(target=target, data=data):
-                sent = wire.decode(data)
-                yield f"    {target} gets {sent.case.name} {shown(sent.case.type, sent.message)}"
-            case Published(target=target, data=data) if (kind := types[target]) is not None:
-                yield f"    {target} gets {shown(kind, deserialize(kind, data))}"
-            case Dropped(target=target, reason=reason, detail=detail):
-                yield f"    {target} gets nothing: {reason}{f', {detail}' if detail else ''}"
-            case Filtered(target=target):
-                yield f"    {target} gets nothing: `when` withholds it"
-            case Collected(target=target):
-                yield f"    {target} waits for the rest of the frame"
+    happened = [event for event in rehearsal.events if not isinstance(event, Received)]
+    yield from (f"    {line}" for line in Teller(everything, program).lines(happened))
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:

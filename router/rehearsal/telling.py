@@ -1,0 +1,185 @@
+"""What happened in a rehearsal in words, and where the table says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+from router.compiler import Checked
+from router.compiler.checked import CheckedTarget
+from router.compiler.plan import Each, Items, Leaf, Plan, Record
+from router.compiler.program import Program
+from router.datagrams import Wire
+from router.errors import DecodeError, SourceSpan
+from router.rehearsal import cdr
+from router.rehearsal.fields import Path, offset, path_text, shown
+from router.rehearsal.rehearsal import (
+    START,
+    Collected,
+    DeadmanChanged,
+    Dropped,
+    Event,
+    Filtered,
+    Published,
+    Received,
+    Rejected,
+    Sent,
+)
+from router.types.model import MessageType
+
+_MOST_LINES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Related:
+    """A stretch of the table, and what it has to do with a failure."""
+
+    span: SourceSpan
+    note: str
+
+
+class TableIndex:
+    """Finds the places of a table by route and target, as events name them."""
+
+    def __init__(self, checked: Checked) -> None:
+        self._routes = {route.route.name: route for route in checked.routes}
+        self._targets: dict[tuple[str, str], list[CheckedTarget]] = {}
+        for route in checked.routes:
+            for target in (
+                *route.targets,
+                *(target for subscription in route.subscriptions for target in subscription.targets),
+            ):
+                self._targets.setdefault((route.route.name, target.label), []).append(target)
+
+    def target(self, route: str, target: str, note: str = "the target") -> Related | None:
+        found = self._targets.get((route, target))
+        return Related(found[0].span, note) if found else None
+
+    def type(self, route: str, topic: str) -> MessageType | None:
+        """Of a topic that a route publishes on."""
+        return next((found.type for found in self._targets.get((route, topic), ())), None)
+
+    def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
+        """The target of this name in one of the `routes` that took a message, or else in any."""
+        taken = [name for name in routes if name in self._routes]
+        found = next((found for name in taken if (found := self.target(name, target))), None)
+        if found is None and taken:
+            found = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
+        return found or next((self.target(*key) for key in self._targets if key[1] == target), None)
+
+    def condition(self, route: str, target: str) -> Related | None:
+        for found in self._targets.get((route, target), ()):
+            if found.when is not None:
+                return Related(found.when.span, "withheld by this condition")
+        return self.target(route, target)
+
+    def deadman(self, route: str) -> Related | None:
+        deadman = self._routes[route].route.deadman if route in self._routes else None
+        return Related(deadman.span, "sent by this deadman") if deadman else None
+
+    def field(self, route: str, target: str, path: Path) -> Related | None:
+        """What fills a field, or else the target that leaves it at its default."""
+        for found in self._targets.get((route, target), ()):
+            if found.plan is None:
+                return Related(found.span, "forwarded here")
+            if (span := _filled(found.plan, path)) is not None:
+                return Related(span, f"what fills {path_text(path)}")
+        return self.target(route, target, "nothing here fills it")
+
+
+def _filled(plan: Plan, path: Path) -> SourceSpan | None:
+    match plan:
+        case Leaf() | Each():
+            return plan.span
+        case Record():
+            inner = next((made for field, made in plan.members if path and field.name == path[0]), None)
+            if inner is None:
+                return plan.span if not path else None
+            return _filled(inner, path[1:])
+        case Items():
+            if path and isinstance(path[0], int) and path[0] < len(plan.items):
+                return _filled(plan.items[path[0]], path[1:])
+            return plan.span
+    return None
+
+
+class Teller:
+    """Tells what happened to messages of one table. `index` finds its places."""
+
+    def __init__(self, checked: Checked, program: Program) -> None:
+        self.index = TableIndex(checked)
+        self._wire = Wire(program.envelope)
+
+    def lines(self, events: Iterable[Event]) -> list[str]:
+        """Everything that happened, in order, each with its place in the table."""
+        lines = []
+        for _, same in groupby(events, _what):
+            alike = [*same]
+            line, place = self.first_of(alike), self.related(alike[0])
+            if place is not None and place.span.file not in line:  # as it is where an expression has no value
+                line += f" ({place.span})"
+            lines.append(line)
+        more = [f"and {len(lines) - _MOST_LINES} lines more"] if len(lines) > _MOST_LINES else []
+        return lines[:_MOST_LINES] + more
+
+    def related(self, event: Event) -> Related | None:
+        match event:
+            case Sent(by_deadman=True) | DeadmanChanged():
+                return self.index.deadman(event.route)
+            case Filtered():
+                return self.index.condition(event.route, event.target)
+            case Sent() | Published() | Dropped() | Collected():
+                return self.index.target(event.route, event.target)
+        return None
+
+    def first_of(self, events: Sequence[Event]) -> str:
+        more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
+        return self.described(events[0]) + more
+
+    def described(self, event: Event) -> str:
+        """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
+        at = when(event)
+        match event:
+            case Sent():
+                by = f" by the deadman of {event.route}" if event.by_deadman else ""
+                return f"{at}{self._datagram(event.data)} is sent to {event.target}{by}"
+            case Published():
+                kind = self.index.type(event.route, event.target)
+                inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
+                return f"{at}{inside} is published on {event.target}"
+            case Dropped():
+                return f"{at}{event.target} misses one as {event.reason}{in_brackets(event.detail)}"
+            case Filtered():
+                return f"{at}{event.route} withholds one from {event.target}"
+            case Collected():
+                return f"{at}{event.target} waits for the rest of its frame"
+            case Received():
+                return f"{at}{event.route} takes a message from {event.source}"
+            case Rejected():
+                return f"{at}{event.listener} rejects a datagram as {event.reason}{in_brackets(event.detail)}"
+            case DeadmanChanged():
+                return f"{at}the deadman of {event.route} {'trips' if event.active else 'is released'}"
+        raise AssertionError(event)
+
+    def _datagram(self, data: bytes) -> str:
+        try:
+            decoded = self._wire.decode(data)
+        except DecodeError:
+            return data.hex(" ")
+        return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
+
+
+def _what(event: Event) -> tuple[object, ...]:
+    """The same of events that only time and content tell apart."""
+    names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
+    return type(event), *names
+
+
+def in_brackets(detail: str) -> str:
+    return f" ({detail})" if detail else ""
+
+
+def when(event: Event) -> str:
+    """`at 500 ms `, nothing at the beginning of the test."""
+    return f"at {offset(event.at - START)} " if event.at != START else ""
