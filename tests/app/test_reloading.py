@@ -470,16 +470,21 @@ def test_a_stop_leaves_the_deadman_of_a_gateway_that_is_stuck(
     assert left == [["client deadmen"]]
 
 
-@pytest.mark.parametrize("late", ["router.app.counts.Counters.settle", "router.app.router.Router._watch"])
+@pytest.mark.parametrize("late", ["settle", "replaced"])
 def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
     site: Site, monkeypatch: pytest.MonkeyPatch, late: str
 ) -> None:
+    """Neither a failure of what follows the adoption, nor one of who is told of it."""
+
     def fail(*_: object) -> None:
         raise LookupError("a bug")
 
     with capture_logs() as logged, site.router(PH) as router:
         site.write(PH + turns("1h"))
-        monkeypatch.setattr(late, fail)
+        if late == "settle":
+            monkeypatch.setattr("router.app.counts.Counters.settle", fail)
+        else:
+            monkeypatch.setattr(router._reloader, "_replaced", fail)
         assert router.reload() == (True, ANY, "route manual_drive added")
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE
