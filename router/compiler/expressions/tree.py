@@ -248,16 +248,6 @@ def _nodes_of(value: object) -> Iterator[Node]:
             yield from _nodes_of(each)
 
 
-def paths_in(node: Node) -> Iterator[Path]:
-    """The paths of the fields that an expression reads, each as far as names lead: `a.b` alone for `a.b`."""
-    path = path_of(node)
-    if path is not None:
-        yield path
-        return
-    for part in parts_of(node):
-        yield from paths_in(part)
-
-
 CHECKS = ("fit", "fit_text", "octets", "named", "member")
 """Functions that `conversion` puts around a value, and that tables cannot call:
 
