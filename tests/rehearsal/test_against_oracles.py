@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from struct import pack
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
@@ -190,6 +191,8 @@ NUMBERS = st.integers(0, len(SETTINGS) - 1)
 AGES = st.one_of(st.just(0), st.integers(0, 400 * MS), st.sampled_from([(TTL + d) * MS for d in (-1, 0, 1)]))
 STEPS = st.one_of(st.integers(0, 30 * MS), st.integers(0, 1200 * MS), st.sampled_from((20 * MS, 50 * MS, 300 * MS)))
 AHEAD = st.one_of(st.integers(-600 * MS, 600 * MS), st.sampled_from((0, 3 * MS, 3600 * 1000 * MS)))
+CASES = ("telemetry", "bulk", "drive", "telemetry", "drive", "arm")
+TIMES, COUNTS = (1, 1, 2, 5, 20), (1, 2, 2, 3, 3, 3)
 SIZES = st.one_of(st.integers(0, 40), st.integers(0, 1500), st.sampled_from((0, 15_000)))
 
 
@@ -221,83 +224,66 @@ def envelope(case: str, **payload: object) -> bytes:
     return data
 
 
-class Tables(RuleBasedStateMachine):
-    @initialize(number=NUMBERS)
-    def start(self, number: int) -> None:
-        self.setting = SETTINGS[number]
-        self.program = checked(self.setting).program
+class Both:
+    """A stage and its model, which are given the same."""
+
+    def __init__(self, setting: Setting) -> None:
+        self.setting, self.program = setting, checked(setting).program
         assert self.program is not None
-        self.stage, self.model = Rehearsal(self.program), Model(self.setting.model(), START)
-        self.count = 0
+        self.stage, self.model = Rehearsal(self.program), Model(setting.model(), START)
+        self._count = 0
 
-    def next_number(self, sign: int) -> int:
+    def _next_number(self, sign: int = 1) -> int:
         """One that no other message has."""
-        self.count += 1
-        return sign * self.count
+        self._count += 1
+        return sign * self._count
 
-    @rule(
-        case=st.sampled_from(("telemetry", "bulk", "drive", "telemetry", "drive", "arm")),
-        age=AGES,
-        sign=st.sampled_from((1, 1, -1)),
-        size=SIZES,
-        times=st.sampled_from((1, 1, 2, 5, 20)),
-    )
+    def _wall(self, age: int) -> int:
+        return self.stage.now + self.stage.ahead - age
+
     def receive(self, case: str, age: int, sign: int, size: int, times: int) -> None:
-        arrived = self.stage.now + self.stage.ahead - age
         if case in {"drive", "arm"}:
             size = min(size, MOST_TO_BOARD)
         for _ in range(times):
-            number = self.next_number(sign)
+            number = self._next_number(sign)
             data = envelope(case, number=number, filling=bytes(size))
-            self.stage.datagram("here", PEERS.get(case, OPERATOR), data, arrived)
-            self.model.datagram(case, data, number, arrived, {"latest": b"\0\1\0\0" + pack("<i", number)})
+            self.stage.datagram("here", PEERS.get(case, OPERATOR), data, self._wall(age))
+            self.model.datagram(case, data, number, self._wall(age), {"latest": b"\0\1\0\0" + pack("<i", number)})
         self.compare()
 
-    @rule(
-        frame=st.integers(1, 5),
-        count=st.sampled_from((1, 2, 2, 3, 3, 3)),
-        places=st.lists(st.integers(0, 2), min_size=1, max_size=4) | st.just([-1]) | st.permutations(range(3)),
-        age=AGES,
-    )
-    def receive_parts(self, frame: int, count: int, places: list[int], age: int) -> None:
-        arrived = self.stage.now + self.stage.ahead - age
+    def receive_parts(self, frame: int, count: int, places: Sequence[int], age: int) -> None:
         for place in places:
-            name = f"{self.next_number(1)}"
+            name = f"{self._next_number()}"
             data = envelope("part", frame=frame, count=count, place=place, name=name)
-            self.stage.datagram("here", OPERATOR, data, arrived)
-            self.model.part("part", Part(frame, count, place, name.encode()), arrived)
+            self.stage.datagram("here", OPERATOR, data, self._wall(age))
+            self.model.part("part", Part(frame, count, place, name.encode()), self._wall(age))
         self.compare()
 
-    @rule(age=AGES, times=st.sampled_from((1, 1, 3)))
     def take_from_ros(self, age: int, times: int) -> None:
-        sent = self.stage.now + self.stage.ahead - age
         for _ in range(times):
-            number = self.next_number(1)
-            self.stage.ros("orders", b"\0\1\0\0" + pack("<i", number), sent)
-            self.model.ros("orders", envelope("orders", number=number), number, sent)
+            number = self._next_number()
+            self.stage.ros("orders", b"\0\1\0\0" + pack("<i", number), self._wall(age))
+            self.model.ros("orders", envelope("orders", number=number), number, self._wall(age))
         self.compare()
 
-    @rule(ns=STEPS)
     def pass_time(self, ns: int) -> None:
         for each in (self.stage, self.model):
             each.advance(each.now + ns)
         self.compare()
 
-    @rule(ahead=AHEAD)
     def set_clock(self, ahead: int) -> None:
         self.stage.set_clock(ahead)
         self.model.ahead = ahead
 
-    @rule(number=NUMBERS)
     def reload(self, number: int) -> None:
-        self.adopt(SETTINGS[number])
+        self._adopt(SETTINGS[number])
 
-    @rule(name=st.sampled_from(sorted(CHOICES)), choice=st.integers(0, 6))
-    def reload_with_one_change(self, name: str, choice: int) -> None:
+    def change(self, name: str, choice: int) -> None:
+        """A reload that changes one thing."""
         choices = CHOICES[name]
-        self.adopt(replace(self.setting, **{name: choices[choice % len(choices)]}))
+        self._adopt(replace(self.setting, **{name: choices[choice % len(choices)]}))
 
-    def adopt(self, setting: Setting) -> None:
+    def _adopt(self, setting: Setting) -> None:
         assert self.program is not None
         self.setting, self.program = setting, checked(setting).program_in(self.program.counters.continued())
         assert self.program is not None
@@ -305,12 +291,11 @@ class Tables(RuleBasedStateMachine):
         self.model.reload(setting.model())
         self.compare()
 
-    @rule()
     def restart(self) -> None:
         self.stage.restart()
         self.model = Model(self.setting.model(), START)
 
-    def teardown(self) -> None:
+    def close(self) -> None:
         self.stage.close()
         self.model.close()
         self.compare()
@@ -323,6 +308,88 @@ class Tables(RuleBasedStateMachine):
         assert changes == self.model.changes
         for events in (self.stage.events, self.model.happened, self.model.changes):
             events.clear()
+
+
+class Tables(RuleBasedStateMachine):
+    @initialize(number=NUMBERS)
+    def start(self, number: int) -> None:
+        self.both = Both(SETTINGS[number])
+
+    @rule(
+        case=st.sampled_from(CASES), age=AGES, sign=st.sampled_from((1, -1)), size=SIZES, times=st.sampled_from(TIMES)
+    )
+    def receive(self, case: str, age: int, sign: int, size: int, times: int) -> None:
+        self.both.receive(case, age, sign, size, times)
+
+    @rule(frame=st.integers(1, 5), count=st.sampled_from(COUNTS), places=st.lists(st.integers(-1, 2)), age=AGES)
+    def receive_parts(self, frame: int, count: int, places: list[int], age: int) -> None:
+        self.both.receive_parts(frame, count, places, age)
+
+    @rule(age=AGES, times=st.integers(1, 3))
+    def take_from_ros(self, age: int, times: int) -> None:
+        self.both.take_from_ros(age, times)
+
+    @rule(ns=STEPS)
+    def pass_time(self, ns: int) -> None:
+        self.both.pass_time(ns)
+
+    @rule(ahead=AHEAD)
+    def set_clock(self, ahead: int) -> None:
+        self.both.set_clock(ahead)
+
+    @rule(number=NUMBERS)
+    def reload(self, number: int) -> None:
+        self.both.reload(number)
+
+    @rule(name=st.sampled_from(sorted(CHOICES)), choice=st.integers(0, 6))
+    def change(self, name: str, choice: int) -> None:
+        self.both.change(name, choice)
+
+    @rule()
+    def restart(self) -> None:
+        self.both.restart()
+
+    def teardown(self) -> None:
+        self.both.close()
+
+
+TestTables = Tables.TestCase
+TestTables.settings = settings(max_examples=25, stateful_step_count=40, deadline=None)
+
+
+def step_of(both: Both, noise: random.Random) -> None:
+    """One as a busy rover has them; Hypothesis has few of those that a limit takes."""
+    age = noise.choice((0, 0, noise.randrange(400 * MS), (TTL + noise.choice((-1, 0, 1))) * MS))
+    match noise.choices(range(7), (35, 15, 10, 30, 1, 3, 5))[0]:
+        case 0:
+            size = noise.choice((noise.randrange(41), noise.randrange(1500), 0, 15_000))
+            both.receive(noise.choice(CASES), age, noise.choice((1, 1, -1)), size, noise.choice(TIMES))
+        case 1:
+            places = noise.choice(([-1], [0, 1, 2], [noise.randrange(3)], [noise.randrange(3) for _ in range(4)]))
+            both.receive_parts(noise.randint(1, 5), noise.choice(COUNTS), places, age)
+        case 2:
+            both.take_from_ros(age, noise.choice((1, 1, 3)))
+        case 3:
+            both.pass_time(noise.choice((noise.randrange(30 * MS), noise.randrange(1200 * MS), 20 * MS, 50 * MS)))
+        case 4:
+            both.set_clock(noise.choice((noise.randrange(-600 * MS, 600 * MS), 0, 3 * MS, 3600 * 1000 * MS)))
+        case 5:
+            both.reload(noise.randrange(len(SETTINGS)))
+        case 6:
+            both.change(noise.choice(sorted(CHOICES)), noise.randrange(7))
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(1500, marks=pytest.mark.slow)])
+def test_long_histories_are_as_the_models_say(count: int) -> None:
+    """With one stage: what one leaves behind does not reach the next."""
+    both = Both(SETTINGS[0])
+    for seed in range(count):
+        noise = random.Random(seed)
+        both.restart()
+        both.reload(noise.randrange(len(SETTINGS)))
+        for _ in range(70):
+            step_of(both, noise)
+        both.close()
 
 
 def _by_target(events: Iterable[Happened]) -> dict[tuple[str, str], list[Happened]]:
@@ -354,7 +421,3 @@ def _content(event: Published) -> bytes:
     (target,) = [each for route in checked(SETTINGS[0]).routes for each in route.targets if each.label == "frames"]
     assert target.type is not None
     return b"|".join(each.name.encode() for each in deserialize(target.type, event.data).status)
-
-
-TestTables = Tables.TestCase
-TestTables.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
