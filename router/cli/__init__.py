@@ -226,6 +226,12 @@ def _run(arguments: Sequence[str]) -> int:
         parser.print_help()
         return OK
     try:
+        Path.cwd()
+    except FileNotFoundError:
+        what = f"router {chosen}: the working directory was deleted"
+        print(with_help(what, "change to one that exists"), file=sys.stderr)
+        return BAD_TABLE
+    try:
         code: int = module.run(args)
     except TableError as error:
         from router.cli.findings import print_findings
