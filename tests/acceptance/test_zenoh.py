@@ -203,17 +203,6 @@ def test_rovers_and_operators_find_a_hub_that_comes_back(
         assert now.site.changes(before)[key("messages_published", route="fleet", topic="/drive_motor")] > 0
 
 
-def test_a_second_rover_of_the_same_name_waits_also_behind_the_hub(
-    tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folders = [tmp_path / name for name in ("first", "second")]
-    for folder in folders:
-        folder.mkdir()
-    with fleet.hub(), rover_1(fleet, folders[0], monkeypatch), scene(folders[1], fleet.gateways) as second:
-        wait_until(lambda: bool(second.router.events(WAITS)), "the conflict")
-        assert second.site.samples()['gateway_clients{route="fleet"}'] == 0
-
-
 WAITS = "another gateway has the Zenoh key: this gateway waits until it is free"
 PASSWORD = "fjord-4711"  # noqa: S105 - of nobody
 ENVIRONMENT = {"ZENOH_PASSWORD": PASSWORD}

@@ -131,19 +131,6 @@ def test_an_address_or_interface_that_is_not_there_is_waited_for(
     listener.end_input()
 
 
-def test_a_listener_that_is_there_lacks_nothing(stack: ExitStack) -> None:
-    listener = listen(stack)
-    assert (listener.is_waiting, listener.lacks_network(), listener.is_replaceable()) == (False, False, False)
-
-
-def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, peer: socket.socket) -> None:
-    listener = stack.enter_context(closing(Listener(replace(plan(host="0.0.0.0"), interface="lo"))))
-    peer.sendto(b"hello", ("127.0.0.1", listener.address.port))
-    assert listener.socket.recv(100) == b"hello"
-    assert listener.bound_to == f"0.0.0.0:{listener.address.port} on lo"
-    assert not listener.has_lost_interface()
-
-
 def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack) -> None:
     asked = 8 * int(Path("/proc/sys/net/core/rmem_max").read_text())
     with capture_logs() as logged:
