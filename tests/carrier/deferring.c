@@ -94,7 +94,7 @@ static enum publication publish_noted(struct stage *stage, const struct target *
     *why = "refused";
     if (opened->is_given_up) {
         give_up();
-        return LEFT;
+        return ABANDONED;
     }
     return note(target, stage->machine.output.data, stage->machine.output.size) ? PUBLISH_FAILED : PUBLISHED;
 }

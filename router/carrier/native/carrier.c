@@ -165,7 +165,7 @@ static void adopt(struct carrier *carrier, const struct change *change) {
     struct timeval turn = {0, TURN_MS * 1000};
     for (uint32_t index = 0; index < change->program->listener_count; index++)
         setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
-    route_by(&carrier->routing, change);
+    routing_adopt(&carrier->routing, change);
     atomic_store(&carrier->adopted, change);
 }
 

@@ -151,7 +151,7 @@ static void publish_waiting(struct rehearsal *rehearsal) {
 
 void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct timer_change *published,
                      const struct ros_topic *topics) {
-    route_by(&rehearsal->routing, change);
+    routing_adopt(&rehearsal->routing, change);
     timers_change(rehearsal->holding, published);
     rehearsal->topics = topics;
 }

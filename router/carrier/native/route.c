@@ -145,7 +145,7 @@ int route_datagram(struct routing *routing, struct received *received) {
     return reason;
 }
 
-void route_by(struct routing *routing, const struct change *change) {
+void routing_adopt(struct routing *routing, const struct change *change) {
     for (uint32_t index = 0; index < change->replaced_count; index++)
         deadman_replace(routing->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
     timers_change(routing->stage.timers, &change->timers);

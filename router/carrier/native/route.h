@@ -48,7 +48,7 @@ enum { ROUTED = -1 };
 int route_datagram(struct routing *routing, struct received *received);
 
 /* Adopt another program between two datagrams: deadmen pass from the earlier one to it, or end. */
-void route_by(struct routing *routing, const struct change *change);
+void routing_adopt(struct routing *routing, const struct change *change);
 
 /* Deliver a message that `route_datagram` has put into the ring. Return false if the thread was abandoned. */
 bool route_to_topics(struct stage *stage, const struct message_record *record);

@@ -7,6 +7,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include "check.h"
 #include "clock.h"
 #include "deadman.h"
 
@@ -33,12 +34,6 @@ static struct deadman *takes_over; /* of another route */
 static _Atomic bool is_done;
 static _Atomic int64_t stale, arrived, brakes;
 static long commands;
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 static struct board open_board(void) {
     struct sockaddr_in address = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};

@@ -7,6 +7,7 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "check.h"
 #include "clock.h"
 #include "defer.h"
 
@@ -31,12 +32,6 @@ static _Atomic bool is_done;
 static _Atomic int64_t offered, refused;
 static long messages;
 static uint8_t *left; /* how often each message has left, by thread and number */
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 /* Under the lock of the timers. Some fail. */
 static int note_sent(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {

@@ -11,6 +11,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include "check.h"
 #include "clock.h"
 
 enum { ROUNDS = 12, PROGRAMS = 24, TOPICS = 2, QUEUE = 1 << 12, ALIVE = 0x600d, NUMBER = 2, SLOTS = 3 };
@@ -58,12 +59,6 @@ static uint32_t latest[TOPICS]; /* numbers that were published; of the thread */
 static _Atomic bool is_stuck, has_ended;
 static _Atomic uint32_t inside;
 static struct publish_thread *left[ROUNDS]; /* by the caller, with what they hold */
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 /* ---- the middleware ---- */
 

@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#include "check.h"
 #include "ring.h"
 
 enum { LONGEST = 40, WORDS_TAKEN = 256 }; /* words of a record; words that are taken at once */
@@ -19,12 +20,6 @@ static struct ring *ring;
 static uint64_t count;
 static uint8_t *dropped, *taken; /* by number: each is written by one thread */
 static _Atomic bool has_ended;
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 static uint64_t filling(uint64_t number, uint64_t word) { return (number + 1) * 0x9e3779b97f4a7c15u + word; }
 

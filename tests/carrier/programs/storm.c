@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include "carrier.h"
+#include "check.h"
 #include "clock.h"
 
 enum {
@@ -66,12 +67,6 @@ static _Atomic uint32_t latest, reader_at, commander_at; /* generations */
 static _Atomic(struct deadman *) acting;
 static _Atomic bool is_quiet, has_ended; /* nobody sends; nobody reads either */
 static uint8_t wanted;
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 /* ---- sockets ---- */
 

@@ -5,6 +5,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#include "check.h"
 #include "clock.h"
 #include "ring.h"
 
@@ -14,12 +15,6 @@ static _Atomic uint64_t asked, answered, has_taken;
 static _Atomic bool has_ended;
 
 static const int64_t PATIENCE_NS = 20000000000;
-
-static void check(bool holds, const char *what) {
-    if (holds) return;
-    printf("failed: %s\n", what);
-    exit(1);
-}
 
 static void await(_Atomic uint64_t *reached, uint64_t value, const char *what) {
     int64_t until = monotonic_ns() + PATIENCE_NS;
