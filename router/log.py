@@ -63,7 +63,7 @@ def configure_log(level: str = "info", *, coloured: bool = False) -> None:
     """Set up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
     on_terminal = sys.stderr.isatty()
     rendering: list[structlog.typing.Processor] = (
-        # A plain traceback, without frames and locals, shows file and line of the route table.
+        # A plain traceback, without frames and locals.
         [
             structlog.dev.ConsoleRenderer(
                 colors=coloured, sort_keys=False, exception_formatter=structlog.dev.plain_traceback

@@ -1,6 +1,6 @@
 """The plan of a message: a tree with its structure that says where the value of each field comes from.
 
-`mapping` makes plans; `lowering` turns them into programs of the machine, `cdr.writing` into code in Python.
+`mapping` makes plans; `lowering` turns them into routines of the machine.
 """
 
 from __future__ import annotations

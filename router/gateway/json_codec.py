@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import orjson
 
-from router.compiler.cdr.primitives import (
+from router.compiler.cdr import (
     CDR_LE,
     HEADER,
     put_length,
@@ -360,7 +360,7 @@ class _Writing:
                     self.write(data, field.type, member if is_bare else member[0], inner)
             case List(element=element):
                 if declared.length is None:
-                    put_length(data, len(value), None)
+                    put_length(data, len(value))
                 if isinstance(element, (MessageType, String)):
                     for each in value:
                         self.write(data, element, each, f"{path}[]")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from router.clock import wall_ns
-from router.compiler.cdr.primitives import HEADER, put_length, put_text
+from router.compiler.cdr import HEADER, put_length, put_text
 from router.compiler.program import GatewayPlan
 from router.log import logger
 from router.observe import health
@@ -219,12 +219,12 @@ def diagnostic_array(stamp: int, node: str, statuses: Iterable[Status]) -> bytes
     every = list(statuses)
     data = bytearray(struct.pack("<iI", stamp // 10**9, stamp % 10**9))
     put_text(data, "")
-    put_length(data, len(every), None)
+    put_length(data, len(every))
     for status in every:
         data.append(status.level)
         for text in (f"{node}: {status.name}", status.message, status.hardware_id):
             put_text(data, text)
-        put_length(data, len(status.values), None)
+        put_length(data, len(status.values))
         for pair in status.values:
             for text in pair:
                 put_text(data, text)

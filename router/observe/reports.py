@@ -42,8 +42,6 @@ class Reporter:
                 detail=report.detail,
             )
             return
-        # A traceback through generated code shows the line of the route table; others show only the router.
-        traceback = report.error if report.reason in ("mapping_error", "non_finite") else None
         event = "message dropped" if report.kind == "drop" else "the deadman could not send"
         detail = {"detail": report.detail} if report.detail else {}
         error = {"error": self._text(report.error, report.target)} if report.error is not None else {}
@@ -51,7 +49,7 @@ class Reporter:
             (report.kind, report.place, report.target, report.reason),
             logger.warning,
             event,
-            traceback,
+            None,
             report.times,
             route=report.place,
             target=report.target,

@@ -1,6 +1,6 @@
-"""ROS messages as CDR bytes and back, one scalar after the other: slow, plain, and apart from the compiler's codec.
+"""ROS messages as CDR bytes and back, one scalar after the other: slow, plain, and apart from what the carrier does.
 
-Plain CDR, little-endian, as rmw_fastrtps writes it. What the generated code writes is thus checked by other code, in
+Plain CDR, little-endian, as rmw_fastrtps writes it. What the carrier writes is thus checked by other code, in
 table tests and in the tests of the router, where this module is the oracle.
 """
 

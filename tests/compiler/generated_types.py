@@ -181,7 +181,7 @@ def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
 
 @cache  # Hypothesis checks each new strategy, which takes longer than to draw from it
 def values(declared: Type) -> st.SearchStrategy[Any]:
-    """Python values of a type; messages are namespaces, as the generated code reads attributes only."""
+    """Python values of a type; messages are namespaces."""
     match declared:
         case Bool():
             return st.booleans()

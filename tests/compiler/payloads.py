@@ -26,7 +26,7 @@ from tests.tables import PROTOS
 
 Wire = tuple[ProtoSchema, Envelope]
 MakeEnvelope = Callable[[Any], bytes]
-"""Takes a message of the source's type. Raises MappingError, or one of MAPPING_FAILURES."""
+"""Takes a message of the source's type. Raises MappingError, or one of FAILURES."""
 
 
 @cache

@@ -37,8 +37,6 @@ from router.compiler.expressions.tree import (
     path_of,
 )
 from router.compiler.mapping import build
-from router.compiler.python import render
-from router.compiler.source import Source
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import (
     SPAN,
@@ -311,13 +309,6 @@ def test_nan_and_inf_fill_floats_and_nothing_else(text: str) -> None:
         target = MessageType("made/msg/One", (Field("it", refused),))
         [found] = build(field_map(it=text), target, scope_of(SOURCE, [MODE]), SPAN).findings
         assert found.hint
-
-
-def test_generated_code_is_told_with_the_names_of_the_language() -> None:
-    node, _ = compiled("[nan if flag else f32, -inf, 1e300]", scope_of(SOURCE))
-    out = Source()
-    out.line(f"return {out.expression(render(node))}", SPAN)
-    assert out.text() == "return ([nan if m.flag else m.f32, -inf, 1e+300])\n"
 
 
 def test_submessages_whose_paths_read_alike_stay_apart() -> None:

@@ -19,7 +19,6 @@ from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import StringKind, TimeKind
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
-from router.compiler.namespace import MAPPING_FAILURES
 from router.errors import Code, MappingError
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import FieldMap
@@ -38,6 +37,7 @@ from tests.compiler.compiling import (
     written,
 )
 from tests.compiler.generated_types import EACH_TYPE, mirror, payload_sources, values
+from tests.compiler.machine import FAILURES
 from tests.compiler.payloads import (
     Wire,
     as_ros,
@@ -175,7 +175,7 @@ def test_a_field_wins_over_the_name_of_an_enum_value() -> None:
 @pytest.mark.parametrize(("case", "name", "value"), [("scalars", "rock", "ROCK_RED"), ("many", "rocks", ("ROCK_RED",))])
 def test_an_unknown_name_is_refused_when_it_comes(case: str, name: str, value: object) -> None:
     type_: Type = String() if isinstance(value, str) else List(String())
-    with pytest.raises(MAPPING_FAILURES):
+    with pytest.raises(FAILURES):
         made(case, AUTO, **{name: (type_, value)})
 
 
@@ -319,7 +319,7 @@ def test_random_mappings_make_the_envelopes_of_the_reference(data: st.DataObject
     assume(not findings_of(AUTO, case.type, scope_of(source, tuple(wire[0].enums.values()))))
     message = data.draw(values(mirror(source)))
     made = outcome(lambda: compiled_envelope(wire, case, AUTO, source)(message))
-    event("refused" if made is MAPPING_FAILURES else "sent")
+    event("refused" if made is FAILURES else "sent")
     expected = outcome(lambda: reference_envelope(wire, case, AUTO, source)(message))
     assert canonical(wire, made) == canonical(wire, expected)
 

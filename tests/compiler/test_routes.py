@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ast
-
 import pytest
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedSubscription, CheckedTarget
+from router.compiler.expressions.tree import Node, Read, Variable
 from router.compiler.plan import Leaf, Record
-from router.compiler.python import render
 from router.errors import Code, Diagnostic, Severity
 from router.table.model import OnLimit, Priority
 from tests.compiler.conftest import CheckText
@@ -93,11 +91,19 @@ def objects(fields: str, when: str = "'true'", to_when: str = "'true'") -> str:
     return OBJECTS.format(fields=fields, when=when, to_when=to_when)
 
 
+def shown(node: Node) -> str:
+    """A variable, or a field of one."""
+    if isinstance(node, Read):
+        return f"{shown(node.holder)}.{node.field.name}"
+    assert isinstance(node, Variable)
+    return node.name
+
+
 def source_of(plan: Record, name: str) -> str:
-    """What fills a field, as code."""
+    """What fills a field."""
     made = next(inner for member, inner in plan.members if member.name == name)
     assert isinstance(made, Leaf)
-    return ast.unparse(render(made.node))
+    return shown(made.node)
 
 
 def plan_of(feed: CheckedSubscription) -> Record:
@@ -110,7 +116,7 @@ def test_element_index_and_count_are_visible_beside_the_fields_of_the_message(ch
     fields = "{frame_id: frame_id, total_count: count, index: index, confidence: item.confidence}"
     plan = plan_of(only_feed(check_text(objects(fields, "item.id > 0", "index < count"))))
     assert [source_of(plan, name) for name in ("frame_id", "total_count", "index", "confidence")] == [
-        "m.frame_id",
+        "message.frame_id",
         "count",
         "index",
         "item.confidence",
@@ -132,7 +138,7 @@ def test_names_of_for_each_win_over_fields_which_the_message_still_reaches(check
         destinations: [base]
     """
     plan = plan_of(only_feed(check_text(routes)))
-    assert (source_of(plan, "index"), source_of(plan, "id")) == ("index", "m.index")
+    assert (source_of(plan, "index"), source_of(plan, "id")) == ("index", "message.index")
 
 
 def test_list_itself_does_not_see_its_elements(check_text: CheckText) -> None:

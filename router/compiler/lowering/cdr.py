@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import starmap
 
-from router.compiler.cdr.constants import NO_FIELDS, known_default, known_length, known_value
-from router.compiler.cdr.primitives import HEADER
+from router.compiler.cdr import HEADER, NO_FIELDS, known_default, known_length, known_value
 from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
