@@ -86,15 +86,6 @@ def test_one_that_may_pass_by_itself_takes_the_place_of_one_that_still_waits(hel
     assert held.arrived == [(0, 0), (51 * MS, 2)]
 
 
-def test_what_gets_too_old_while_it_waits_is_dropped_and_takes_no_place(held: Held) -> None:
-    held.offer(0, 0)
-    held.offer(10 * MS, 1, expires=50 * MS - 1)
-    held.serve(50 * MS)
-    assert held.counted()["stale"] == 1
-    held.offer(50 * MS, 2, expires=50 * MS)
-    assert held.arrived == [(0, 0), (50 * MS, 2)]
-
-
 def test_it_is_not_disturbed_by_being_served_too_early(held: Held) -> None:
     held.deferring.serve()
     held.offer(0, 0)
@@ -117,16 +108,6 @@ def test_at_the_end_what_is_held_goes_ahead_of_its_time_unless_it_is_too_old(
     assert held.arrived == [(20 * MS * number, number) for number in arrived]
     assert held.deferring.next_due is None
     assert held.counted().get("stale", 0) == 2 - len(arrived)
-
-
-def test_after_the_end_everything_passes_at_once(held: Held) -> None:
-    """A thread may still serve messages by the program that had the target."""
-    held.offer(0, 0)
-    held.deferring.end(held.target)
-    held.offer(MS, 1)
-    held.offer(2 * MS, 2)
-    assert held.arrived == [(0, 0), (MS, 1), (2 * MS, 2)]
-    assert held.deferring.next_due is None
 
 
 @pytest.mark.parametrize("happens", ["is due", "ends", "gets another rate", "all end"])

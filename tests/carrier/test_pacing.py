@@ -128,14 +128,6 @@ def test_a_thread_that_is_late_by_half_a_burst_costs_nothing(opened: Open) -> No
     assert measured(opened(500_000), 100, 10_000, BULK, late=BURST // 2) >= 0.99 * 10 * 500_000
 
 
-def test_after_a_pause_there_is_no_more_than_a_burst(link: Callable[[int], Link]) -> None:
-    paused = link(100_000)
-    paused.wait(60 * NS)
-    for _ in range(100):
-        paused.offer(TELEMETRY)
-    assert paused.bytes_sent == 100_000 * BURST // NS
-
-
 def test_the_longest_datagram_goes_through_the_smallest_budget_and_pays_before(link: Callable[[int], Link]) -> None:
     slow = link(1000)
     slow.offer(BULK, MAX_DATAGRAM)
@@ -146,35 +138,7 @@ def test_the_longest_datagram_goes_through_the_smallest_budget_and_pays_before(l
     assert 0 < slow.sent[1][0] - slow.sent[0][0] <= BURST
 
 
-def test_what_was_saved_up_for_one_that_was_dropped_is_lost(link: Callable[[int], Link]) -> None:
-    slow = link(10_000)
-    slow.offer(BULK, 30_000, expires=2 * NS)
-    slow.wait(2 * NS + 1)
-    assert slow.fate(0) == "stale"
-    for _ in range(100):
-        slow.offer(TELEMETRY)
-    assert slow.bytes_sent == 10_000 * BURST // NS
-
-
-def test_nothing_is_saved_up_for_what_is_too_old(link: Callable[[int], Link]) -> None:
-    slow = link(10_000)
-    slow.offer(BULK, 30_000, expires=100 * MS)
-    fresh = slow.offer(BULK, 1000)
-    slow.wait(300 * MS)
-    assert (slow.fate(0), slow.fate(fresh)) == ("stale", "sent")
-
-
 # ---- who goes first
-
-
-def test_commands_wait_for_each_other_when_they_are_too_far_ahead(link: Callable[[int], Link]) -> None:
-    """They overdraw the budget by 100 ms of it; the others wait until that is paid."""
-    busy = link(100_000)
-    bulk = [busy.offer(BULK) for _ in range(30)]
-    commands = [busy.offer(COMMAND) for _ in range(200)]
-    assert busy.numbers == bulk[:20] + commands[:101]
-    busy.wait(10 * NS)
-    assert busy.numbers == bulk[:20] + commands + bulk[20:]
 
 
 def test_with_a_small_budget_two_kilobytes_of_commands_go_ahead(link: Callable[[int], Link]) -> None:
@@ -213,21 +177,6 @@ def test_what_waits_for_a_target_that_is_gone_goes_at_once_and_the_rest_stays(li
 
 
 # ---- what is dropped
-
-
-def test_the_oldest_of_the_least_urgent_is_dropped_when_there_is_no_room(link: Callable[[int], Link]) -> None:
-    slow = link(1000)
-    slow.offer(BULK, MAX_DATAGRAM)
-    oldest, newest = slow.offer(BULK, 1000), slow.offer(BULK, 1000)
-    telemetry = [slow.offer(TELEMETRY, 1000) for _ in range(LEAST_ROOM // 1000)]
-    assert slow.fate(oldest) == slow.fate(newest) == "queue_full"
-    assert [slow.fate(number) for number in telemetry] == [None] * len(telemetry)
-
-    late = slow.offer(BULK, 1000)
-    assert slow.fate(late) == "queue_full"
-    slow.offer(TELEMETRY, 1000)
-    assert slow.fate(telemetry[0]) == "queue_full"
-    assert slow.fate(telemetry[1]) is None
 
 
 def test_so_many_tiny_datagrams_may_wait_that_their_number_is_bounded(opened: Open) -> None:
