@@ -1,4 +1,4 @@
-"""Reads what native threads tell: rejected datagrams, lost messages, and what deadmen do."""
+"""Reads the events of native threads: rejected datagrams, lost messages, and what deadmen do."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""UDP: sockets, the receive thread, and what the kernel reports about both."""
+"""UDP: sockets, and what the kernel reports about them."""

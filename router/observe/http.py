@@ -400,7 +400,7 @@ def refusal(peer: str, own: str, headers: Message) -> str | None:
 def is_own_page(headers: Message) -> bool:
     """Return whether a browser asks for a page that came from this server, by an IP address or localhost.
 
-    A name is not believed: it may have been made to lead here only after a page of somebody else was loaded from it.
+    Host names are not trusted: one may lead here only since a page of somebody else was loaded from it (DNS rebinding).
     """
     origins, hosts = headers.get_all("Origin", []), headers.get_all("Host", [])
     is_same = len(hosts) == 1 and _is_plain(hosts[0]) and origins == [f"http://{hosts[0]}"]

@@ -78,8 +78,7 @@ class CountersCollector(Collector):
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
     """Pause every SAMPLES_PER_REST samples, so that a scrape does not hold the interpreter lock for its whole 5 ms.
 
-    A thread that needs the lock then waits for 0.1 ms at most times; without rests it waits a whole switch
-    interval, and the receive thread needs it again after each system call.
+    A thread that needs the lock then mostly waits for 0.1 ms, and without rests for a whole switch interval.
     """
     for number, sample in enumerate(samples, 1):
         if number % SAMPLES_PER_REST == 0:
