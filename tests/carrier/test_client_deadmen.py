@@ -20,8 +20,8 @@ from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from tests.carrier.building import MEMORY, RACES, run_program
-from tests.carrier.commanding import middleware
 from tests.carrier.publishing import Publisher, wait_until
+from tests.carrier.serving_ros import middleware
 
 MS = 1_000_000
 NEVER_MS = 3_600_000

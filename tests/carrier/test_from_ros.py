@@ -18,7 +18,7 @@ from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
-from tests.carrier.commanding import Commanding, Subscription, middleware
+from tests.carrier.serving_ros import ServingRos, Subscription, middleware
 from tests.carrier.staged import START, Staged
 from tests.small_tables import program
 
@@ -84,7 +84,7 @@ def functions(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return middleware(tmp_path_factory.mktemp("middleware") / "middleware.so")
 
 
-Open = Callable[..., Commanding]
+Open = Callable[..., ServingRos]
 
 
 @pytest.fixture
@@ -92,10 +92,10 @@ def opened(library: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iter
     """Opens a table of these routes, and serves it."""
     with ExitStack() as stack:
 
-        def made(routes: str = ROUTES) -> Commanding:
-            commanding = Commanding(library, functions, program(tmp_path, routes), stack)
-            commanding.serve()
-            return commanding
+        def made(routes: str = ROUTES) -> ServingRos:
+            serving = ServingRos(library, functions, program(tmp_path, routes), stack)
+            serving.serve()
+            return serving
 
         yield made
 
@@ -138,35 +138,33 @@ Messages = Mapping[str, list[tuple[Callable[[int], bytes], int]]]
 """By topic: messages made with the wall clock, and how long ago (ns) they were sent."""
 
 
-def compare(commanding: Commanding, messages: Messages) -> None:
+def compare(serving: ServingRos, messages: Messages) -> None:
     """The threads count and send what the stage does."""
-    staged = Staged(commanding.program)
+    staged = Staged(serving.program)
     for topic, sent in messages.items():
         for make, age in sent:
             now = wall_ns()
-            commanding.subscriptions[topic].put(make(now), now - age)
+            serving.subscriptions[topic].put(make(now), now - age)
             staged.stage.message(topic, make(START), START - age)
             last = staged.ledger().total("messages_received")
-        wait_until(lambda: commanding.ledger().total("messages_received") == last)  # noqa: B023 - at once
+        wait_until(lambda: serving.ledger().total("messages_received") == last)  # noqa: B023 - at once
     counted = ("messages_", "datagrams_", "sent_")
-    assert commanding.ledger().counted(*counted) == staged.ledger().counted(*counted)
-    for endpoint, board in commanding.boards.items():
+    assert serving.ledger().counted(*counted) == staged.ledger().counted(*counted)
+    for endpoint, board in serving.boards.items():
         assert board.received() == staged.to(endpoint)
-    assert list(commanding.ledger().imbalances()) == []
-    assert [(route, target) for route, target, *_ in commanding.losses()] == staged.losses
+    assert list(serving.ledger().imbalances()) == []
+    assert [(route, target) for route, target, *_ in serving.losses()] == staged.losses
     topics_of: dict[str, set[str]] = {}
-    for topic, plans in commanding.program.outbound.items():
+    for topic, plans in serving.program.outbound.items():
         for plan in plans:
             topics_of.setdefault(plan.route, set()).add(topic)
     for route, topics in topics_of.items():
         timed = sum(
-            commanding.thread.counters(1 << 16)[
-                commanding.program.counters.index("route_duration_seconds", route) + part
-            ]
+            serving.thread.counters(1 << 16)[serving.program.counters.index("route_duration_seconds", route) + part]
             for part in range(HISTOGRAM_CELLS - 1)
         )
         assert timed == sum(len(sent) for topic, sent in messages.items() if topic in topics)
-        last = commanding.count("route_last_message_timestamp_seconds", route)
+        last = serving.count("route_last_message_timestamp_seconds", route)
         assert abs(wall_ns() - last) < 60 * SECOND if timed else last == 0
 
 
@@ -223,12 +221,12 @@ def test_fields_are_calculated_and_conditions_evaluated(opened: Open) -> None:
 
 
 def test_a_refusal_names_its_place(opened: Open) -> None:
-    commanding = opened(CALCULATED)
-    (feed,) = commanding.program.lowered.from_ros["drive"]
+    serving = opened(CALCULATED)
+    (feed,) = serving.program.lowered.from_ros["drive"]
     for message in (drive(2, 2), drive(2, 0)):
-        commanding.subscriptions["drive"].put(message, wall_ns())
-    wait_until(lambda: commanding.ledger().total("messages_received") == 2)
-    found = [(feed.targets[target].places[place], reason) for _, target, reason, _, place in commanding.refusals()]
+        serving.subscriptions["drive"].put(message, wall_ns())
+    wait_until(lambda: serving.ledger().total("messages_received") == 2)
+    found = [(feed.targets[target].places[place], reason) for _, target, reason, _, place in serving.refusals()]
     (board,) = (place for place, _ in found if "when" in place)
     fields = [place for place, _ in found if place != board]
     assert {reason for _, reason in found} == {0}
@@ -237,19 +235,19 @@ def test_a_refusal_names_its_place(opened: Open) -> None:
 
 
 def test_a_message_that_cannot_be_read_names_its_topic(opened: Open) -> None:
-    commanding = opened(CALCULATED)
-    (feed,) = commanding.program.lowered.from_ros["drive"]
-    commanding.subscriptions["drive"].put(drive(2, 2)[:7], wall_ns())
-    wait_until(lambda: commanding.ledger().total("messages_received") == 1)
-    places = [feed.targets[target].places[place] for _, target, _, _, place in commanding.refusals()]
+    serving = opened(CALCULATED)
+    (feed,) = serving.program.lowered.from_ros["drive"]
+    serving.subscriptions["drive"].put(drive(2, 2)[:7], wall_ns())
+    wait_until(lambda: serving.ledger().total("messages_received") == 1)
+    places = [feed.targets[target].places[place] for _, target, _, _, place in serving.refusals()]
     assert places
     assert all(place.endswith(": a malformed message") for place in places)
 
 
 def test_each_element_is_a_message(opened: Open) -> None:
-    commanding = opened(EACH)
+    serving = opened(EACH)
     compare(
-        commanding,
+        serving,
         {
             "poses": [
                 (lambda now: poses((1, 0), (2, 0), (3, 0), stamp=now), 0),
@@ -262,76 +260,76 @@ def test_each_element_is_a_message(opened: Open) -> None:
             "arm": [(lambda _: arm(4), 0), (lambda _: arm(0), 0), (lambda _: arm(2)[:7], 0)],
         },
     )
-    assert commanding.count("messages_received", "arm_ctrl", "poses") == 3 + 2 + 0 + 1 + 1 + 59
-    assert commanding.count("messages_received", "arm_target", "arm") == 3 + 1 + 1
-    assert commanding.count("messages_dropped", "arm_target", "driving_board", "mapping_error") == 2
+    assert serving.count("messages_received", "arm_ctrl", "poses") == 3 + 2 + 0 + 1 + 1 + 59
+    assert serving.count("messages_received", "arm_target", "arm") == 3 + 1 + 1
+    assert serving.count("messages_dropped", "arm_target", "driving_board", "mapping_error") == 2
 
 
 def test_a_list_that_is_refused_is_reported_with_its_place(opened: Open) -> None:
-    commanding = opened(EACH)
-    commanding.subscriptions["arm"].put(arm(0), wall_ns())
-    wait_until(lambda: commanding.ledger().total("messages_received") == 1)
-    ((route, target, _, topic, place),) = commanding.refusals()
-    (feed,) = commanding.program.lowered.from_ros[topic]
+    serving = opened(EACH)
+    serving.subscriptions["arm"].put(arm(0), wall_ns())
+    wait_until(lambda: serving.ledger().total("messages_received") == 1)
+    ((route, target, _, topic, place),) = serving.refusals()
+    (feed,) = serving.program.lowered.from_ros[topic]
     assert "for_each" in feed.targets[target].places[place]
     assert (route, target) == ("arm_target", "driving_board")
 
 
 def test_a_message_without_times_is_as_old_as_its_receipt(opened: Open) -> None:
-    commanding = opened()
-    commanding.subscriptions["drive"].put(drive(1), 0, 0)
-    commanding.subscriptions["drive"].put(drive(2), 0, wall_ns() - SECOND)
-    commanding.subscriptions["drive"].put(drive(3), wall_ns(), wall_ns() - SECOND)
-    commanding.subscriptions["drive"].put(drive(4), wall_ns() + SECOND, wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 4)
-    assert [of(each) for each in commanding.boards["driving_board"].received()] == [1, 4]
+    serving = opened()
+    serving.subscriptions["drive"].put(drive(1), 0, 0)
+    serving.subscriptions["drive"].put(drive(2), 0, wall_ns() - SECOND)
+    serving.subscriptions["drive"].put(drive(3), wall_ns(), wall_ns() - SECOND)
+    serving.subscriptions["drive"].put(drive(4), wall_ns() + SECOND, wall_ns())
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 4)
+    assert [of(each) for each in serving.boards["driving_board"].received()] == [1, 4]
 
 
 def test_what_cannot_be_sent_is_counted_and_reported(opened: Open) -> None:
-    commanding = opened()
-    commanding.boards["driving_board"].break_down()
-    commanding.subscriptions["drive"].put(drive(1), wall_ns())
-    wait_until(lambda: commanding.count("messages_dropped", "drive_motor", "driving_board", "send_error"))
-    assert commanding.losses() == [("drive_motor", "driving_board", 6, errno.ENOTSOCK)]
-    assert len(commanding.boards["recorder"].received()) == 1
+    serving = opened()
+    serving.boards["driving_board"].break_down()
+    serving.subscriptions["drive"].put(drive(1), wall_ns())
+    wait_until(lambda: serving.count("messages_dropped", "drive_motor", "driving_board", "send_error"))
+    assert serving.losses() == [("drive_motor", "driving_board", 6, errno.ENOTSOCK)]
+    assert len(serving.boards["recorder"].received()) == 1
 
 
 # ---- order
 
 
 def test_commands_leave_in_the_order_in_which_they_came(opened: Open) -> None:
-    commanding = opened()
+    serving = opened()
     for number in range(1, 101):  # more than one turn
-        commanding.subscriptions["drive"].put(drive(number), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 100)
-    sent = [of(each) for each in commanding.boards["driving_board"].received()]
+        serving.subscriptions["drive"].put(drive(number), wall_ns())
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 100)
+    sent = [of(each) for each in serving.boards["driving_board"].received()]
     assert sent == sorted(sent)
     assert sent[-1] == 100
 
 
 def test_a_brake_leaves_behind_the_last_command_and_commands_of_others_disarm_it(opened: Open) -> None:
-    commanding = opened()
-    deadmen = commanding.deadmen.address
-    board = commanding.boards["driving_board"]
-    commanding.subscriptions["drive"].put(drive(1), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.timers_serve(deadmen, boottime_ns() + SECOND)
+    serving = opened()
+    deadmen = serving.deadmen.address
+    board = serving.boards["driving_board"]
+    serving.subscriptions["drive"].put(drive(1), wall_ns())
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive"))
+    serving.library.timers_serve(deadmen, boottime_ns() + SECOND)
     command, brake = board.received()
     assert of(command) == 1
-    assert brake == commanding.program.deadmen[0].datagrams[0][1]
-    commanding.subscriptions["arm"].put(arm(1), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "arm_ctrl", "arm"))
+    assert brake == serving.program.deadmen[0].datagrams[0][1]
+    serving.subscriptions["arm"].put(arm(1), wall_ns())
+    wait_until(lambda: serving.count("messages_received", "arm_ctrl", "arm"))
     assert len(board.received()) == 2
-    commanding.library.timers_serve(deadmen, boottime_ns() + 10 * SECOND)
+    serving.library.timers_serve(deadmen, boottime_ns() + 10 * SECOND)
     assert board.received() == []
 
 
 def test_a_stale_command_feeds_no_deadman(opened: Open) -> None:
-    commanding = opened()
-    commanding.subscriptions["drive"].put(drive(1), wall_ns() - SECOND)
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    commanding.library.timers_serve(commanding.deadmen.address, boottime_ns() + SECOND)
-    assert commanding.boards["driving_board"].received() == []
+    serving = opened()
+    serving.subscriptions["drive"].put(drive(1), wall_ns() - SECOND)
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive"))
+    serving.library.timers_serve(serving.deadmen.address, boottime_ns() + SECOND)
+    assert serving.boards["driving_board"].received() == []
 
 
 # ---- reloads and the stop
@@ -340,89 +338,89 @@ def test_a_stale_command_feeds_no_deadman(opened: Open) -> None:
 def test_a_subscription_that_is_left_is_emptied_before_and_not_used_afterwards(
     opened: Open, functions: ctypes.CDLL
 ) -> None:
-    commanding = opened()
-    earlier = commanding.subscriptions["drive"]
+    serving = opened()
+    earlier = serving.subscriptions["drive"]
     later = Subscription(functions)
     later.put(drive(1), wall_ns())  # which the earlier one has got as well, and served
     earlier.announce_to(None)
     earlier.put(drive(2), wall_ns())
-    commanding.serve({**commanding.subscriptions, "drive": later})
-    assert [of(each) for each in commanding.boards["driving_board"].received()] == [2]
+    serving.serve({**serving.subscriptions, "drive": later})
+    assert [of(each) for each in serving.boards["driving_board"].received()] == [2]
     earlier.put(drive(3), wall_ns())
     later.put(drive(4), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
-    assert [of(each) for each in commanding.boards["driving_board"].received()] == [4]
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 2)
+    assert [of(each) for each in serving.boards["driving_board"].received()] == [4]
 
 
 def test_what_came_before_a_topic_is_served_is_served_then(opened: Open) -> None:
-    commanding = opened()
-    commanding.thread.serve(NativeFromRos())
-    commanding.subscriptions["drive"].put(drive(1), wall_ns())
-    assert commanding.count("messages_received", "drive_motor", "drive") == 0
-    commanding.serve()
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
-    assert len(commanding.boards["driving_board"].received()) == 1
+    serving = opened()
+    serving.thread.serve(NativeFromRos())
+    serving.subscriptions["drive"].put(drive(1), wall_ns())
+    assert serving.count("messages_received", "drive_motor", "drive") == 0
+    serving.serve()
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive"))
+    assert len(serving.boards["driving_board"].received()) == 1
 
 
 def test_a_reload_while_messages_come_loses_none(opened: Open) -> None:
-    commanding = opened()
+    serving = opened()
     for number in range(1, 501):
-        commanding.subscriptions["drive"].put(drive(number), wall_ns())
+        serving.subscriptions["drive"].put(drive(number), wall_ns())
         if number % 10 == 0:
-            commanding.serve()
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 500)
+            serving.serve()
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 500)
 
 
 def test_stopping_serves_what_has_arrived(opened: Open) -> None:
-    commanding = opened()
-    for subscription in commanding.subscriptions.values():
+    serving = opened()
+    for subscription in serving.subscriptions.values():
         subscription.announce_to(None)
-    commanding.subscriptions["drive"].put(drive(1), wall_ns())
-    commanding.subscriptions["arm"].put(arm(1), wall_ns())
-    assert commanding.thread.stop()
-    assert commanding.count("messages_received", "drive_motor", "drive") == 1
-    assert commanding.count("messages_received", "arm_target", "arm") == 1
+    serving.subscriptions["drive"].put(drive(1), wall_ns())
+    serving.subscriptions["arm"].put(arm(1), wall_ns())
+    assert serving.thread.stop()
+    assert serving.count("messages_received", "drive_motor", "drive") == 1
+    assert serving.count("messages_received", "arm_target", "arm") == 1
 
 
 # ---- a middleware that is stuck, and one that refuses
 
 
 def test_a_reload_does_not_wait_for_the_middleware(opened: Open, functions: ctypes.CDLL) -> None:
-    commanding = opened()
-    subscription = commanding.subscriptions["drive"]
+    serving = opened()
+    subscription = serving.subscriptions["drive"]
     subscription.set(is_stuck=True)
     subscription.put(drive(1), wall_ns())
     wait_until(lambda: subscription.is_taken_from)
     with pytest.raises(StuckError):
-        commanding.serve({**commanding.subscriptions, "drive": Subscription(functions)})
+        serving.serve({**serving.subscriptions, "drive": Subscription(functions)})
     subscription.set(is_stuck=False)
     subscription.put(drive(2), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
-    assert of(commanding.boards["driving_board"].received()[-1]) == 2
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 2)
+    assert of(serving.boards["driving_board"].received()[-1]) == 2
 
 
 def test_a_thread_that_is_stuck_is_left_and_sends_nothing_any_more(opened: Open) -> None:
-    commanding = opened()
-    subscription = commanding.subscriptions["drive"]
+    serving = opened()
+    subscription = serving.subscriptions["drive"]
     subscription.set(is_stuck=True)
     subscription.put(drive(1), wall_ns())
     wait_until(lambda: subscription.is_taken_from)
-    assert not commanding.thread.stop()
+    assert not serving.thread.stop()
     subscription.set(is_stuck=False)
     wait_until(lambda: not subscription.is_taken_from)
-    assert commanding.count("messages_received", "drive_motor", "drive") == 0
-    assert commanding.boards["driving_board"].received() == []
+    assert serving.count("messages_received", "drive_motor", "drive") == 0
+    assert serving.boards["driving_board"].received() == []
 
 
 def test_a_middleware_that_refuses_is_counted(opened: Open) -> None:
-    commanding = opened()
-    subscription = commanding.subscriptions["drive"]
+    serving = opened()
+    subscription = serving.subscriptions["drive"]
     subscription.set(refuses=True)
     subscription.put(drive(1), wall_ns())
-    wait_until(lambda: commanding.thread.failures)
+    wait_until(lambda: serving.thread.failures)
     subscription.set(refuses=False)
     subscription.put(drive(2), wall_ns())
-    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
+    wait_until(lambda: serving.count("messages_received", "drive_motor", "drive") == 2)
 
 
 @pytest.mark.parametrize(
@@ -489,43 +487,43 @@ def clocked(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 
 @pytest.fixture
-def timed(clocked: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iterator[tuple[Commanding, Clocks]]:
+def timed(clocked: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iterator[tuple[ServingRos, Clocks]]:
     with ExitStack() as stack:
         clocks = Clocks(clocked)
-        commanding = Commanding(clocked, functions, program(tmp_path, ROUTES), stack)
-        commanding.serve()
-        yield commanding, clocks
+        serving = ServingRos(clocked, functions, program(tmp_path, ROUTES), stack)
+        serving.serve()
+        yield serving, clocks
 
 
-def settle(commanding: Commanding, messages: int) -> None:
-    wait_until(lambda: commanding.ledger().total("messages_received", "drive_motor") == messages)
+def settle(serving: ServingRos, messages: int) -> None:
+    wait_until(lambda: serving.ledger().total("messages_received", "drive_motor") == messages)
 
 
 def test_a_publisher_that_goes_on_is_obeyed_at_once_after_its_clock_was_set_back(
-    timed: tuple[Commanding, Clocks],
+    timed: tuple[ServingRos, Clocks],
 ) -> None:
-    commanding, clocks = timed
-    board, obeyed = commanding.boards["driving_board"], 0
+    serving, clocks = timed
+    board, obeyed = serving.boards["driving_board"], 0
     for number in range(1, 301):
         clocks.pass_time(SECOND // 50)
         if number == 200:
             clocks.ahead -= 3 * SECOND
         clocks.pass_time(0)
-        commanding.subscriptions["drive"].put(drive(number), clocks.wall)
-        settle(commanding, number)
+        serving.subscriptions["drive"].put(drive(number), clocks.wall)
+        settle(serving, number)
         obeyed += len(board.received())
     assert obeyed == 300
 
 
-def test_commands_of_a_stall_stay_stale_whatever_was_done_to_the_clock(timed: tuple[Commanding, Clocks]) -> None:
-    commanding, clocks = timed
-    commanding.subscriptions["drive"].put(drive(1), clocks.wall)
-    settle(commanding, 1)
+def test_commands_of_a_stall_stay_stale_whatever_was_done_to_the_clock(timed: tuple[ServingRos, Clocks]) -> None:
+    serving, clocks = timed
+    serving.subscriptions["drive"].put(drive(1), clocks.wall)
+    settle(serving, 1)
     clocks.pass_time(5 * SECOND)
     stamps = [clocks.wall + age * SECOND // 10 for age in range(20)]
     clocks.ahead -= 3 * SECOND
     clocks.pass_time(3 * SECOND)
     for number, stamp in enumerate(stamps, 2):
-        commanding.subscriptions["drive"].put(drive(number), stamp)
-        settle(commanding, number)
-    assert len(commanding.boards["driving_board"].received()) == 1
+        serving.subscriptions["drive"].put(drive(number), stamp)
+        settle(serving, number)
+    assert len(serving.boards["driving_board"].received()) == 1

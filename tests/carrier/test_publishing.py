@@ -13,8 +13,8 @@ from time import sleep
 import pytest
 
 from tests.carrier.building import MEMORY, RACES, run_program
-from tests.carrier.commanding import middleware
 from tests.carrier.publishing import Publishing, wait_until
+from tests.carrier.serving_ros import middleware
 from tests.carrier.staged import START, Staged
 from tests.small_tables import STRANGER, enveloped, program
 

@@ -1,4 +1,4 @@
-"""A program whose commands from ROS the carrier serves, between a middleware of tests and sockets in memory."""
+"""A program whose messages from ROS the carrier serves, between a middleware of tests and sockets in memory."""
 
 from __future__ import annotations
 
@@ -122,8 +122,8 @@ class Board:
         self._far.close()
 
 
-class Commanding:
-    """The thread with the commands of a program. It serves nothing before `serve`."""
+class ServingRos:
+    """The thread for messages from ROS. It serves nothing before `serve`."""
 
     def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack) -> None:
         self.program = program
