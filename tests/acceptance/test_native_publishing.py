@@ -10,9 +10,8 @@ import struct
 import subprocess
 import sys
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import count
 from pathlib import Path
 from time import sleep, time
@@ -24,11 +23,13 @@ from tests.acceptance.gateway_clients import Dashboard
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import BARE, RouterProcess, Site, balance, site, total, wait_until
 from tests.ports import free_port
+from tests.readable import readable
 from tests.ros import peers
 from tests.ros.peers import Subscriber
 
 FLOAT = "std_msgs/msg/Float32"
 _FLOAT = f"type: {FLOAT}, fields: {{{{data: accel_x}}}}"
+PROBE, LAST_PROBE = -1e9, -2e9
 LATEST = "max_rate: 1000000000 Hz, on_limit: latest"
 """Holds nothing back: no two messages come within 1 ns."""
 
@@ -55,16 +56,26 @@ def taken(subscriber: Subscriber, many: int) -> list[float]:
 
 
 @contextmanager
-def hearing(*topics: str, options: Sequence[str] = ()) -> Iterator[list[Subscriber]]:
-    """A subscriber of each topic; the router has discovered them all by then."""
-    with ExitStack() as closing:
-        opened = [Subscriber(topic, FLOAT, *options) for topic in topics]
+def hearing(place: Site, *topics: str) -> Iterator[list[Subscriber]]:
+    """A subscriber of each topic, which is fed by `imu_info`. The router has discovered them all by then."""
+    with ExitStack() as stack:
+        opened = [Subscriber(topic, FLOAT) for topic in topics]
         for each in opened:
-            closing.callback(each.close)
+            stack.callback(each.close)
         for topic, each in zip(topics, opened, strict=True):
             for _ in range(_PUBLISHERS.get(topic, 1)):
                 assert each.line() == "matched"
-        sleep(1)  # the other side learns of it later
+        before, sent = place.scrape(), 1
+        for each in opened:
+            while not readable(each.process.stdout.fileno(), 0.02):
+                place.send("sensor_board", imu(PROBE))
+                sent += 1
+        place.send("sensor_board", imu(LAST_PROBE))
+        place.settle(before, sent)
+        for each in opened:
+            while next_of(each) != LAST_PROBE:
+                pass
+        place.waiting()
         yield opened
 
 
@@ -133,8 +144,8 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, int
 
 def test_topics_get_all_values_in_order_or_the_latest(beside: tuple[Site, int]) -> None:
     place, _ = beside
-    before = place.scrape()
-    with hearing("beside_a", "beside_b", "beside_latest") as (first, second, latest):
+    with hearing(place, "beside_a", "beside_b", "beside_latest") as (first, second, latest):
+        before = place.scrape()
         for each in range(300):
             place.send("sensor_board", imu(each))
             if each % 10 == 0:
@@ -149,7 +160,7 @@ def test_topics_get_all_values_in_order_or_the_latest(beside: tuple[Site, int]) 
 
 def test_a_topic_of_two_routes_is_in_order(beside: tuple[Site, int]) -> None:
     place, _ = beside
-    with hearing("beside_shared") as (shared,):
+    with hearing(place, "beside_shared") as (shared,):
         for each in range(0, 200, 2):
             place.send("sensor_board", imu(each), gps(each + 1))
             sleep(0.001)
@@ -161,13 +172,14 @@ def test_who_joins_late_gets_the_last_values(beside: tuple[Site, int]) -> None:
     before = place.scrape()
     place.send("sensor_board", *(imu(1000.0 + each) for each in range(20)))
     place.settle(before, 20)
-    with hearing("beside_kept", options=("--transient-local",)) as (late,):
+    with closing(Subscriber("beside_kept", FLOAT, "--transient-local")) as late:
+        assert late.line() == "matched"
         assert taken(late, 5) == [1015.0, 1016.0, 1017.0, 1018.0, 1019.0]
 
 
 def test_a_gateway_publishes_on_the_topic_of_a_route_at_the_same_time(beside: tuple[Site, int]) -> None:
     place, port = beside
-    with hearing("beside_a") as (both,), Dashboard(port) as client:
+    with hearing(place, "beside_a") as (both,), Dashboard(port) as client:
         before = place.scrape()
         with sending(place, imu) as sent:
             for each in range(200):
@@ -194,7 +206,7 @@ def test_a_subscriber_with_a_shared_memory_of_its_own(beside: tuple[Site, int], 
         "PYTHONPATH": os.pathsep.join(sys.path),
     }
     with (
-        hearing("beside_a") as (near,),
+        hearing(place, "beside_a") as (near,),
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as apart,
     ):
         assert apart.stdout is not None
@@ -220,7 +232,8 @@ routes:
     destinations: [basestation]
     topics: [{{{{topic: killed_a, {_FLOAT}, queue_depth: 1000}}}}, {{{{topic: killed_b, {_FLOAT}, {LATEST}}}}}]
 """
-    with running(tmp_path, routes) as (place, router), hearing("killed_a") as (stays,):
+    with running(tmp_path, routes) as (place, router), hearing(place, "killed_a") as (stays,):
+        before = place.scrape()
         with sending(place, imu) as sent:
             for _ in range(3):
                 killed = [Subscriber(topic, FLOAT, *how) for topic in ("killed_a", "killed_b") for how in _RELIABILITY]
@@ -230,7 +243,7 @@ routes:
                 for each in killed:
                     each.kill()
         assert [place.receive("basestation") for _ in range(sent[0])] == [imu(each) for each in range(sent[0])]
-        counts = place.settle(Counter(), sent[0])
+        counts = place.settle(before, sent[0])
         balance(counts, ())
         lost = total(counts, "messages_dropped", target="killed_a")
         lost += total(counts, "messages_filtered", target="killed_a")
@@ -255,13 +268,14 @@ routes:
 """
     when = "when: accel_y < 5", LATEST
     tables = [routes.replace("FIRST", first).replace("SECOND", second) for first, second in (when, when[::-1])]
-    with running(tmp_path, tables[0]) as (place, router), hearing("moved_a", "moved_b") as (first, second):
+    with running(tmp_path, tables[0]) as (place, router), hearing(place, "moved_a", "moved_b") as (first, second):
+        before = place.scrape()
         with sending(place, imu) as sent:
             for turn in range(1, 9):
                 place.table(BARE + tables[turn % 2])
                 router.process.send_signal(signal.SIGHUP)
                 wait_until(lambda: len(router.events("table reloaded")) == turn, "the reload")  # noqa: B023 - at once
-        counts = place.settle(Counter(), sent[0])
+        counts = place.settle(before, sent[0])
         assert total(counts, "messages_published") == 2 * sent[0]
         assert taken(first, sent[0]) == list(range(sent[0]))
         assert taken(second, sent[0]) == list(range(sent[0]))
