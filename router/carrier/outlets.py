@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.collectors import NativeCollector
-from router.carrier.deferrals import Adoption, NativeDeferral, NativePacer, held_period
+from router.carrier.deferrals import Adoption, NativeDeferral, NativePacer
 from router.carrier.limits import open_limit
 from router.carrier.state import State
 from router.compiler.program import RoutePlan, TargetPlan
@@ -70,11 +70,11 @@ class Outlets:
         """The deadmen that commands of the route feed, which is its own, or disarm."""
         return [c.Feed(deadman=self.deadmen[name].address, disarms=name != plan.route) for name in target.deadmen]
 
-    def limit(self, plan: RoutePlan, target: TargetPlan) -> c.Limit:
-        """The limit of a target with `max_rate`."""
+    def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> c.Limit:
+        """The limit of a target with `max_rate` for one source of its route."""
         rate = target.max_rate
         assert rate is not None  # noqa: S101 - said by the caller
-        return self.state.keep(("limit", plan.route, plan.topic, target), lambda: open_limit(rate))
+        return self.state.keep(("limit", plan.route, plan.topic, source, target), lambda: open_limit(rate))
 
     def pacers(self) -> list[Adoption]:
         """The pacers of all endpoints with a bandwidth."""
@@ -85,13 +85,11 @@ class Outlets:
         key = "pacer", endpoint, bandwidth, self.senders[endpoint]
         return self.state.keep(key, lambda: NativePacer(self.library, bandwidth))
 
-    def deferral(self, plan: RoutePlan, target: TargetPlan) -> NativeDeferral | None:
-        """What holds back the messages of a target, if it needs that. They do not go to another sender or publisher."""
+    def deferral(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> NativeDeferral:
+        """What holds back the messages of one source for a target. They do not go to another sender or publisher."""
         pacer = self._pacer(target.label) if not target.is_topic and target.label in self.bandwidths else None
-        if pacer is None and not held_period(target):
-            return None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
-        key = "deferral", plan.route, plan.topic, target.label, destination
+        key = "deferral", plan.route, plan.topic, source, target.label, destination
         return self.state.keep(key, lambda: NativeDeferral(self.library, pacer))
 
     def collector(self, plan: RoutePlan) -> NativeCollector:

@@ -15,6 +15,9 @@ from router.carrier.reasons import LOSSES
 from router.compiler.lowering import LoweredRoute, LoweredTarget
 from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
 
+Sources = Mapping[int, "str | None"]
+"""The sources of a route by `source_of` in native/deliver.h; all publishers of a topic together are None."""
+
 
 @dataclass(slots=True)
 class TargetStates:
@@ -24,13 +27,15 @@ class TargetStates:
     """
 
     adopted: list[Adoption] = field(default_factory=list)
-    _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan]]] = field(default_factory=list)
+    _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan], Sources]] = field(default_factory=list)
     _collects: list[tuple[c.Targets, c.Collect, RoutePlan]] = field(default_factory=list)
     _kept: list[object] = field(default_factory=list)
 
-    def add(self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan]) -> None:
-        self._targets.append((made, plan, targets))
-        self._bind(outlets, made, plan, targets)
+    def add(
+        self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan], sources: Sources
+    ) -> None:
+        self._targets.append((made, plan, targets, sources))
+        self._bind(outlets, made, plan, targets, sources)
 
     def add_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
         self._collects.append((made, collect, plan))
@@ -49,17 +54,20 @@ class TargetStates:
         for collects in self._collects:
             self._bind_collector(outlets, *collects)
 
-    def _bind(self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan]) -> None:
+    def _bind(
+        self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan], sources: Sources
+    ) -> None:
         for native, target in zip(made.targets[: made.count], targets, strict=True):
-            if (deferral := outlets.deferral(plan, target)) is not None:
-                native.deferral = deferral.address
-                self._kept.append(deferral)
+            if target.is_deferred:
+                deferrals = {place: outlets.deferral(plan, target, source) for place, source in sources.items()}
+                native.deferrals = _by_place({place: deferral.address for place, deferral in deferrals.items()})
+                self._kept += deferrals.values()
                 to = ctypes.addressof(made), ctypes.addressof(native)
-                self.adopted.append(Adoption(deferral.address, target.is_topic, *to))
+                self.adopted += [Adoption(each.address, target.is_topic, *to) for each in deferrals.values()]
             if target.max_rate is not None and not native.period:
-                limit = outlets.limit(plan, target)
-                native.limit = ctypes.pointer(limit)
-                self._kept.append(limit)
+                limits = {place: outlets.limit(plan, target, source) for place, source in sources.items()}
+                native.limits = _by_place({place: ctypes.addressof(limit) for place, limit in limits.items()})
+                self._kept += limits.values()
             if target.deadmen:
                 feeds = outlets.feeds(plan, target)
                 native.feeds, native.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
@@ -69,6 +77,13 @@ class TargetStates:
         collect.collector = collector.address
         self._kept.append(collector)
         self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
+
+
+def _by_place(addresses: Mapping[int, int]) -> ctypes.Array[ctypes.c_void_p]:
+    made = (ctypes.c_void_p * (max(addresses) + 1))()
+    for place, address in addresses.items():
+        made[place] = address
+    return made
 
 
 @dataclass(slots=True)
@@ -121,7 +136,7 @@ class TargetWriter:
             topic=c.NO_NAME if plan.topic is None else number(plan.topic),
             generation=self.generation,
         )
-        self.states.add(self.outlets, together, plan, targets)
+        self.states.add(self.outlets, together, plan, targets, self._sources_of(plan))
         self.arrays.append(together)
         return together
 
@@ -157,6 +172,12 @@ class TargetWriter:
             )
             self.arrays.append(publication)
         return c.Target(topic=ctypes.pointer(self._topics[target.label]))
+
+    def _sources_of(self, plan: RoutePlan) -> Sources:
+        if plan.topic is not None:
+            return {0: None}
+        senders = (*self.program.table.endpoints, STRANGER)
+        return {column: sender for column, sender in enumerate(senders) if sender in plan.sources}
 
     def _ids_of_senders(self) -> list[int]:
         """By column."""

@@ -25,6 +25,7 @@ struct deferring {
     struct topic topic;
     struct targets to;
     struct target targets[MOST_TARGETS];
+    struct deferral *deferrals[MOST_TARGETS]; /* theirs */
     struct output notes;
     int64_t now;
     int error; /* that sending returns */
@@ -47,8 +48,8 @@ void seam_give_up(struct deferring *of) { of->is_given_up = true; }
 /* Whether nobody has used a deferral since. */
 bool seam_is_untouched(struct deferring *of) {
     for (uint32_t number = 0; number < of->to.count; number++) {
-        const uint8_t *deferral = (const uint8_t *)of->targets[number].deferral;
-        for (size_t at = 0; at < malloc_usable_size((void *)of->targets[number].deferral); at++)
+        const uint8_t *deferral = (const uint8_t *)of->deferrals[number];
+        for (size_t at = 0; at < malloc_usable_size(of->deferrals[number]); at++)
             if (deferral[at] != GONE) return false;
     }
     return true;
@@ -85,7 +86,7 @@ static int send_noted(struct stage *stage, const struct target *target, const ui
 /* As the thread is given up in the middleware: the owner of what it serves frees that. */
 static void give_up(void) {
     for (uint32_t number = 0; number < opened->to.count; number++) {
-        struct deferral *deferral = opened->targets[number].deferral;
+        struct deferral *deferral = opened->deferrals[number];
         memset(deferral, GONE, malloc_usable_size(deferral));
     }
 }
@@ -133,7 +134,8 @@ void seam_close(struct deferring *of) {
 uint32_t seam_target(struct deferring *of, struct deferral *deferral, int64_t period, uint32_t priority, bool is_topic) {
     uint32_t number = of->to.count++, first = number * COUNTERS;
     struct target *made = &of->targets[number];
-    *made = (struct target){.deferral = deferral, .period = period, .priority = priority, .delivered = first,
+    of->deferrals[number] = deferral;
+    *made = (struct target){.period = period, .priority = priority, .delivered = first,
                             .delivered_bytes = first + 1, .topic = is_topic ? &of->topic : NULL};
     for (uint32_t reason = 0; reason < LOSSES; reason++) made->dropped[reason] = first + 2 + reason;
     if (deferral) seam_adopt(of, (struct timer *)deferral, number);
@@ -169,7 +171,7 @@ void seam_offer(struct deferring *of, uint32_t number, const void *data, size_t 
     uint8_t *copy = malloc(size ? size : 1);
     if (!copy) abort();
     if (size) memcpy(copy, data, size);
-    if (!defer(&of->offering, of->targets[number].deferral, copy, size, expires, now)) abort();
+    if (!defer(&of->offering, of->deferrals[number], copy, size, expires, now)) abort();
     free(copy);
 }
 
@@ -178,7 +180,7 @@ void seam_offer_written(struct deferring *of, uint32_t number, const void *data,
     struct stage *stage = of->targets[number].topic ? &of->sending : &of->offering;
     stage->machine.output.size = 0;
     if (!append(&stage->machine.output, data, size)) abort();
-    if (!defer(stage, of->targets[number].deferral, stage->machine.output.data, size, expires, now)) abort();
+    if (!defer(stage, of->deferrals[number], stage->machine.output.data, size, expires, now)) abort();
 }
 
 /* What has left since the last call. */

@@ -53,9 +53,13 @@ class Target:
 
 @dataclass(frozen=True)
 class Table:
-    """`targets` are in the order of the table. `ttl`, `timeouts` of `collect` and deadmen are by route, in ns."""
+    """`targets` are in the order of the table. `ttl`, `timeouts` of `collect` and deadmen are by route, in ns.
+
+    `sources` are by route, in the order of the endpoints: None for strangers, and for all publishers of a topic.
+    """
 
     targets: tuple[Target, ...]
+    sources: Mapping[str, tuple[str | None, ...]]
     ttl: Mapping[str, int]
     bandwidths: Mapping[str, int]
     timeouts: Mapping[str, int]
@@ -150,35 +154,37 @@ class Model:
 
     # messages
 
-    def datagram(self, route: str, data: bytes, number: int, arrived: int, topics: Mapping[str, bytes]) -> None:
+    def datagram(
+        self, route: str, source: str | None, data: bytes, number: int, arrived: int, topics: Mapping[str, bytes]
+    ) -> None:
         """`topics` are what they get of it."""
         born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
         for target in self.table.of(route):
             oldest = born.oldest if target.is_board else born.youngest
-            self._deliver(target, topics[target.label] if target.is_topic else data, number, oldest)
+            self._deliver(target, source, topics[target.label] if target.is_topic else data, number, oldest)
 
     def part(self, route: str, part: Part, arrived: int) -> None:
-        """A datagram of a route with `collect`, for its one topic; that gets the payloads."""
+        """A datagram of a route with `collect` and one source, for its one topic; that gets the payloads."""
         born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
-        (target,) = self.table.of(route)
+        (target,), (source,) = self.table.of(route), self.table.sources[route]
         timer: _FramesTimer = self._kept[_frames_key(self.table, route)]
         made = timer.frames.offer(self.now, part)
         timer.tell(timer.frames)
         if made is not None:
-            self._deliver(target, b"|".join(made), 0, born.youngest)
+            self._deliver(target, source, b"|".join(made), 0, born.youngest)
 
     def ros(self, route: str, data: bytes, number: int, sent: int) -> None:
         born = self._of_ros.born(sent, self.now + self.ahead, self.now)
         for target in self.table.of(route):
-            self._deliver(target, data, number, born.oldest if target.is_board else born.youngest)
+            self._deliver(target, None, data, number, born.oldest if target.is_board else born.youngest)
 
-    def _deliver(self, target: Target, data: bytes, number: int, born: int) -> None:
+    def _deliver(self, target: Target, source: str | None, data: bytes, number: int, born: int) -> None:
         ttl = self.table.ttl.get(target.route)
         expires = None if ttl is None else born + ttl
         self._messages.append((target, data))
-        message = Message(len(self._messages) - 1, target.place, len(data), expires, target.rank)
-        limit: RateLimit | None = self._kept.get(_limit_key(self.table, target))
-        deferral: Deferral | None = self._kept.get(_deferral_key(self.table, target))
+        message = Message(len(self._messages) - 1, (target.place, source), len(data), expires, target.rank)
+        limit: RateLimit | None = self._kept.get(_limit_key(self.table, target, source))
+        deferral: Deferral | None = self._kept.get(_deferral_key(self.table, target, source))
         if target.only_positive and number <= 0:
             self._tell(target, "filtered")
         elif message.is_stale(self.now):
@@ -264,17 +270,20 @@ class Model:
         for endpoint, bandwidth in table.bandwidths.items():
             yield ("pacer", endpoint, bandwidth), partial(Pacer, bandwidth, self._fate)
         for target in table.targets:
-            if key := _deferral_key(table, target):
-                yield key, partial(Deferral, None, kept.get(_pacer_key(table, target)), self._fate)
-            if target.hertz is not None and (key := _limit_key(table, target)):
-                yield key, partial(RateLimit, target.hertz)
+            for source in table.sources[target.route]:
+                if key := _deferral_key(table, target, source):
+                    yield key, partial(Deferral, None, kept.get(_pacer_key(table, target)), self._fate)
+                if target.hertz is not None and (key := _limit_key(table, target, source)):
+                    yield key, partial(RateLimit, target.hertz)
             if key := _frames_key(table, target.route):
                 frames = Frames(table.timeouts[target.route])
                 yield key, partial(_FramesTimer, frames, partial(self._tell_frames, target))
 
     def _change(self, table: Table, key: Key, kept: Any, group: Timers) -> None:
         if isinstance(kept, Deferral):
-            (target,) = [each for each in table.targets if _deferral_key(table, each) == key]
+            place, source = key[1]
+            (target,) = [each for each in table.targets if each.place == place]
+            assert _deferral_key(table, target, source) == key
             kept.change(self.now, target.hertz if target.is_latest else None)
             if kept.held is not None:
                 kept.held = replace(kept.held, rank=target.rank)
@@ -300,8 +309,8 @@ class Model:
     def _end(self, timer: Any) -> None:
         timer.end(self.now)
         if isinstance(timer, Deferral) and timer.pacer is not None:
-            (place,) = {key[1] for key, each in self._kept.items() if each is timer}
-            timer.pacer.release(self.now, lambda message: message.target == place)
+            (whose,) = {key[1] for key, each in self._kept.items() if each is timer}
+            timer.pacer.release(self.now, lambda message: message.target == whose)
 
 
 def _pacer_key(table: Table, target: Target) -> Key:
@@ -309,17 +318,17 @@ def _pacer_key(table: Table, target: Target) -> Key:
     return None if bandwidth is None else ("pacer", target.label, bandwidth)
 
 
-def _deferral_key(table: Table, target: Target) -> Key:
-    """What waits goes to the same endpoint, by the same pacer."""
+def _deferral_key(table: Table, target: Target, source: str | None) -> Key:
+    """What waits comes from the same source, and goes to the same endpoint, by the same pacer."""
     pacer = _pacer_key(table, target)
-    return ("deferral", target.place, target.is_topic, pacer) if pacer or target.is_latest else None
+    return ("deferral", (target.place, source), target.is_topic, pacer) if pacer or target.is_latest else None
 
 
-def _limit_key(table: Table, target: Target) -> Key:
-    """Whatever is changed of a target but its condition, its limit begins anew."""
+def _limit_key(table: Table, target: Target, source: str | None) -> Key:
+    """Each source has its own. Whatever is changed of a target but its condition, its limits begin anew."""
     if target.hertz is None or target.is_latest:
         return None
-    return "limit", replace(target, only_positive=False), _pacer_key(table, target) is not None
+    return "limit", source, replace(target, only_positive=False), _pacer_key(table, target) is not None
 
 
 def _frames_key(table: Table, route: str) -> Key:

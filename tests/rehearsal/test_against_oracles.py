@@ -59,7 +59,7 @@ endpoints:
   operator: {{address: "192.168.0.10:9000", kind: basestation{radio}}}
 routes:
   telemetry:
-    source: sensors
+    source: {sources}
     destinations: [{{endpoint: operator{telemetry}}}]
     topics: [{{topic: latest, type: std_msgs/msg/Int32, fields: {{data: number}}{topic}}}]
     {options}
@@ -84,8 +84,8 @@ routes:
 """
 MOST_TO_BOARD = 1400
 BRAKE = b"\x32\x02\x08\x01"
-PEERS = {"telemetry": ("192.168.0.30", 8), "bulk": ("192.168.0.30", 8)}
-OPERATOR = ("192.168.0.10", 9000)
+PEERS = {"sensors": ("192.168.0.30", 8), "wheels": ("192.168.0.31", 8), "operator": ("192.168.0.10", 9000)}
+STRANGER = ("192.168.0.99", 9000)
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,14 @@ class To:
 
 RATES = [To(), To(20), To(7, is_latest=True), To(20, is_latest=True), To(50, is_latest=True)]
 CONDITIONS = [To(only_positive=True), To(20, is_latest=True, only_positive=True)]
+SOURCES: Mapping[str, tuple[str | None, ...]] = {
+    "sensors": ("sensors",),
+    "wheels": ("wheels",),
+    "[wheels, sensors]": ("sensors", "wheels"),
+    "any": ("sensors", "wheels", "operator", None),
+}
 CHOICES: Mapping[str, list[Any]] = {
+    "sources": [*SOURCES],
     "telemetry": [*RATES, *CONDITIONS],
     "bulk": [To(), To(), *RATES],
     "topic": [*RATES, *CONDITIONS],
@@ -124,6 +131,7 @@ CHOICES: Mapping[str, list[Any]] = {
 class Setting:
     """What may differ between two tables; bandwidths in bytes per second, times in ms."""
 
+    sources: str
     telemetry: To
     bulk: To
     topic: To
@@ -142,6 +150,7 @@ class Setting:
         options = [f"priority: {names[self.rank]}", *([] if self.ttl is None else [f"ttl: {self.ttl}ms"])]
         return TABLE.format(
             **{name: value for name, value in vars(self).items() if isinstance(value, To)},
+            sources=self.sources,
             ttl=ORDERS_TTL,
             options="\n    ".join(options),
             radio="" if self.radio is None else f", bandwidth: {self.radio}B/s",
@@ -169,6 +178,12 @@ class Setting:
                 target("part", "frames", self.frames, is_topic=True),
                 target("orders", "wheels", self.orders, **command),
             ),
+            sources={
+                "telemetry": SOURCES[self.sources],
+                "bulk": ("sensors",),
+                **dict.fromkeys(("drive", "arm", "part"), ("operator",)),
+                "orders": (None,),
+            },
             ttl={route: ms * MS for route, ms in ttl.items() if ms is not None},
             bandwidths={name: bandwidth for name, bandwidth in bandwidths.items() if bandwidth is not None},
             timeouts={"part": self.collect * MS},
@@ -241,21 +256,26 @@ class Both:
     def _wall(self, age: int) -> int:
         return self.stage.now + self.stage.ahead - age
 
-    def receive(self, case: str, age: int, sign: int, size: int, times: int) -> None:
+    def receive(self, case: str, sender: int, age: int, sign: int, size: int, times: int) -> None:
+        """`sender` chooses one of those that may send it."""
+        sources = self.model.table.sources[case]
+        source = sources[sender % len(sources)]
         if case in {"drive", "arm"}:
             size = min(size, MOST_TO_BOARD)
         for _ in range(times):
             number = self._next_number(sign)
             data = envelope(case, number=number, filling=bytes(size))
-            self.stage.datagram("here", PEERS.get(case, OPERATOR), data, self._wall(age))
-            self.model.datagram(case, data, number, self._wall(age), {"latest": b"\0\1\0\0" + pack("<i", number)})
+            self.stage.datagram("here", PEERS[source] if source else STRANGER, data, self._wall(age))
+            self.model.datagram(
+                case, source, data, number, self._wall(age), {"latest": b"\0\1\0\0" + pack("<i", number)}
+            )
         self.compare()
 
     def receive_parts(self, frame: int, count: int, places: Sequence[int], age: int) -> None:
         for place in places:
             name = f"{self._next_number()}"
             data = envelope("part", frame=frame, count=count, place=place, name=name)
-            self.stage.datagram("here", OPERATOR, data, self._wall(age))
+            self.stage.datagram("here", PEERS["operator"], data, self._wall(age))
             self.model.part("part", Part(frame, count, place, name.encode()), self._wall(age))
         self.compare()
 
@@ -316,10 +336,15 @@ class Tables(RuleBasedStateMachine):
         self.both = Both(SETTINGS[number])
 
     @rule(
-        case=st.sampled_from(CASES), age=AGES, sign=st.sampled_from((1, -1)), size=SIZES, times=st.sampled_from(TIMES)
+        case=st.sampled_from(CASES),
+        sender=st.integers(0, 3),
+        age=AGES,
+        sign=st.sampled_from((1, -1)),
+        size=SIZES,
+        times=st.sampled_from(TIMES),
     )
-    def receive(self, case: str, age: int, sign: int, size: int, times: int) -> None:
-        self.both.receive(case, age, sign, size, times)
+    def receive(self, case: str, sender: int, age: int, sign: int, size: int, times: int) -> None:
+        self.both.receive(case, sender, age, sign, size, times)
 
     @rule(frame=st.integers(1, 5), count=st.sampled_from(COUNTS), places=st.lists(st.integers(-1, 2)), age=AGES)
     def receive_parts(self, frame: int, count: int, places: list[int], age: int) -> None:
@@ -363,7 +388,9 @@ def step_of(both: Both, noise: random.Random) -> None:
     match noise.choices(range(7), (35, 15, 10, 30, 1, 3, 5))[0]:
         case 0:
             size = noise.choice((noise.randrange(41), noise.randrange(1500), 0, 15_000))
-            both.receive(noise.choice(CASES), age, noise.choice((1, 1, -1)), size, noise.choice(TIMES))
+            both.receive(
+                noise.choice(CASES), noise.randrange(4), age, noise.choice((1, 1, -1)), size, noise.choice(TIMES)
+            )
         case 1:
             places = noise.choice(([-1], [0, 1, 2], [noise.randrange(3)], [noise.randrange(3) for _ in range(4)]))
             both.receive_parts(noise.randint(1, 5), noise.choice(COUNTS), places, age)

@@ -1,4 +1,5 @@
-/* Messages that are held back: by `on_limit: latest`, by the bandwidth of their endpoint (pace.h), or by both.
+/* Messages that are held back: by `on_limit: latest`, by the bandwidth of their endpoint (pace.h), or by both. A target has
+ * a deferral for each source of its route.
  *
  * With `on_limit: latest` at most one message passes per period, and the newest of those in between is held until it may. A
  * held message is dropped as `rate_limited` when a newer one replaces it, as `stale` when it expires. A message is counted

@@ -106,7 +106,8 @@ static bool is_fresh(const struct delivery *of) {
 }
 
 static bool keeps_rate(const struct delivery *of) {
-    if (!of->target->limit || limit_passes(of->target->limit, of->message->now)) return true;
+    struct limit *const *limits = of->target->limits;
+    if (!limits || limit_passes(limits[source_of(of->message)], of->message->now)) return true;
     count(of, of->target->dropped[LOSS_RATE_LIMITED]);
     return false;
 }
@@ -191,7 +192,8 @@ bool deliver(struct stage *stage, const struct targets *to, const struct target 
     }
     if (!fits_board(&of)) return true;
     if (target->trims) of.size = trimmed_size(of.data, of.size);
-    if (target->deferral) return defer(stage, target->deferral, of.data, of.size, of.expires, message->now);
+    if (target->deferrals)
+        return defer(stage, target->deferrals[source_of(message)], of.data, of.size, of.expires, message->now);
     return leave(stage, to, target, of.data, of.size, of.expires, message->now);
 }
 

@@ -41,8 +41,10 @@ struct topic {
 struct target {
     struct routine condition; /* empty: it gets every message */
     struct routine message;   /* empty: it gets the envelope as it was received */
-    struct limit *limit;   /* `max_rate` with `on_limit: first`, or NULL */
-    struct deferral *deferral; /* what may hold its messages back, or NULL */
+    /* One for each source of the route, by `source_of`, or NULL: of `max_rate` with `on_limit: first`, and what may hold
+     * messages back. */
+    struct limit *const *limits;
+    struct deferral *const *deferrals;
     int64_t period;            /* of `on_limit: latest`, ns; 0 without */
     const struct topic *topic; /* NULL for a destination, which has these: */
     struct sender *sender;
@@ -56,8 +58,6 @@ struct target {
      * `delivered_bytes`: of a destination. */
     uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
 };
-
-struct deferral;
 
 /* The first slots of every layout of datagrams, and its first sections. */
 enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
@@ -98,6 +98,9 @@ struct message {
     int outcome;    /* of reading: EVALUATED, or an enum loss */
     uint32_t place; /* that refused it, an enum place */
 };
+
+/* The source of a message in arrays of its route: the column of the sender, or 0 if it is from ROS. */
+static inline uint32_t source_of(const struct message *message) { return message->datagram ? message->datagram->column : 0; }
 
 /* ---- how it is delivered ---- */
 

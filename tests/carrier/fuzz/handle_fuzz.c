@@ -16,6 +16,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
 
 static counter counters[COUNTERS];
 static struct limit limit = {1000, 500, -1000};
+static struct limit *const limits[COLUMNS] = {&limit, &limit, &limit};
+static struct deferral *deferrals[2][COLUMNS];
 static const uint8_t wanted = 1;
 static const struct topic topic = {.wanted = &wanted};
 static const struct target published = {
@@ -31,7 +33,7 @@ static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6},
                                              {.kind = OP_DIVIDE}};
 
 static struct target destinations[] = {
-    {.sender = &nowhere, .limit = &limit, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
+    {.sender = &nowhere, .limits = limits, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
      .dropped = {[LOSS_STALE] = STALE, [LOSS_RATE_LIMITED] = LIMITED, [LOSS_SEND_BUFFER_FULL] = FULL,
                  [LOSS_SEND_ERROR] = FAILED}},
     {.sender = &nowhere, .condition = {condition, 3, 0}, .filtered = UNMET,
@@ -82,7 +84,8 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
                                  {NULL, &only.sends, &destinations[3]}};
     for (int index = 1; index < 3; index++) {
         struct deferral *deferral = deferral_open(index == 1 ? pacer : NULL);
-        destinations[1 + index].deferral = deferral;
+        for (uint32_t column = 0; column < COLUMNS; column++) deferrals[index - 1][column] = deferral;
+        destinations[1 + index].deferrals = deferrals[index - 1];
         adopted[index].timer = (struct timer *)deferral;
     }
     struct change first = {.program = &program, .timers = {.adopted = adopted, .adopted_count = 3}};

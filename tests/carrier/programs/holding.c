@@ -18,6 +18,7 @@ enum { DELIVERED, BYTES, FIRST_LOSS };
 struct program {
     struct targets to;
     struct target targets[TARGETS];
+    struct deferral *deferrals[TARGETS];
     struct program *earlier;
     uint32_t generation;
 };
@@ -60,8 +61,8 @@ static struct program *open_program(struct program *earlier, unsigned *random) {
         target->period = index % 2 ? 1000 * (1 + rand_r(random) % 100) : 0;
         if (keeps && rand_r(random) % 2) target->period = earlier->targets[index].period;
         for (uint32_t reason = 0; reason < LOSSES; reason++) target->dropped[reason] = FIRST_LOSS + reason;
-        target->deferral = keeps ? earlier->targets[index].deferral : deferral_open(index == 3 ? NULL : pacer);
-        check(target->deferral, "memory");
+        made->deferrals[index] = keeps ? earlier->deferrals[index] : deferral_open(index == 3 ? NULL : pacer);
+        check(made->deferrals[index], "memory");
     }
     return made;
 }
@@ -71,10 +72,9 @@ static void adopt(struct program *next) {
     struct timer *ended[TARGETS];
     struct timer_change change = {adopted, ended, TARGETS + 1, 0};
     for (uint32_t index = 0; index < TARGETS; index++) {
-        const struct target *target = &next->targets[index];
-        adopted[1 + index] = (struct adoption){(struct timer *)target->deferral, &next->to, target};
-        if (next->earlier && next->earlier->targets[index].deferral != target->deferral)
-            ended[change.ended_count++] = (struct timer *)next->earlier->targets[index].deferral;
+        adopted[1 + index] = (struct adoption){(struct timer *)next->deferrals[index], &next->to, &next->targets[index]};
+        if (next->earlier && next->earlier->deferrals[index] != next->deferrals[index])
+            ended[change.ended_count++] = (struct timer *)next->earlier->deferrals[index];
     }
     timers_change(timers, &change);
     atomic_store(&current, next);
@@ -86,8 +86,8 @@ static void close_earlier(struct program *next) {
     for (int thread = 0; thread < OFFERING; thread++)
         while (atomic_load(&seen[thread]) < next->generation && !atomic_load(&is_done)) usleep(100);
     for (uint32_t index = 0; index < TARGETS; index++)
-        if (earlier->targets[index].deferral != next->targets[index].deferral)
-            deferral_close(earlier->targets[index].deferral);
+        if (earlier->deferrals[index] != next->deferrals[index])
+            deferral_close(earlier->deferrals[index]);
     free(earlier);
     next->earlier = NULL;
 }
@@ -132,7 +132,7 @@ static void *offer(void *which) {
             check(append(&stage.machine.output, datagram, size), "memory");
             data = stage.machine.output.data;
         }
-        check(defer(&stage, program->targets[index].deferral, data, size, expires, now), "nobody is left");
+        check(defer(&stage, program->deferrals[index], data, size, expires, now), "nobody is left");
         atomic_fetch_add(&offered, 1);
         atomic_store(&seen[thread], program->generation);
         if (number % 16 == 0) usleep(100);
@@ -171,7 +171,7 @@ int main(int count, char **arguments) {
     printf("offered %lld, delivered %lld, %u programs\n", (long long)offered, (long long)counters[DELIVERED],
            atomic_load(&current)->generation);
     struct program *last = atomic_load(&current);
-    for (uint32_t index = 0; index < TARGETS; index++) deferral_close(last->targets[index].deferral);
+    for (uint32_t index = 0; index < TARGETS; index++) deferral_close(last->deferrals[index]);
     free(last);
     pacer_close(pacer);
     timers_close(timers);

@@ -54,6 +54,7 @@ static const struct wire_schema schema = {types, 2};
 
 static const uint8_t header[] = {0, 1, 0, 0};
 static struct limit limit = {1000, 500, -1000};
+static struct limit *const limits[] = {&limit};
 static uint8_t wanted[TOPICS] = {1, 1};
 static uint32_t latest[TOPICS]; /* numbers that were published; of the thread */
 static _Atomic bool is_stuck, has_ended;
@@ -93,7 +94,7 @@ static void make_target(struct made *made, int index) {
     made->topics[index] = (struct topic){&made->publishers[index], &wanted[index]};
     made->targets[index] = (struct target){
         .topic = &made->topics[index], .message = {made->operations, 3, 0}, .id = (uint32_t)index + 1,
-        .condition = {made->operations + 1, (uint32_t)index, 0}, .limit = index ? &limit : NULL,
+        .condition = {made->operations + 1, (uint32_t)index, 0}, .limits = index ? limits : NULL,
         .delivered = topic_counter(index, PUBLICATIONS), .waiting = topic_counter(index, WAITING),
         .filtered = topic_counter(index, FILTERED)};
     for (int reason = 0; reason < LOSSES; reason++) made->targets[index].dropped[reason] = topic_counter(index, MAPPING);

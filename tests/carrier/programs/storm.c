@@ -60,6 +60,7 @@ static struct ring *receive_events, *brake_events, *messages, *mirrored;
 static struct timers *timers;
 static struct carrier *carrier;
 static struct limit limit = {1000000, 500000, -1000000};
+static struct limit *const limits[] = {&limit, &limit}; /* columns */
 static int listening[LISTENERS], boards[BOARDS], sending[DESTINATIONS];
 static struct sender *senders[DESTINATIONS];
 static _Atomic int64_t sent[LISTENERS], taken, commands;
@@ -122,7 +123,7 @@ static struct listener make_listener(const struct made *made, int index) {
 
 static struct target make_destination(const struct made *made, int route, int to) {
     struct target target = {
-        .sender = senders[to], .limit = to == 1 ? &limit : NULL, .feeds = &made->feed, .feed_count = to == 0,
+        .sender = senders[to], .limits = to == 1 ? limits : NULL, .feeds = &made->feed, .feed_count = to == 0,
         .condition = {&made->condition, to == 1, 0}, .trims = to == 1, .id = (uint32_t)to,
         .delivered = destination_counter(route, to, SENT), .delivered_bytes = destination_counter(route, to, SENT_BYTES)};
     target.dropped[LOSS_STALE] = destination_counter(route, to, STALE);
