@@ -77,7 +77,9 @@ def wire_of_table(table: RouteTable) -> Wire:
     if table.envelope is None:
         raise UsageError(f"{shown_path(table.path)} has no 'envelope': there are no datagrams to build or to read")
     settings = table.envelope
-    return Wire(find_envelope(load_protos(settings.protos, settings.message, settings.lock), settings.oneof))
+    return Wire(
+        find_envelope(load_protos(settings.protos, settings.message, settings.lock, settings.exclude), settings.oneof)
+    )
 
 
 def wire_of_protos(root: Path) -> Wire:

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
         raise UsageError(what, "copy the protos with `router init --rover DIR`, and name yours: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
-    schema = load_protos(settings.protos, settings.message, settings.lock)
+    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
     found = lock.conflicts
     _refuse_unknown(args.accept, found)

@@ -30,15 +30,16 @@ class Definitions:
     """
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
-        self._protos: dict[tuple[Path, str, Path], ProtoSchema] = {}
+        self._protos: dict[tuple[Path, str, Path, tuple[str, ...]], ProtoSchema] = {}
         self._known = known
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """The protos of an envelope. Raises TableError; an invalid folder is read and reported again for each table."""
-        key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock)
+        exclude = tuple(each.value for each in settings.exclude)
+        key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock), exclude
         if key not in self._protos:
             known = self._unchanged(settings)
-            self._protos[key] = known or load_protos(settings.protos, settings.message, settings.lock)
+            self._protos[key] = known or load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
         return self._protos[key]
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
@@ -48,7 +49,7 @@ class Definitions:
             return None
         if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
             return None
-        return known if known.sha256 == read_folder(known.root, settings.protos.span).sha256 else None
+        return known if known.sha256 == read_folder(known.root, settings.protos.span, settings.exclude).sha256 else None
 
     @cached_property
     def interfaces(self) -> RosInterfaces:

@@ -80,13 +80,15 @@ class OnLimit(enum.Enum):
 class EnvelopeSettings:
     """`protos` is an absolute path, the router's own unless the table has one; `message` and `oneof` name the envelope.
 
-    `lock` is the absolute path of the lock file, None where it is beside the protos.
+    `lock` is the absolute path of the lock file, None where it is beside the protos. `exclude` are files and folders of
+    `protos`, relative to it.
     """
 
     protos: Located[Path]
     message: Located[str]
     oneof: Located[str]
     lock: Located[Path] | None = None
+    exclude: tuple[Located[str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

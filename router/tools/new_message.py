@@ -90,7 +90,7 @@ def site_of(checked: Checked, messages: Path) -> Site:
     if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
     # A field's type may be in a file of its own.
-    schema = load_protos(settings.protos, settings.message, settings.lock, with_others=True)
+    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude, with_others=True)
     return Site(checked.table, settings, schema, checked.envelope, messages)
 
 

@@ -104,7 +104,7 @@ class Written:
 
 def locked(site: Site) -> str:
     """The lock with what the `.proto` files declare now. Raises UsageError and TableError."""
-    schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock)
+    schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
     errors = [each for each in lock.findings() if each.severity is Severity.ERROR]
     if errors:

@@ -9,9 +9,9 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
 from router.types.lock_file import Lock
@@ -28,12 +28,14 @@ _SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", 
 class Folder:
     """`files` has the bytes of all readable files by name relative to `root`, with `/`, sorted.
 
-    `faults` are the findings of a file, readable or not, by the same names.
+    `faults` are the findings of a file, readable or not, by the same names. `excluded` are the names of files that are
+    in neither, each with what excludes it.
     """
 
     root: Path
     files: Mapping[str, bytes]
     faults: Mapping[str, Sequence[Diagnostic]]
+    excluded: Mapping[str, Located[str]] = field(default_factory=dict)
 
     @property
     def protos(self) -> Mapping[str, bytes]:
@@ -61,10 +63,11 @@ def _meant(root: Path, blame: SourceSpan) -> str:
     return f"did you mean '{Path(os.path.relpath(near, Path(blame.file).resolve().parent)).as_posix()}'?"
 
 
-def read_folder(root: Path, blame: SourceSpan) -> Folder:
-    """The `.proto` and `.options` files below `root`; hidden ones are left alone.
+def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] = ()) -> Folder:
+    """The `.proto` and `.options` files below `root`; hidden ones and those that `exclude` names are left alone.
 
-    What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
+    What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder,
+    and for what `exclude` names in vain.
     """
     if not root.is_dir():
         raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", _meant(root, blame))
@@ -75,9 +78,12 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
     }
     if not any(name.endswith(PROTO) for name in found):
         raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")
+    excluded = _excluded(root, found, exclude)
     files = {}
     faults: dict[str, Sequence[Diagnostic]] = {}
     for name, path in sorted(found.items()):
+        if name in excluded:
+            continue
         if not _FILE_NAME.fullmatch(name):
             hint = "take letters, digits, '_', '-' and '.'"
             faults[name] = [Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint)]
@@ -89,7 +95,35 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
         else:
             if complaints := list(_text_findings(path, files[name])):
                 faults[name] = [*faults.get(name, ()), *complaints]
-    return Folder(root, files, faults)
+    return Folder(root, files, faults, excluded)
+
+
+def _excluded(root: Path, names: Iterable[str], exclude: Sequence[Located[str]]) -> Mapping[str, Located[str]]:
+    """Which of the files are excluded, a `.proto` with its `.options`, and by what. Raises TableError."""
+    excluded: dict[str, Located[str]] = {}
+    findings = []
+    for each in exclude:
+        written = each.value.rstrip("/")
+        covered = [name for name in names if written in (proto_of(name), name) or name.startswith(f"{written}/")]
+        excluded.update(dict.fromkeys(covered, each))
+        if not covered:
+            hint = _exclude_hint(written, [name for name in names if name.endswith(PROTO)])
+            what = f"{shown_path(root)} has no file or folder '{each.value}' to exclude"
+            findings.append(Diagnostic(each.span, Code.BAD_FILE, what, hint))
+    if findings:
+        raise TableError(findings)
+    return excluded
+
+
+def _exclude_hint(written: str, protos: Sequence[str]) -> str:
+    """Which file is meant: one of this name in another folder, or a similar one."""
+    same = [name for name in protos if PurePosixPath(name).name == PurePosixPath(written).name]
+    return f"did you mean '{same[0]}'?" if len(same) == 1 else did_you_mean(written, same or protos)
+
+
+def proto_of(name: str) -> str:
+    """The `.proto` file that a `.proto` or `.options` file is about."""
+    return name.removesuffix(OPTIONS) + PROTO if name.endswith(OPTIONS) else name
 
 
 def walk(root: Path) -> Iterator[Path]:
@@ -239,6 +273,8 @@ def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> lis
             return [_too_deep(folder, protos, above, file)]
     hint = did_you_mean(wanted.value, [name for content in folder.protos.values() for name in scan(content).messages])
     message = f"no .proto file declares a message '{wanted.value}'"
+    if folder.excluded:
+        hint = f"does a file declare it that `exclude` leaves out ({', '.join(folder.excluded)})?"
     faults = [each for found in folder.faults.values() for each in found]
     return [Diagnostic(wanted.span, Code.BAD_VALUE, message, hint), *faults]
 

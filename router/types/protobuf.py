@@ -17,7 +17,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
 from router.types.boards import (
     NO_OPTIONS,
     BoardOptions,
@@ -30,7 +30,7 @@ from router.types.boards import (
 from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
-from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reached, read_folder
+from router.types.proto_files import OPTIONS, Folder, envelope_file, proto_of, reached, read_folder
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
 from router.types.undecidable import undecidable
@@ -136,21 +136,29 @@ class Envelope:
 
 
 def load_protos(
-    protos: Located[Path], message: Located[str], lock: Located[Path] | None = None, *, with_others: bool = False
+    protos: Located[Path],
+    message: Located[str],
+    lock: Located[Path] | None = None,
+    exclude: Sequence[Located[str]] = (),
+    *,
+    with_others: bool = False,
 ) -> ProtoSchema:
     """Compile the file below `protos` that declares the envelope `message`, and what it imports.
 
-    Other files of the folder are checked only, `with_others` compiled too where nothing is wrong with them. Raises
+    Other files of the folder are checked only, but for those that `exclude` names, `with_others` compiled too where
+    nothing is wrong with them. Raises
     TableError with every finding. What is wrong with the folder itself is blamed on the place that names it.
     """
     root = protos.value.resolve()
-    folder = read_folder(root, protos.span)
+    folder = read_folder(root, protos.span, exclude)
     path = lock_path(protos, lock)
     locked = _readable_lock(path)
     file, envelope = envelope_file(folder, protos, message, locked)
-    used = reached(file, folder.files) if folder.faults else {file}
+    used = reached(file, folder.files) if folder.faults or folder.excluded else {file}
     if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
         raise TableError(faults)
+    if needed := [_excluded_finding(name, message, folder) for name in sorted(used & folder.excluded.keys())]:
+        raise TableError(needed)
     compiled = compile_protos(folder, [file])
     names = [each.name for each in compiled.file]
     warnings, valid = _check_others(folder, names)
@@ -161,12 +169,12 @@ def load_protos(
     options = {}
     for name in folder.files:
         if name.endswith(OPTIONS):
-            proto = _proto_of(name)
+            proto = proto_of(name)
             options[proto], complaints = read_options(root / name)
             if proto in names:
                 findings += complaints
             elif complaints:
-                warnings.append(_unused(complaints[0], len(complaints)))
+                warnings.append(_unused(proto, complaints))
     if findings:
         raise TableError(findings)
     return ProtoSchema(folder, envelope, path, compiled, options, warnings)
@@ -191,20 +199,17 @@ def _readable_lock(path: Path) -> Lock | None:
         return None
 
 
-def _proto_of(name: str) -> str:
-    """The `.proto` file that a `.proto` or `.options` file is about."""
-    return name.removesuffix(OPTIONS) + PROTO if name.endswith(OPTIONS) else name
-
-
 def _faults(folder: Folder, proto: str) -> list[Diagnostic]:
-    return [each for name, faults in folder.faults.items() if _proto_of(name) == proto for each in faults]
+    return [each for name, faults in folder.faults.items() if proto_of(name) == proto for each in faults]
 
 
 def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnostic], list[str]]:
     """A warning for each file that was not compiled and has faults, and the `.proto` files among them without any."""
-    unused = [faults for name, faults in folder.faults.items() if _proto_of(name) not in compiled]
-    warnings = [_unused(faults[0], len(faults)) for faults in unused]
+    unused = [(name, faults) for name, faults in folder.faults.items() if proto_of(name) not in compiled]
+    warnings = [_unused(proto_of(name), faults) for name, faults in unused]
     valid = [name for name in folder.protos if name not in compiled and name not in folder.faults]
+    if folder.excluded:  # what needs an excluded file is left out with it
+        valid = [name for name in valid if folder.excluded.keys().isdisjoint(reached(name, folder.files))]
     if not valid:
         return warnings, []
     complaints = check_protos(folder, compiled, valid)
@@ -212,16 +217,28 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     files: dict[str, list[Diagnostic]] = {}
     for finding in findings_of(news, folder):
         files.setdefault(finding.span.file, []).append(finding)
-    warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
+    names = {shown_path(folder.root / name): name for name in valid}
+    warnings += [_unused(names.get(file, ""), findings) for file, findings in files.items()]
     broken = {complaint.file for complaint in complaints}
     return warnings, [name for name in valid if name not in broken]
 
 
-def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:
-    """The first fault of a file that is not compiled."""
-    more = f" (and {count - 1} more)" if count > 1 else ""
-    message = f"the envelope does not use this file, and it is left out: {finding.message}{more}"
-    return replace(finding, code=Code.UNUSED_PROTO, message=message)
+def _unused(proto: str, faults: Sequence[Diagnostic]) -> Diagnostic:
+    """The first fault of a file that is not compiled. `proto` is "" for one that only an import leads to."""
+    first = faults[0]
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    message = f"the envelope does not use this file, and it is left out: {first.message}{more}"
+    hint = first.hint
+    if proto:
+        hint = f"{hint or 'repair it'}; or, if it is not yours, write `exclude: [{proto}]` in the table's `envelope`"
+    return replace(first, code=Code.UNUSED_PROTO, message=message, hint=hint)
+
+
+def _excluded_finding(name: str, envelope: Located[str], folder: Folder) -> Diagnostic:
+    """`exclude` names a file that the envelope imports."""
+    by = folder.excluded[name]
+    what = f"'{by.value}' cannot be excluded: the envelope {envelope.value} needs {name}"
+    return Diagnostic(by.span, Code.BAD_VALUE, what, "exclude only what the envelope does not import")
 
 
 def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import Code, SourceSpan, TableError
+from router.compiler.lookup import Definitions
+from router.errors import Code, Located, SourceSpan, TableError
+from router.table.model import EnvelopeSettings
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, String
 from router.types.protobuf import Envelope, find_envelope, load_protos
@@ -146,9 +148,71 @@ STRAY = {
 def test_file_that_the_envelope_does_not_import_is_a_warning(write: Write, stray: str, warning: str) -> None:
     schema = load_protos(*settings(write({"a.proto": ENVELOPE, "b.proto": f'syntax = "proto3";\n{stray}'})))
     said = "the envelope does not use this file, and it is left out"
-    assert [str(found) for found in schema.warnings] == [warning.format(said)]
+    (found,) = schema.warnings
+    hint, _, otherwise = found.hint.partition("; or, ")
+    assert str(replace(found, hint=hint.removesuffix("repair it"))) == warning.format(said)
+    assert otherwise == "if it is not yours, write `exclude: [b.proto]` in the table's `envelope`"
     assert schema.files == ("a.proto",)
     assert list(schema.messages) == ["Imu", "Note", "Envelope"]
+
+
+def excluding(*names: str) -> tuple[Located[str], ...]:
+    return tuple(Located(name, SourceSpan("table.yaml", 5, 12)) for name in names)
+
+
+def test_excluded_files_and_folders_are_as_if_they_were_not_there(write: Write) -> None:
+    root = write(
+        {
+            "a.proto": ENVELOPE,
+            "old/b.proto": "message B {}",
+            "old/b.options": "B.x nonsense",
+            "older.proto": 'syntax = "proto3";\nmessage Envelope {}',
+            "user.proto": 'syntax = "proto3";\nimport "old/b.proto";\nmessage User {}',
+            "tests/c.proto": 'syntax = "proto3";\nmessage Imu {}',
+            "gr\u00f6\u00dfe.proto": "",
+        }
+    )
+    exclude = excluding("old/b.proto", "older.proto", "tests/", "gr\u00f6\u00dfe.proto")
+    schema = load_protos(*settings(root), exclude=exclude, with_others=True)
+    assert (schema.files, schema.warnings) == (("a.proto",), ())
+
+
+@pytest.mark.parametrize(
+    ("excluded", "code", "line", "message", "hint"),
+    [
+        (
+            "imu.proto", Code.BAD_VALUE, 5, "'imu.proto' cannot be excluded: the envelope Envelope needs imu.proto",
+            "exclude only what the envelope does not import",
+        ),
+        (
+            "a.proto", Code.BAD_VALUE, 3, "no .proto file declares a message 'Envelope'",
+            "does a file declare it that `exclude` leaves out (a.proto)?",
+        ),
+        ("b.proto", Code.BAD_FILE, 5, ". has no file or folder 'b.proto' to exclude", "did you mean 'c/b.proto'?"),
+    ],
+)  # fmt: skip
+def test_exclude_names_files_that_are_there_and_not_needed(
+    write: Write, excluded: str, code: Code, line: int, message: str, hint: str
+) -> None:
+    root = write(
+        {
+            "a.proto": ENVELOPE.replace("message Imu { float x = 1; }", 'import "imu.proto";'),
+            "imu.proto": 'syntax = "proto3";\nmessage Imu { float x = 1; }',
+            "c/b.proto": 'syntax = "proto3";\nmessage B {}',
+        }
+    )
+    with pytest.raises(TableError) as caught:
+        load_protos(*settings(root), exclude=excluding(excluded))
+    (found,) = caught.value.diagnostics
+    assert (found.code, found.span.line, found.message, found.hint) == (code, line, message, hint)
+
+
+def test_protos_are_read_again_once_something_else_is_excluded(write: Write) -> None:
+    protos, message, *_ = settings(write({"a.proto": ENVELOPE, "b.proto": "message B {}"}))
+    whole = EnvelopeSettings(protos, message, ONEOF)
+    known = Definitions().protos(whole)
+    assert Definitions(known).protos(whole) is known
+    assert Definitions(known).protos(replace(whole, exclude=excluding("b.proto"))).warnings == ()
 
 
 def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: Write) -> None:
