@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,8 @@ from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_
 from router.table.model import RouteTable
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
-from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
+from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
+from router.types.wire import read_varint
 
 Peer = tuple[str, int]
 """The IP address and port of a sender."""
@@ -64,10 +65,10 @@ class Wire:
         try:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:
-            raise DecodeError(f"malformed: no {self.envelope.name}") from error
+            raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
         name = outer.WhichOneof(self.envelope.oneof)
         if name is None:
-            reason, detail = why_no_payload(outer, {case.number for case in self.envelope.cases.values()})
+            reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
         return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram))
 
@@ -109,25 +110,88 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
         return f"{length} bytes"
     if not data:
         return ""
+    whole = data if len(data) == length else b""
     try:
         outer = envelope.message_class.FromString(restored(data) if repairs else data)
-    except ProtobufError as error:
-        return str(error)
+    except ProtobufError:
+        return _why_malformed(envelope, whole)
     name = outer.WhichOneof(envelope.oneof)
     if name is not None:
         return str(name)
-    return why_no_payload(outer, {case.number for case in envelope.cases.values()})[1]
+    return _why_no_payload(envelope, outer, whole)[1]
 
 
-def why_no_payload(envelope: Message, cases: Container[int]) -> tuple[str, str]:
-    """Return the reason why a parsed envelope has no payload, and the field that causes it, or "".
-
-    `cases` are the field numbers of the payload cases: one of them among the unknown fields has the wrong wire type.
-    """
-    fields = UnknownFieldSet(envelope)
+def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tuple[str, str]:
+    """Return the reason why a parsed envelope has no payload, and the field that causes it, or ""."""
+    cases = {case.number for case in envelope.cases.values()}
+    fields = UnknownFieldSet(outer)
     numbers = [fields[index].field_number for index in range(len(fields))]
     if not numbers:
         return "no_payload", ""
+    # A payload case among the unknown fields has the wrong wire type.
     if known := [number for number in numbers if number in cases]:
-        return "malformed", f"field {known[0]} is no message here"
+        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is no message here")
     return "unknown_case", f"field {numbers[0]}"
+
+
+def _why_malformed(envelope: Envelope, datagram: bytes, what: str = "") -> str:
+    """Say what is wrong, and what most likely causes it: firmware that frames an envelope, or sends none."""
+    cause = _framing(envelope, datagram) or _bare_payload(envelope, datagram)
+    return "; ".join(filter(None, (what or f"no {envelope.name}", cause)))
+
+
+_CHECKSUMS = (1, 2, 4)
+"""Bytes of what serial protocols send behind a message."""
+
+
+def _framing(envelope: Envelope, datagram: bytes) -> str:
+    """What stands before or behind an envelope that is complete."""
+    for size, length in _lengths(datagram):
+        if length == len(datagram) - size and _has_payload(envelope, datagram[size:]):
+            return f"its own length ({_bytes(size)}) stands before it: send the envelope alone"
+    for size in _CHECKSUMS:
+        if _has_payload(envelope, datagram[:-size]):
+            return f"{_bytes(size)} stand behind it, as a checksum would: send the envelope alone"
+    return ""
+
+
+def _lengths(datagram: bytes) -> Iterator[tuple[int, int]]:
+    """The numbers that a datagram may begin with, each behind the bytes that it takes."""
+    try:
+        length, size = read_varint(datagram, 0)
+    except IndexError:
+        return
+    yield size, length
+    for size in (1, 2, 4):
+        for order in ("little", "big"):
+            yield size, int.from_bytes(datagram[:size], order)
+
+
+def _has_payload(envelope: Envelope, data: bytes) -> bool:
+    outer = _parsed(envelope.message_class, data)
+    return outer is not None and outer.WhichOneof(envelope.oneof) is not None
+
+
+def _bare_payload(envelope: Envelope, datagram: bytes) -> str:
+    """The payload cases that a datagram may be without its envelope."""
+    cases = [case.name for case in envelope.cases.values() if _parsed(case.message_class, datagram)]
+    if not cases:
+        return ""
+    names = " or ".join(f"'{name}'" for name in cases) if len(cases) <= _MOST_NAMED else "one of several cases"
+    return f"it may be the payload {names} without its envelope"
+
+
+_MOST_NAMED = 3
+
+
+def _parsed(message_class: MessageClass, data: bytes) -> Message | None:
+    """The message, if it has fields and knows them all."""
+    try:
+        message = message_class.FromString(data)
+    except ProtobufError:
+        return None
+    return message if message.ListFields() and not len(UnknownFieldSet(message)) else None
+
+
+def _bytes(size: int) -> str:
+    return "1 byte" if size == 1 else f"{size} bytes"

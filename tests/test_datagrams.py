@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from router.datagrams import Wire, framed, wire_of_protos
+from router.datagrams import Wire, framed, why_rejected, wire_of_protos
 from router.errors import DecodeError, UsageError
 from router.values import payload
 
@@ -50,7 +50,7 @@ def test_padding_never_cuts() -> None:
         ("", "empty"),
         ("ffff", "malformed: no PBEnvelope"),
         ("1a00", "unknown_case: field 3"),
-        ("1001", "malformed: field 2 is no message here"),
+        ("1001", "malformed: field 2 is no message here; it may be the payload 'every_kind' without its envelope"),
         ("0000", "no_payload"),
     ],
 )
@@ -58,6 +58,33 @@ def test_what_cannot_be_decoded_says_why(wire: Wire, datagram: str, problem: str
     with pytest.raises(DecodeError) as caught:
         wire.decode(bytes.fromhex(datagram))
     assert str(caught.value) == problem
+
+
+ENVELOPE = bytes.fromhex("12050d0000803f")
+ALONE = "send the envelope alone"
+
+
+@pytest.mark.parametrize(
+    ("datagram", "cause"),
+    [
+        (b"\x07" + ENVELOPE, f"its own length (1 byte) stands before it: {ALONE}"),
+        (b"\x00\x07" + ENVELOPE, f"its own length (2 bytes) stands before it: {ALONE}"),
+        (b"\x07\x00\x00\x00" + ENVELOPE, f"its own length (4 bytes) stands before it: {ALONE}"),
+        (ENVELOPE + b"\x1f\x2f", f"2 bytes stand behind it, as a checksum would: {ALONE}"),
+        (ENVELOPE[2:], "it may be the payload 'plain' without its envelope"),
+        (b'{"value": 1.0}', ""),
+    ],
+)
+def test_what_firmware_does_with_an_envelope_is_recognised(wire: Wire, datagram: bytes, cause: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        wire.decode(datagram)
+    told = why_rejected(wire.envelope, datagram, len(datagram), repairs=True)
+    assert (str(caught.value), told.partition("; ")[2]) == (f"malformed: {told}", cause)
+
+
+def test_a_part_of_a_datagram_is_not_taken_for_another_one(wire: Wire) -> None:
+    whole = ENVELOPE[2:] * 9
+    assert why_rejected(wire.envelope, whole[:5], len(whole), repairs=True) == "field 1 is no message here"
 
 
 def test_a_datagram_that_the_router_would_not_take_is_not_decoded(wire: Wire) -> None:

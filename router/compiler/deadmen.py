@@ -161,10 +161,11 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
     message = f"it would cut into commands of '{case}', which '{board}' gets too"
-    alternative = "`because: why`" if named else "`disarmed_by: []` if that is intended"
+    # Commands to another motor of the board must not disarm it: it would stay silent for as long as they come.
+    beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
-    hint = f"say `disarmed_by: {value}`, or {alternative}"
+    hint = f"say `disarmed_by: {value}` if they take over from '{route.case.value}', {beside} if they move something else"
     lookup.report(
         deadman.disarmed_by[0].span if deadman.disarmed_by else deadman.span, Code.DOUBTFUL_DEADMAN, message, hint
     )
