@@ -165,7 +165,9 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
-    hint = f"say `disarmed_by: {value}` if they take over from '{route.case.value}', {beside} if they move something else"
+    hint = (
+        f"say `disarmed_by: {value}` if they take over from '{route.case.value}', {beside} if they move something else"
+    )
     lookup.report(
         deadman.disarmed_by[0].span if deadman.disarmed_by else deadman.span, Code.DOUBTFUL_DEADMAN, message, hint
     )
