@@ -116,7 +116,7 @@ DROP_REASONS: Mapping[str, str] = {
 
 GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "too_large": "longer than the gateway takes, also after decompression",
-    "malformed": "no packet or document of the gateway's format",
+    "malformed": "no packet or document of the gateway's format, or no JSON",
     "source_mismatch": "not from the host that the gateway sends to",
     "not_allowed": "a topic that `inbound` does not have",
     "wrong_type": "another type than `inbound` says",

@@ -19,7 +19,7 @@ from typing import NamedTuple, Union
 import msgspec
 import orjson
 
-from router.gateway.json_codec import InvalidMessageError, shown
+from router.gateway.json_codec import reader, shown
 from router.gateway.json_types import example, schema_text
 from router.gateway.packets import PacketError
 from router.types.model import MessageType
@@ -86,20 +86,15 @@ class _Schema(msgspec.Struct, tag_field="op", tag="schema", forbid_unknown_field
     type: str | None = None
 
 
-_decode = msgspec.json.Decoder(Union[_Publish, _Schema]).decode
+_read = reader(msgspec.json.Decoder(Union[_Publish, _Schema]))
 
 
 def request(text: bytes) -> Request:
-    """What a client asks for. The data of a message are not read yet.
-
-    Raises PacketError for JSON that is no request, InvalidMessageError for what is no JSON.
-    """
+    """What a client asks for. The data of a message are not read yet. Raises PacketError for what is no request."""
     try:
-        found = _decode(text)
+        found = _read(text)
     except msgspec.ValidationError as error:
         raise PacketError(f"no request: {shown(str(error))}") from None
-    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
-        raise InvalidMessageError(f"no JSON: {shown(str(error))}") from None
     if isinstance(found, _Schema):
         return SchemaRequest(found.type)
     return PublishRequest(found.topic, found.type, found.time, bytes(found.data))

@@ -99,7 +99,7 @@ class Encoding(ABC):
 
     @abstractmethod
     def request(self, data: bytes) -> Request:
-        """What a client has sent. Raises PacketError for what has not the format, InvalidMessageError."""
+        """What a client has sent. Raises PacketError for what has not the format."""
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         """The same frames as the transport is to send them."""

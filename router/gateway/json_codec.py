@@ -11,7 +11,7 @@ import linecache
 import struct
 from collections.abc import Callable, Sequence
 from itertools import count
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import msgspec
 import numpy as np
@@ -27,12 +27,15 @@ from router.compiler.cdr import (
     scalar_format,
 )
 from router.gateway.json_types import PLACEHOLDER, Style
+from router.gateway.packets import PacketError
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
+
+T = TypeVar("T")
 
 Encode = Callable[[bytes], bytes]
 """From CDR bytes with their header to UTF-8 JSON. Raises UnreadableError."""
 Decode = Callable[[bytes], bytes]
-"""From UTF-8 JSON to CDR bytes with their header. Raises InvalidMessageError."""
+"""From UTF-8 JSON to CDR bytes with their header. Raises InvalidMessageError, and PacketError for what is no JSON."""
 
 
 class UnreadableError(ValueError):
@@ -275,17 +278,38 @@ def decoder(message: MessageType, style: Style) -> Decode:
     Nothing is converted: 3.0 is no integer, and 1 is no bool. An integer is a float where one is wanted.
     """
     writing = _Writing(style)
-    read: Callable[[bytes], Any] = msgspec.json.Decoder(writing.struct(message)).decode
+    read: Callable[[bytes], Any] = reader(msgspec.json.Decoder(writing.struct(message)))
 
     def decode(text: bytes) -> bytes:
         data = bytearray()
         try:
             writing.write(data, message, read(text), "")
-        except (msgspec.DecodeError, UnicodeError, RecursionError, InvalidMessageError) as error:
+        except (msgspec.ValidationError, UnicodeError, InvalidMessageError) as error:
             raise InvalidMessageError(shown(str(error))) from None
         return HEADER + data
 
     return decode
+
+
+_AnyJson = msgspec.json.Decoder(msgspec.Raw)
+
+
+def reader(decoder: msgspec.json.Decoder[T]) -> Callable[[bytes], T]:
+    """A function that reads JSON. It raises PacketError for what is no JSON, ValidationError for any other."""
+
+    def read(text: bytes) -> T:
+        try:
+            try:
+                return decoder.decode(text)
+            except msgspec.ValidationError:
+                _AnyJson.decode(text)  # the fault may come before the end of what is JSON
+                raise
+        except msgspec.ValidationError:
+            raise
+        except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+            raise PacketError(f"no JSON: {shown(str(error))}") from None
+
+    return read
 
 
 def shown(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Damaged and hostile messages: either bytes that the reference reads, or InvalidMessageError, and nothing else."""
+"""Damaged and hostile messages: bytes that the reference reads, or one of two errors, and nothing else."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 
 from router.gateway.json_codec import InvalidMessageError, decoder
 from router.gateway.json_types import Style, example
+from router.gateway.packets import PacketError
 from router.rehearsal.cdr import deserialize as parse
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String
 from router.types.ros import ros_interfaces
@@ -87,7 +88,7 @@ def test_mutated_messages_are_refused_or_sound(declared: MessageType, style: Sty
         try:
             parse(declared, decode(text))
             outcomes.append("")
-        except InvalidMessageError as error:
+        except (InvalidMessageError, PacketError) as error:
             outcomes.append(str(error))
     assert outcomes.count("") > 40
     assert len({*outcomes}) > 40

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from router.gateway.json_codec import InvalidMessageError, decoder, encoder
 from router.gateway.json_types import PLACEHOLDER, Style, example
+from router.gateway.packets import PacketError
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
@@ -34,7 +35,7 @@ def build(declared: MessageType, text: str | bytes, style: Style = Style.PLAIN) 
 def refusal(declared: MessageType, value: Any, style: Style = Style.PLAIN) -> str:
     """Why a value is refused, or the text of one."""
     text = value if isinstance(value, bytes) else json.dumps(value).encode()
-    with pytest.raises(InvalidMessageError) as caught:
+    with pytest.raises((InvalidMessageError, PacketError)) as caught:
         decoder(declared, style)(text)
     return str(caught.value)
 
