@@ -54,7 +54,7 @@ version: 1
 envelope: {{protos: ., message: PBEnvelope, oneof: payload}}
 listen: {{here: {{address: "127.0.0.1:5000"}}}}
 endpoints:
-  sensors: {{address: "192.168.0.30:8", kind: tool}}
+{spare}  sensors: {{address: "192.168.0.30:8", kind: tool}}
   wheels: {{address: "192.168.0.31:8", kind: board{wire}}}
   operator: {{address: "192.168.0.10:9000", kind: basestation{radio}}}
 routes:
@@ -84,7 +84,14 @@ routes:
 """
 MOST_TO_BOARD = 1400
 BRAKE = b"\x32\x02\x08\x01"
-PEERS = {"sensors": ("192.168.0.30", 8), "wheels": ("192.168.0.31", 8), "operator": ("192.168.0.10", 9000)}
+SPARE = '  spare: {address: "192.168.0.29:8", kind: tool}\n'
+"""An endpoint before the others, which then have other numbers."""
+PEERS = {
+    "spare": ("192.168.0.29", 8),
+    "sensors": ("192.168.0.30", 8),
+    "wheels": ("192.168.0.31", 8),
+    "operator": ("192.168.0.10", 9000),
+}
 STRANGER = ("192.168.0.99", 9000)
 
 
@@ -108,10 +115,11 @@ SOURCES: Mapping[str, tuple[str | None, ...]] = {
     "sensors": ("sensors",),
     "wheels": ("wheels",),
     "[wheels, sensors]": ("sensors", "wheels"),
-    "any": ("sensors", "wheels", "operator", None),
+    "any": ("spare", "sensors", "wheels", "operator", None),
 }
 CHOICES: Mapping[str, list[Any]] = {
     "sources": [*SOURCES],
+    "spare": ["", SPARE],
     "telemetry": [*RATES, *CONDITIONS],
     "bulk": [To(), To(), *RATES],
     "topic": [*RATES, *CONDITIONS],
@@ -132,6 +140,7 @@ class Setting:
     """What may differ between two tables; bandwidths in bytes per second, times in ms."""
 
     sources: str
+    spare: str
     telemetry: To
     bulk: To
     topic: To
@@ -151,6 +160,7 @@ class Setting:
         return TABLE.format(
             **{name: value for name, value in vars(self).items() if isinstance(value, To)},
             sources=self.sources,
+            spare=self.spare,
             ttl=ORDERS_TTL,
             options="\n    ".join(options),
             radio="" if self.radio is None else f", bandwidth: {self.radio}B/s",
@@ -179,7 +189,7 @@ class Setting:
                 target("orders", "wheels", self.orders, **command),
             ),
             sources={
-                "telemetry": SOURCES[self.sources],
+                "telemetry": tuple(each for each in SOURCES[self.sources] if each != "spare" or self.spare),
                 "bulk": ("sensors",),
                 **dict.fromkeys(("drive", "arm", "part"), ("operator",)),
                 "orders": (None,),
