@@ -273,10 +273,10 @@ class Services:
         own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
         return {**own, "endpoint_stale_after_seconds": self._stale_after}
 
-    def _stale_after(self) -> Iterator[tuple[tuple[str], float]]:
+    def _stale_after(self) -> Iterator[tuple[tuple[str, str], float]]:
         for endpoint in self._running.program.table.endpoints.values():
             if endpoint.stale_after is not None:
-                yield (endpoint.name,), endpoint.stale_after / 1e9
+                yield (endpoint.name, endpoint.kind.value), endpoint.stale_after / 1e9
 
     def deadman_tripped(self, route: str) -> None:
         """Called by the deadman's thread: returns at once."""

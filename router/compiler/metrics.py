@@ -54,7 +54,7 @@ METRICS = (
     ),
     Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last took a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
-    Metric("endpoint_stale_after_seconds", "number", ("endpoint",), "Silent for longer, it is stale."),
+    Metric("endpoint_stale_after_seconds", "number", ("endpoint", "kind"), "Silent for longer, it is stale."),
     Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
     Metric("deadman_trips", "counter", ("route",), "How often commands stopped coming."),
     Metric(

@@ -32,7 +32,12 @@ class Level(enum.IntEnum):
     STALE = 3
 
 
-_LEVELS = {health.Level.CRITICAL: Level.ERROR, health.Level.WARNING: Level.WARN, health.Level.INFO: Level.OK}
+_LEVELS = {
+    health.Level.CRITICAL: Level.ERROR,
+    health.Level.WARNING: Level.WARN,
+    health.Level.INFO: Level.OK,
+    health.Level.CALM: Level.OK,
+}
 _SEVERITY = (Level.OK, Level.WARN, Level.STALE, Level.ERROR)
 
 
@@ -136,6 +141,8 @@ class Report:
         sends = any(source.value == name for route in routes for source in route.sources)
         has_sent = self._look.now.total(LAST_SEEN, name)
         well = "sends" if has_sent else "nothing came yet" if sends else "is not expected to send"
+        if any(name in away for away in self._look.away.values()):
+            well = "is silent: nobody drives"
         problems = self._labelled(name, *_TO_ENDPOINTS)
         return _status(f"endpoint/{name}", str(endpoint.address.value), problems, well, values)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from router.compiler.metrics import INTENDED_REASONS
 from router.observe.snapshot import SERIES, Labels, Snapshot
+from router.table.model import EndpointKind
 from router.values import age_text
 
 if TYPE_CHECKING:
@@ -33,11 +34,19 @@ PAGE = "docs/troubleshooting/alerts.md"
 
 
 class Level(enum.Enum):
-    """CRITICAL: the rover may not obey. WARNING: something is lost. INFO: something is not as the table has it."""
+    """CRITICAL: the rover may not obey. WARNING: something is lost. INFO: something is not as the table has it.
+
+    CALM: nothing is wrong, but the rover stands still.
+    """
 
     CRITICAL = "critical"
     WARNING = "warning"
     INFO = "info"
+    CALM = "calm"
+
+    @property
+    def is_fault(self) -> bool:
+        return self in (Level.CRITICAL, Level.WARNING)
 
 
 class Kind(enum.Enum):
@@ -78,7 +87,7 @@ class Kind(enum.Enum):
     )
     DEADMAN_ACTIVE = (
         Level.WARNING,
-        "commands of {route} stopped coming: its deadman sends in their place",
+        "commands of {route} do not get through: its deadman sends in their place",
         "`router explain` says who sends them. Do they come often enough, from a clock that agrees with this one?",
         "deadman_active",
     )
@@ -164,6 +173,13 @@ class Kind(enum.Enum):
         "`router explain {route} --live` names them: source their packages, or exclude them.",
         "gateway_topics",
     )
+    HALTED = (
+        Level.CALM,
+        "{route} is halted: no commands",
+        "Nobody drives; the next command ends it. Otherwise `router explain` says who sends commands.",
+        "deadman_active",
+        60,  # s; until then nobody knows whether the link was lost
+    )
 
     @property
     def alert(self) -> str:
@@ -236,7 +252,7 @@ _MORE: Mapping[Kind, str] = {
 }
 """By how much a value is too large, where that is of interest."""
 
-_GAUGES = (Kind.LISTENER_WAITING, Kind.DEADMAN_ACTIVE, *_MORE)
+_GAUGES = (Kind.LISTENER_WAITING, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
     Kind.MESSAGES_DROPPED,
@@ -259,13 +275,14 @@ class Look:
     """A router at the time of the last of `snapshots`, of the last WINDOW seconds, oldest first.
 
     `silence`: for how long each endpoint has been silent, or was not heard yet, s. `standing`: for how long the receive
-    thread has made no progress, s.
+    thread has made no progress, s. `tripped`: for how long the deadmen that send now have done so, s, by route.
     """
 
     program: Program
     snapshots: Sequence[Snapshot]
     silence: Mapping[str, float]
     standing: float
+    tripped: Mapping[str, float]
 
     @property
     def now(self) -> Snapshot:
@@ -287,10 +304,57 @@ class Look:
     def problems(self) -> tuple[Problem, ...]:
         """All that is wrong, in the order of kinds."""
         found = chain(
-            self._states(), self._silent(), self._waiting(), *map(self._above, _GAUGES), *map(self._lost, _LOSSES)
+            self._states(),
+            self._silent(),
+            self._tripped(),
+            self._waiting(),
+            *map(self._above, _GAUGES),
+            *map(self._lost, _LOSSES),
         )
         rank = {kind: place for place, kind in enumerate(Kind)}
         return tuple(sorted(found, key=lambda problem: rank[problem.kind]))
+
+    @cached_property
+    def halted(self) -> frozenset[str]:
+        """The routes whose deadman has sent for so long that nobody drives: none of whose commands is refused, and
+        which the deadman reaches."""
+        failing = {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
+        for labels, _ in self.grown(Kind.MESSAGES_DROPPED.metric):
+            named = dict(zip(SERIES[Kind.MESSAGES_DROPPED.metric], labels, strict=True))
+            if named["reason"] not in _NO_LOSS:
+                failing.add(named["route"])
+        return frozenset(route for route, s in self.tripped.items() if s > Kind.HALTED.threshold) - failing
+
+    @cached_property
+    def away(self) -> Mapping[str, Sequence[str]]:
+        """By halted route, those who send its commands and are silent because nobody drives. A board is not."""
+        endpoints = self.program.table.endpoints
+        away = {
+            name for name in self._stale if endpoints[name].kind is not EndpointKind.BOARD and self._was_heard(name)
+        }
+        return {route: sorted(away & self._sources.get(route, set())) for route in sorted(self.halted)}
+
+    @cached_property
+    def _sources(self) -> Mapping[str, set[str]]:
+        """The endpoints that each route takes messages from."""
+        return {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
+
+    @cached_property
+    def _limits(self) -> Mapping[str, float]:
+        """The `stale_after` of each endpoint that a route takes messages from, s."""
+        senders = {name for names in self._sources.values() for name in names}
+        return {
+            endpoint.name: endpoint.stale_after / 1e9
+            for endpoint in self.program.table.endpoints.values()
+            if endpoint.stale_after is not None and endpoint.name in senders
+        }
+
+    @cached_property
+    def _stale(self) -> set[str]:
+        return {name for name, limit in self._limits.items() if self.silence.get(name, 0.0) > limit}
+
+    def _was_heard(self, endpoint: str) -> bool:
+        return bool(self.now.total(Kind.ENDPOINT_SILENT.metric, endpoint))
 
     def _states(self) -> Iterator[Problem]:
         if self.standing > Kind.RECEIVE_STUCK.threshold:
@@ -303,24 +367,26 @@ class Look:
 
     def _silent(self) -> Iterator[Problem]:
         """Those whose commands a deadman replaces first."""
-        sources = {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
-        senders = {name for names in sources.values() for name in names}
-        limits = {
-            endpoint.name: endpoint.stale_after / 1e9
-            for endpoint in self.program.table.endpoints.values()
-            if endpoint.stale_after is not None and endpoint.name in senders
-        }
-        silent = {name for name, limit in limits.items() if self.silence.get(name, 0.0) > limit}
-        held = {
-            name for (route,), on in self.now.counts("deadman_active").items() if on for name in sources.get(route, ())
-        }
-        for name in sorted(silent, key=lambda name: (name not in held, name)):
+        silent, away = self._stale, set(chain.from_iterable(self.away.values()))
+        held = set(chain.from_iterable(self._sources.get(route, ()) for route in self.tripped))
+        for name in sorted(silent - away, key=lambda name: (name not in held, name)):
             kind, more = Kind.ENDPOINT_NEVER_HEARD, ""
-            if self.now.total(Kind.ENDPOINT_SILENT.metric, name):
+            if self._was_heard(name):
                 kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[name])}"
-            routes = tuple(route for route, names in sources.items() if name in names and names <= silent)
+            routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
             problem = self._problem(kind, {"endpoint": name}, more, routes)
-            yield problem if len(silent) < len(limits) or len(limits) == 1 else problem._replace(remedy=_ALL_SILENT)
+            is_one_of_all = len(silent) == len(self._limits) > 1
+            yield problem._replace(remedy=_ALL_SILENT) if is_one_of_all else problem
+
+    def _tripped(self) -> Iterator[Problem]:
+        """Deadmen that send in place of commands: somebody drove until just now, or nobody drives."""
+        for route, seconds in self.tripped.items():
+            kind, more = Kind.DEADMAN_ACTIVE, ""
+            if route in self.halted:
+                kind, more = Kind.HALTED, f" for {age_text(seconds)}"
+                if silent := self.away[route]:
+                    more += f", and {' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} silent"
+            yield self._problem(kind, {"route": route}, more, (self._owner(route),))
 
     def _waiting(self) -> Iterator[Problem]:
         """In a publish call, or for a thread."""

@@ -16,6 +16,7 @@ LAST_SEEN = Kind.ENDPOINT_SILENT.metric
 METRICS = {kind.metric for kind in Kind} | {
     "datagrams_received",
     "deadman_datagrams_sent",
+    "deadman_trips",
     "gateway_clients",
     "messages_received",
     "mirror_dropped",
@@ -25,12 +26,16 @@ METRICS = {kind.metric for kind in Kind} | {
 
 
 class Watch:
-    """The last snapshots, and since when endpoints are silent and the receive thread stands still. Thread-safe."""
+    """The last snapshots, and since when endpoints are silent, deadmen send and the receive thread stands still.
+
+    Thread-safe.
+    """
 
     def __init__(self, running: Running) -> None:
         self._running = running
         self._snapshots: deque[Snapshot] = deque()
         self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
+        self._tripped: dict[str, tuple[float, int]] = {}  # by route: the number of trips, and when this was seen first
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
@@ -40,13 +45,19 @@ class Watch:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
             earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
             seen = {name: self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
+            self._tripped = {
+                route: found if (found := self._tripped.get(route, (-1, 0)))[0] == trips else (trips, now)
+                for (route,), trips in latest.counts("deadman_trips").items()
+                if latest.of(Kind.DEADMAN_ACTIVE.metric, route).get(())
+            }
+            tripped = {route: (now - since) / 1e9 for route, (_, since) in self._tripped.items()}
             while self._snapshots and latest.at - self._snapshots[0].at > WINDOW + PERIOD / 2:
                 self._snapshots.popleft()
             snapshots = (*self._snapshots, latest)
             if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
                 self._snapshots.append(latest)
         silence = {name: (now - then) / 1e9 for name, then in seen.items()}
-        return Look(program, snapshots, silence, self.standing(now))
+        return Look(program, snapshots, silence, self.standing(now), tripped)
 
     def standing(self, now: int) -> float:
         """For how long the receive thread has made no progress, s, as far as it was looked at."""

@@ -108,9 +108,12 @@ def _told(program: Program, running: Health) -> Iterator[CheckResult]:
     if running.table_sha256 != program.table.sha256:
         yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
     for each in running.problems:
+        if each.kind.level is Level.CALM:
+            yield fine("router", each.text)
+            continue
         grade = problem if each.kind.level is Level.CRITICAL else warning
         yield grade("router", each.text, f"{each.remedy} See {each.page}")
-    if not running.problems:
+    if all(each.kind.level is Level.CALM for each in running.problems):
         yield fine("router", f"it runs and loses nothing; {plural(running.received, 'datagram')} received")
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
-from router.observe.health import Kind, Level, Problem
+from router.observe.health import Kind, Problem
 from router.observe.snapshot import COLLECTED_AT, Snapshot, parse_metrics
 from router.observe.tap import Lost, StreamReader
 from router.recording.mirror import MirroredDatagram
@@ -42,7 +42,7 @@ class Health(NamedTuple):
 
     @property
     def is_degraded(self) -> bool:
-        return any(problem.kind.level is not Level.INFO for problem in self.problems)
+        return any(problem.kind.level.is_fault for problem in self.problems)
 
 
 def url_of(table: RouteTable) -> str:

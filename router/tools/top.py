@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.metrics import INTENDED_REASONS
-from router.observe.health import Kind, Problem
+from router.observe.health import Kind, Level, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
 WINDOW = 3.0
@@ -90,7 +90,7 @@ class View:
     """All routes, and what no route took, by reason.
 
     `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints of which that is a problem.
-    `problems`: all that is wrong, in words.
+    `problems`: all that is wrong, in words; `calm`: what stands still because nobody drives.
     """
 
     routes: tuple[RouteRow, ...]
@@ -101,6 +101,7 @@ class View:
     silence: Mapping[str, float | None] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
+    calm: tuple[str, ...] = ()
 
 
 class Window:
@@ -155,7 +156,8 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), no
         kernel_drops=after.total("kernel_drops"),
         silence=silence,
         silent=tuple(name for name in silence if _has(problems, Kind.ENDPOINT_SILENT, endpoint=name)),
-        problems=tuple(problem.text for problem in problems),
+        problems=tuple(problem.text for problem in problems if problem.kind.level is not Level.CALM),
+        calm=tuple(problem.text for problem in problems if problem.kind.level is Level.CALM),
     )
 
 

@@ -138,6 +138,8 @@ def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
     if view.problems:
         lines.append(Text("! " + "; ".join(view.problems), style="bold red", no_wrap=True, overflow="ellipsis"))
+    if view.calm:
+        lines.append(Text("; ".join(view.calm), style="dim", no_wrap=True, overflow="ellipsis"))
     return [*lines, *_last_heard(view, width, endpoint_lines)]
 
 

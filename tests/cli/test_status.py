@@ -14,6 +14,7 @@ from tests.tools.answering import answering
 
 SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, " for 8 s", "Check power and cable.")
 HELD = Problem(Kind.DEADMAN_ACTIVE, {"route": "drive"}, routes=("drive",))
+HALTED = Problem(Kind.HALTED, {"route": "drive"}, " for 27 min", routes=("drive",))
 SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
 
 
@@ -22,6 +23,12 @@ SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
     [
         ([], OK, "running: 7 datagrams received"),
         ([SWITCHED_OFF], OK, "running: arm_board was never heard since the router started; 7 datagrams received"),
+        ([HALTED], OK, "running: drive is halted: no commands for 27 min; 7 datagrams received"),
+        (
+            [SILENT, HALTED],
+            DEGRADED,
+            "degraded: arm_board is silent for 8 s; drive is halted: no commands for 27 min; 7 datagrams received",
+        ),
         (
             [SILENT, HELD],
             DEGRADED,

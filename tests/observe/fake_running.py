@@ -89,10 +89,14 @@ class FakeRunning:
 
 
 class FakeHealth:
-    """Looks when it is asked. What was counted since `begin` is recent, and endpoints are silent since they sent."""
+    """Looks when it is asked. What was counted since `begin` is recent, and endpoints are silent since they sent.
+
+    `parked`: for how long deadmen have sent, s.
+    """
 
     def __init__(self, running: FakeRunning) -> None:
         self._running = running
+        self.parked = 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -108,7 +112,9 @@ class FakeHealth:
         seen = {name: int(stamp * 1e9) for (name,), stamp in look.now.counts(LAST_SEEN).items()}
         silence = {name: (now - (seen.get(name) or self._began)) / 1e9 for name in look.silence}
         snapshots = (self._first.now, look.now)
-        return replace(look, snapshots=snapshots, silence=silence, standing=3.0 if self.is_stuck else 0.0)
+        tripped = dict.fromkeys(look.tripped, self.parked)
+        standing = 3.0 if self.is_stuck else 0.0
+        return replace(look, snapshots=snapshots, silence=silence, standing=standing, tripped=tripped)
 
     def _look(self, wall: int) -> Look:
         collected = self._running.collected

@@ -77,7 +77,7 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
             "deadman_active dashboard:/cmd_vel",
             "gateway/dashboard",
             Level.WARN,
-            "commands of dashboard:/cmd_vel stopped",
+            "commands of dashboard:/cmd_vel do not get",
         ),
         (
             "gateway_topics dashboard not_installed",
@@ -108,8 +108,20 @@ def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Count
     assert status.message == (
         "driving_board does not get what the deadman of manual_drive sends, 3 in 6 s; "
         "basestation was never heard since the router started; "
-        "commands of manual_drive stopped coming: its deadman sends in their place"
+        "commands of manual_drive do not get through: its deadman sends in their place"
     )
+
+
+def test_a_rover_that_nobody_drives_is_well(router: Counting) -> None:
+    router.hear("basestation")
+    router.look(1)
+    router.count("deadman_active", "manual_drive", to=1)
+    router.look(1)
+    told = reported(router, 61)
+    assert told["route/manual_drive"].level == told["endpoint/basestation"].level == Level.OK
+    halted = "manual_drive is halted: no commands for 61 s, and basestation is silent"
+    assert halted in told["route/manual_drive"].message
+    assert told["endpoint/basestation"].message == "is silent: nobody drives"
 
 
 def test_every_problem_is_told_somewhere(router: Counting) -> None:

@@ -24,11 +24,15 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
 @pytest.mark.parametrize(
     ("series", "value", "told"),
     [
-        ("deadman_active manual_drive", 1, "commands of manual_drive stopped coming: its deadman sends in their place"),
+        (
+            "deadman_active manual_drive",
+            1,
+            "commands of manual_drive do not get through: its deadman sends in their place",
+        ),
         (
             "deadman_active dashboard:/cmd_vel",
             1,
-            "commands of dashboard:/cmd_vel stopped coming: its deadman sends in their place",
+            "commands of dashboard:/cmd_vel do not get through: its deadman sends in their place",
         ),
         (
             "deadman_send_errors manual_drive driving_board",
@@ -172,6 +176,68 @@ def test_who_is_silent_while_a_deadman_acts_comes_before_others_that_are(router:
     router.count("deadman_active", "manual_drive", to=1)
     first, second, *_ = router.told(10)
     assert (first, second) == ("basestation is silent for 10 s", "sensor_board is silent for 10 s")
+
+
+def parked(router: Counting, *routes: str) -> None:
+    """Somebody drove, and stopped more than a minute ago; boards still send."""
+    router.hear("basestation")
+    router.look(1)
+    for route in routes:
+        router.count("deadman_active", route, to=1)
+        router.count("deadman_trips", route, to=1)
+    for _ in range(61):
+        for board in ("sensor_board", "driving_board"):
+            router.hear(board)
+        router.look(1)
+
+
+def test_a_rover_that_nobody_drives_is_halted_and_that_is_no_fault(router: Counting) -> None:
+    router.count("deadman_active", "manual_drive", to=1)
+    [just_stopped] = router.look(1).problems
+    assert (just_stopped.kind, just_stopped.kind.level) == (Kind.DEADMAN_ACTIVE, Level.WARNING)
+    parked(router, "manual_drive", "manual_arm")
+    router.hear("basestation")
+    found = router.look(1).problems
+    assert [problem.text for problem in found] == [
+        "manual_drive is halted: no commands for 61 s",
+        "manual_arm is halted: no commands for 61 s",
+    ]
+    assert not any(problem.kind.level.is_fault for problem in found)
+    router.count("deadman_active", "manual_arm", to=0)
+    router.count("deadman_active", "manual_drive", to=0)
+    assert router.told(0) == []
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("deadman_trips", "manual_drive", to=2)
+    assert [problem.kind for problem in router.look(1).problems] == [Kind.DEADMAN_ACTIVE]
+
+
+def test_a_trip_between_two_looks_begins_anew(router: Counting) -> None:
+    parked(router, "manual_drive")
+    router.count("deadman_trips", "manual_drive", to=2)  # somebody has driven in between
+    assert Kind.DEADMAN_ACTIVE in {problem.kind for problem in router.look(1).problems}
+
+
+def test_who_drives_may_be_silent_while_nobody_does_and_a_board_may_not(router: Counting) -> None:
+    parked(router, "manual_drive")
+    [halted] = router.look(1).problems
+    assert halted.text == "manual_drive is halted: no commands for 61 s, and basestation is silent"
+    [first, *_, last] = router.told(4)
+    assert first == "driving_board is silent for 6.0 s"
+    assert last.startswith("manual_drive is halted")
+
+
+@pytest.mark.parametrize(
+    "failure",
+    ["messages_dropped manual_drive driving_board stale", "deadman_send_errors manual_drive driving_board"],
+)
+def test_commands_that_are_refused_and_a_deadman_that_cannot_send_are_faults_however_long(
+    router: Counting, failure: str
+) -> None:
+    parked(router, "manual_drive")
+    router.count(*failure.split(), to=9)
+    kinds = {problem.kind for problem in router.look(1).problems}
+    assert Kind.DEADMAN_ACTIVE in kinds
+    assert Kind.HALTED not in kinds
 
 
 @pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])

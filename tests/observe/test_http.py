@@ -115,7 +115,7 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
     [problem] = ask(server, "/health.json").json["problems"]
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")
     assert (problem["labels"], problem["routes"]) == ({"route": "manual_drive"}, ["manual_drive"])
-    assert problem["words"] == "commands of manual_drive stopped coming: its deadman sends in their place"
+    assert problem["words"] == "commands of manual_drive do not get through: its deadman sends in their place"
     assert problem["remedy"].startswith("`router explain` says who sends them")
 
 

@@ -24,6 +24,7 @@ from router.table.addresses import Address
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
 LOOPBACK = Address("127.0.0.1", 0)
 LABELS = {
+    "kind": "board",
     "listener": "rover",
     "reason": "stale",
     "result": "ok",

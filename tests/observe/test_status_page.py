@@ -242,10 +242,7 @@ def test_what_matters_most_is_said_in_the_banner_and_the_rest_beside_it(running:
     assert page.evaluate("document.title") == "! rover_router: arm_board is silent"
     page.until("document.querySelectorAll('#others li').length === 4")
     said = others(page)
-    assert (
-        "Commands of manual_drive stopped coming: its deadman sends in their place router explain says who sends them"
-        in said
-    )
+    assert "Commands of manual_drive do not get through: its deadman sends in their place router explain says" in said
     assert "The last reload failed: the table from before it goes on router validate says what is wrong" in said
     assert "arm_diag is received, and has no route, 3 in " in said
     assert "Nothing passes between imu_data and peers with another reliability, 1 of them ros2 topic info -v" in said
@@ -283,6 +280,21 @@ def test_a_silent_operator_is_said_before_the_deadmen_that_act(running: FakeRunn
     assert "■ deadman" in page.evaluate(f"{box('case:manual_drive')}.innerText")
     for key in ("from:@basestation", "to:@basestation"):
         assert "▲ silent" in page.evaluate(f"{box(key)}.innerText")
+
+
+def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
+    running: FakeRunning, health: FakeHealth, page: Page
+) -> None:
+    health.parked = 27 * 60
+    running.count("endpoint_last_seen_timestamp_seconds", "basestation", to=LONG_AGO)
+    running.count("deadman_active", "manual_drive", to=1)
+    until_said(page, "manual_drive is halted: no commands for 27 min, and basestation is silent", "")
+    assert page.evaluate("document.title") == "□ rover_router: manual_drive is halted: no commands"
+    assert "□ halted" in page.evaluate(f"{box('case:manual_drive')}.innerText")
+    assert page.evaluate("document.querySelectorAll('.silent, .troubled').length") == 0
+    running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
+    until_said(page, "arm_board is silent", "warn")
+    assert others(page).startswith("□ manual_drive is halted: no commands for 27 min, and basestation is silent")
 
 
 def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: FakeHealth, page: Page) -> None:

@@ -26,6 +26,7 @@ from router.tools.doctor_checks import (
     carrier,
     clock,
     endpoints,
+    fine,
     listeners,
     open_domain,
     ports,
@@ -396,6 +397,13 @@ def test_what_is_wrong_with_a_running_router_is_told_with_its_remedy_and_page(ta
     page = "docs/troubleshooting/alerts.md"
     assert first == problem("router", "the receive thread is stuck for 7 s", f"Restart it. See {page}#receivestuck")
     assert second == warning("router", "sensor_board is silent for 9 s", f"Check its cable. See {page}#endpointsilent")
+
+
+def test_a_rover_that_nobody_drives_is_fine(table: Path) -> None:
+    with serving(compiled(table), Problem(Kind.HALTED, {"route": "drive"}, " for 27 min")):
+        first, second = told(table)
+    assert first == fine("router", "drive is halted: no commands for 27 min")
+    assert second.grade is Grade.FINE
 
 
 def test_a_router_that_runs_another_table_is_told(table: Path) -> None:

@@ -82,6 +82,14 @@ def test_a_page_has_all_of_it() -> None:
     ]
 
 
+def test_a_route_that_is_halted_because_nobody_drives_is_no_alarm() -> None:
+    halted = Problem(Kind.HALTED, {"route": "imu_info"}, " for 27 min", routes=("imu_info",))
+    seen = view(snapshot(10, 0, 0), snapshot(12, 100, 10), [halted], NOW)
+    assert (seen.problems, seen.calm) == ((), ("imu_info is halted: no commands for 27 min",))
+    assert printed(Page(seen, Order.TABLE))[1] == "imu_info is halted: no commands for 27 min"
+    assert not any(line.startswith("!") for line in printed(Page(seen, Order.TABLE)))
+
+
 @pytest.mark.parametrize("height", [7, 8, 24])
 def test_a_screen_never_has_more_lines_than_there_are(height: int) -> None:
     lines = printed(Screen(SEEN, "title", Order.TABLE, height, "no answer"), width=64)
