@@ -120,10 +120,10 @@ class Heard:
     def payloads(self) -> list[str]:
         return [sample.payload.to_string() for sample in self._samples]
 
-    def await_one(self, send: Callable[[], object]) -> None:
-        """Repeat `send` until something has come."""
+    def await_one(self, send: Callable[[], object], count: int = 1) -> None:
+        """Repeat `send` until something has come, or `count` values."""
         with repeating(send):
-            wait_until(lambda: bool(self._samples), "a value")
+            wait_until(lambda: len(self._samples) >= count, "a value")
 
 
 def test_an_operator_reads_all_rovers_and_drives_his_own(
@@ -132,10 +132,10 @@ def test_an_operator_reads_all_rovers_and_drives_his_own(
     with fleet.hub(), rover_1(fleet, tmp_path, monkeypatch) as now, RosPeer(DRIVE) as peer:
         now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
         with fleet.operator("ann") as ann, fleet.operator("ben") as ben:
-            for session in (ann, ben):
-                heard = Heard(session, f"{MINE}/data/gw/word")
-                heard.await_one(partial(now.peer.say, "/gw/word", {"data": "x"}))
-                answers = [reply.ok for reply in session.get(f"{MINE}/**", timeout=10.0)]
+            for session, rovers in ((ann, "rovers/*"), (ben, MINE)):  # all first: reads by name would open the way
+                heard = Heard(session, f"{rovers}/data/**")
+                heard.await_one(partial(now.peer.say, "/gw/word", {"data": "x"}), count=3)  # the first always comes
+                answers = [reply.ok for reply in session.get(f"{rovers}/**", timeout=10.0)]
                 assert f"{MINE}/schema/std_msgs/msg/String" in [str(answer.key_expr) for answer in answers if answer]
         received = key("datagrams_received", listener="fleet")
         fleet.drive("ben", "rover_1")
@@ -166,6 +166,44 @@ def test_a_rover_publishes_below_its_own_key_only(tmp_path: Path, fleet: Fleet) 
         assert set(forged.payloads()) == {"real"}
         commands.await_one(lambda: ann.put(f"{MINE}/inbound/drive_motor", "real"))
         assert set(commands.payloads()) == {"real"}
+
+
+def test_wildcards_open_no_other_rover(fleet: Fleet) -> None:
+    """While an operator reads all rovers, neither a rover nor an operator gets at one that is not his by a wildcard."""
+    others = (f"{MINE}/**", "rovers/*/**", "rovers/**", "**")
+    with fleet.hub(), fleet.operator("ann") as ann, fleet.operator("rover_1") as rover, ExitStack() as opened:
+        read, commands = Heard(ann, "rovers/*/data/**"), Heard(rover, f"{MINE}/inbound/**")
+        rover.declare_queryable(f"{MINE}/**", lambda query: query.reply(f"{MINE}/data/word", "real"))
+        attackers = [opened.enter_context(fleet.operator(name)) for name in ("rover_2", "ben")]
+        spy = opened.enter_context(fleet.operator("rover_2"))
+        spied = [Heard(spy, where) for where in others]
+        asked: list[str] = []
+
+        def answer_falsely(query: zenoh.Query) -> None:
+            asked.append(str(query.key_expr))
+            query.reply(f"{MINE}/data/word", "forged")
+
+        for where in others:
+            attackers[0].declare_queryable(where, answer_falsely)
+        attackers[0].liveliness().declare_token("rovers/*/owner/1/forger/host/1")
+
+        def attack() -> None:
+            for session in attackers:
+                for where in ("rovers/*/data/word", "rovers/*/inbound/drive_motor", f"{MINE}/**", "rovers/**"):
+                    session.put(where, "forged")
+                    session.delete(where)
+                session.delete(f"{MINE}/inbound/drive_motor")
+            rover.put(f"{MINE}/data/word", "real")
+            ann.put(f"{MINE}/inbound/drive_motor", "real")
+
+        read.await_one(attack)
+        time.sleep(0.5)  # for what would have come as well
+        assert {*read.payloads()} == {*commands.payloads()} == {"real"}
+        assert [heard.payloads() for heard in spied] == [[]] * len(spied)
+        assert [reply.ok.payload.to_string() for reply in ann.get("rovers/**", timeout=10.0) if reply.ok] == ["real"]
+        assert asked == []
+        assert [*spy.get("rovers/**", timeout=10.0)] == []
+        assert [*rover.liveliness().get(f"{MINE}/owner/**", timeout=10.0)] == []
 
 
 @pytest.mark.parametrize("stranger", ["without", "of another authority", "by tcp"])
