@@ -7,7 +7,7 @@ import shlex
 import shutil
 from pathlib import Path
 
-from router.assets import asset
+from router.assets import asset, is_installed
 from router.cli import OK, Subparsers, add_verb
 from router.errors import UsageError, shown_path
 
@@ -33,8 +33,19 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--rover", action="store_true", help="the rover's tables, protos and ROS messages")
 
 
+def _rover_parts() -> dict[str, str]:
+    """What comes with the router: in a wheel, the protos are in the folders that the tables name."""
+    folder = asset("routes").parent
+    if not is_installed(folder):
+        return _ROVER
+    names = [name for name in _ROVER if (folder / name).exists()]
+    names += sorted({path.name for path in folder.iterdir()} - _ROVER.keys())
+    other = {True: _ROVER["protos"], False: "its field numbers"}
+    return {name: _ROVER.get(name, other[(folder / name).is_dir()]) for name in names}
+
+
 def run(args: argparse.Namespace) -> int:
-    parts = _ROVER if args.rover else _FIRST
+    parts = _rover_parts() if args.rover else _FIRST
     targets = {part: args.folder / part for part in parts}
     try:
         for target in targets.values():
@@ -42,7 +53,10 @@ def run(args: argparse.Namespace) -> int:
                 raise UsageError(f"{shown_path(target)} is there already; nothing was written")
         for part, target in targets.items():
             source = asset(part) if args.rover else FIRST_TABLE / part
-            shutil.copytree(source, target, copy_function=shutil.copyfile)  # drops read-only modes
+            if source.is_dir():
+                shutil.copytree(source, target, copy_function=shutil.copyfile)  # drops read-only modes
+            else:
+                shutil.copyfile(source, target)
     except OSError as error:
         raise UsageError(f"{args.folder} cannot be written: {error.strerror or error}") from error
     for part, target in targets.items():

@@ -120,7 +120,10 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
     if args.protos is None and (path := find(args)) is not None:
         table = read_table(path)
         return wire_of_table(table), table
-    return wire_of_protos(args.protos or asset("protos")), None
+    try:
+        return wire_of_protos(args.protos or asset("protos")), None
+    except FileNotFoundError:
+        raise UsageError("this router has no protos of its own", "name a table, by -t TABLE, or --protos DIR") from None
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:

@@ -245,8 +245,16 @@ def _named(model: type[M]) -> Callable[[Entry], M]:
 
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
-    ours = {} if settings.get("protos") else {"protos": Located(asset("protos"), entry.key.span)}
+    ours = {} if settings.get("protos") else {"protos": Located(_own_protos(entry.key.span), entry.key.span)}
     return structure(EnvelopeSettings, settings, **ours)
+
+
+def _own_protos(span: SourceSpan) -> Path:
+    try:
+        return asset("protos")
+    except FileNotFoundError as error:
+        what = "'envelope' names no protos, and this router has none of its own"
+        raise InvalidValueError(span, Code.MISSING_KEY, what, "add `protos: FOLDER`") from error
 
 
 def _node(entry: Entry) -> NodeSettings:

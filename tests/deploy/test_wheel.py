@@ -49,12 +49,16 @@ routes:
 Router = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-def build(folder: Path, **variables: str) -> Path:
+def building(folder: Path, checkout: Path = ROOT, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
     environment = {**os.environ, **variables}
-    built = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+    return subprocess.run(
+        command, cwd=checkout, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
+
+
+def build(folder: Path, checkout: Path = ROOT, **variables: str) -> Path:
+    built = building(folder, checkout, **variables)
     assert built.returncode == 0, built.stderr
     [path] = folder.glob("*.whl")
     return path
@@ -131,6 +135,58 @@ def test_without_a_compiler_it_is_for_any_platform_and_says_what_it_lacks(tmp_pa
     zipfile.ZipFile(wheel).extractall(tmp_path / "packages")
     said = loaded(tmp_path / "packages")
     assert "was not built, and nothing runs without it; install the router again where there is a C compiler" in said
+
+
+@pytest.fixture
+def moved(tmp_path: Path) -> Path:
+    """A checkout whose tables name protos of somebody else, with the lock beside them."""
+    checkout = tmp_path / "checkout"
+    ignored = shutil.ignore_patterns("_assets", "__pycache__", "libcarrier.so", "declared.py")
+    for name in ("router", "schemas"):
+        shutil.copytree(ROOT / name, checkout / name, ignore=ignored)
+    for name in ("pyproject.toml", "hatch_build.py", "LICENSE"):
+        shutil.copy(ROOT / name, checkout / name)
+    shutil.copytree(tables.ROUTES, checkout / "routes")
+    shutil.copytree(tables.PROTOS, checkout / "upstream")
+    (checkout / "upstream" / "LICENSE.md").write_text("theirs")
+    (checkout / "upstream" / "firmware.c").write_text("not for the router")
+    (checkout / "upstream" / "envelope.lock.json").rename(checkout / "wire.lock.json")
+    for table in (checkout / "routes").glob("*.yaml"):
+        text = table.read_text().replace("protos: ../protos", "protos: ../upstream\n  lock: ../wire.lock.json")
+        table.write_text(text)
+    return checkout
+
+
+def test_protos_are_those_that_the_tables_name(moved: Path, tmp_path: Path) -> None:
+    packages = tmp_path / "packages"
+    zipfile.ZipFile(build(tmp_path, moved, CC="no-compiler")).extractall(packages)
+    assets, there = packages / "router" / "_assets", moved / "upstream"
+    assert {path.name for path in assets.iterdir()} == {"routes", "schemas", "upstream", "wire.lock.json"}
+    shipped = contents(assets / "upstream")
+    assert shipped == {path: text for path, text in contents(there).items() if path.suffix != ".c"}
+    assert shipped[Path("LICENSE.md")] == b"theirs"
+    command = [sys.executable, "-m", "router", "init", "--rover", str(tmp_path / "copy")]
+    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(packages)}, cwd=tmp_path, check=True, timeout=PATIENCE)
+    assert contents(tmp_path / "copy") == contents(assets)
+
+
+def test_no_wheel_is_built_without_the_protos_of_its_tables(moved: Path, tmp_path: Path) -> None:
+    def said() -> str:
+        built = building(tmp_path / "dist", moved, CC="no-compiler")
+        assert (built.returncode, list(tmp_path.glob("dist/*.whl"))) == (1, [])
+        return built.stderr.strip()
+
+    for proto in (moved / "upstream").rglob("*.proto"):
+        proto.unlink()
+    assert said().endswith("if that is a submodule, run `git submodule update --init`")
+    shutil.rmtree(moved / "upstream")
+    assert said().endswith("names ../upstream, which is not there")
+    outside = moved / "routes" / "rover.yaml"
+    outside.write_text(outside.read_text().replace("../upstream", "../../upstream"))
+    for other in (moved / "routes").glob("*.yaml"):
+        if other != outside:
+            other.unlink()
+    assert "routes/rover.yaml names ../../upstream, which is outside of this checkout" in said()
 
 
 def test_the_examples_are_copied_and_work_where_they_are(routed: Router, packages: Path, tmp_path: Path) -> None:
