@@ -17,6 +17,7 @@ from router.app.runtime import Change, Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
 from router.carrier.library import load
 from router.clock import boottime_ns
+from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.log import logger
@@ -131,6 +132,9 @@ class Router:
         """The main counters since the start, over all listeners, routes and targets."""
         totals = {metric: self.total(metric) for metric in _TOTALS}
         return totals | {"kernel_drops": sum(dropped for _, dropped in self._runtime.drops.totals())}
+
+    def mismatches(self) -> Mapping[Mismatch, int]:
+        return self._reporter.mismatches()
 
     def progress(self) -> int:
         return self._runtime.plane.turns + self.total("datagrams_received")

@@ -13,8 +13,8 @@ from typing import cast
 from router.carrier.outlets import Names
 from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.threads import NativeThread
-from router.compiler.metrics import Report
-from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, RejectedEvent
+from router.compiler.metrics import Mismatch, Report
+from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
 from router.threads import Thread, join_or_leave
 
 _PULSE_MS = 5000
@@ -69,10 +69,11 @@ class EventReader:
     def _rejected(self, record: memoryview) -> Told:
         event, begin = RejectedEvent.from_buffer(record), ctypes.sizeof(RejectedEvent)
         place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
-        sender = f"from {inet_ntoa(event.address.to_bytes(4, 'big'))}:{event.port}"
-        what = self._detail(place, data, event.length)
-        detail = f"{sender}: {what}" if what else sender
-        return Told(event.counter, Report("reject", place, "", REJECTIONS[event.reason], None, detail))
+        host, what = inet_ntoa(event.address.to_bytes(4, "big")), self._detail(place, data, event.length)
+        detail = f"from {host}:{event.port}" + (f": {what}" if what else "")
+        mismatch = Mismatch(place, host, what) if event.reason == Reason.SOURCE_MISMATCH else None
+        report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
+        return Told(event.counter, report)
 
     def _lost(self, record: memoryview) -> Told:
         event = LostEvent.from_buffer(record)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,12 +193,20 @@ class Series:
 HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
 
 
+class Mismatch(NamedTuple):
+    """What a listener got from a host that no route takes this payload case from."""
+
+    listener: str
+    host: str
+    payload_case: str
+
+
 @dataclass(frozen=True, slots=True)
 class Report:
     """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
 
     `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is how many such
-    losses there were since the last report of them.
+    losses there were since the last report of them. `mismatch`: of a `source_mismatch`.
     """
 
     kind: str
@@ -207,6 +216,7 @@ class Report:
     error: BaseException | None = None
     detail: str = ""
     times: int = 1
+    mismatch: Mismatch | None = None
 
 
 @dataclass(slots=True)

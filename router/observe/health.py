@@ -15,9 +15,9 @@ from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from router.compiler.metrics import INTENDED_REASONS
+from router.compiler.metrics import INTENDED_REASONS, Mismatch
 from router.observe.snapshot import SERIES, Labels, Snapshot
-from router.table.model import EndpointKind
+from router.table.model import ANY, EndpointKind
 from router.values import age_text
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ REMEDIES: Mapping[str, str] = {
     "non_finite": "A value is NaN or infinite: check what the sender measures.",
     "too_large": "It is larger than the receiver takes: the log names the field and its bound.",
     "incomplete": "Frames are not complete when their time is up: datagrams are lost on the way.",
-    "source_mismatch": "The sender's address is not in the table: `router tap --only rejected` shows it.",
+    "source_mismatch": "No route takes it from that address: `router tap --only rejected` shows what comes from whom.",
     "unknown_case": "The sender's protos are newer than the router's: update them.",
     "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
     "truncated": "They are longer than the router takes.",
@@ -267,6 +267,10 @@ _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
 _NAMED = 3
 """Routes that are named in words."""
 
+_OTHER_ADDRESS = (
+    "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and `router reload`: "
+    "`router tap --only rejected` shows what it sends."
+)
 _ALL_SILENT = "All endpoints are silent: check this computer's network, its cable, the switch, the radio."
 
 
@@ -276,6 +280,7 @@ class Look:
 
     `silence`: for how long each endpoint has been silent, or was not heard yet, s. `standing`: for how long the receive
     thread has made no progress, s. `tripped`: for how long the deadmen that send now have done so, s, by route.
+    `mismatches`: who sent in the last seconds what no route takes from them.
     """
 
     program: Program
@@ -283,6 +288,7 @@ class Look:
     silence: Mapping[str, float]
     standing: float
     tripped: Mapping[str, float]
+    mismatches: frozenset[Mismatch] = frozenset()
 
     @property
     def now(self) -> Snapshot:
@@ -375,8 +381,46 @@ class Look:
                 kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[name])}"
             routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
             problem = self._problem(kind, {"endpoint": name}, more, routes)
-            is_one_of_all = len(silent) == len(self._limits) > 1
-            yield problem._replace(remedy=_ALL_SILENT) if is_one_of_all else problem
+            if (sender := self._in_place_of(name)) is not None:
+                remedy = _OTHER_ADDRESS.format(endpoint=name, address=self._host(name), sender=sender)
+                labels = {"endpoint": name, "sender": sender}
+                problem = problem._replace(
+                    labels=labels, more=f"{more}, and {sender} sends what it should", remedy=remedy
+                )
+            elif len(silent) == len(self._limits) > 1:
+                problem = problem._replace(remedy=_ALL_SILENT)
+            yield problem
+
+    def _expected(self, mismatch: Mismatch) -> list[str]:
+        """The endpoints that routes take this payload case from."""
+        routes = (route for route in self.program.table.routes if route.case.value == mismatch.payload_case)
+        return list(dict.fromkeys(name for route in routes for name in sorted(self._sources[route.name] - {ANY})))
+
+    def _host(self, endpoint: str) -> str:
+        return self.program.table.endpoints[endpoint].address.value.host
+
+    def _in_place_of(self, endpoint: str) -> str | None:
+        """Another host that sends what only this endpoint should."""
+        hosts = (each.host for each in sorted(self.mismatches) if self._expected(each) == [endpoint])
+        return next((host for host in hosts if host != self._host(endpoint)), None)
+
+    def _mismatched(self, listener: str) -> tuple[str, tuple[str, ...]]:
+        """Who sends to a listener what others should, in words; and the routes that do not take it."""
+        found = sorted(each for each in self.mismatches if each.listener == listener and self._expected(each))
+        names = {self._host(endpoint.name): f"{endpoint.name}, " for endpoint in self.program.table.endpoints.values()}
+        told: dict[str, None] = {}
+        for each in found:
+            who = f"{names[each.host]}{each.host}," if each.host in names else each.host
+            expected = self._expected(each)
+            if each.host in map(self._host, expected):
+                told[f"{who} sends from another port, or to another listener, than the table says"] = None
+            else:
+                others = " or ".join(f"{name}, {self._host(name)}," for name in expected)
+                told[f"{who} sends what {others} should"] = None
+        cases = {each.payload_case for each in found}
+        routes = tuple(route.name for route in self.program.table.routes if route.case.value in cases)
+        more = f"; and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
+        return "; ".join([*told][:_NAMED]) + more, routes
 
     def _tripped(self) -> Iterator[Problem]:
         """Deadmen that send in place of commands: somebody drove until just now, or nobody drives."""
@@ -423,7 +467,11 @@ class Look:
                 routes = tuple(route for route, _ in counts.most_common() if route)
                 of = f" of {', '.join(routes[:_NAMED])}" if routes and "route" not in labels else ""
                 others = f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else ""
-                yield self._problem(kind, labels, f", {count}{of}{others} in {max(self.seconds, 1):.0f} s", routes)
+                more = f", {count}{of}{others} in {max(self.seconds, 1):.0f} s"
+                if labels.get("reason") == "source_mismatch" and labels["listener"] not in self.program.table.gateways:
+                    who, routes = self._mismatched(labels["listener"])
+                    more += f": {who}" if who else ""
+                yield self._problem(kind, labels, more, routes)
 
     def _owner(self, route: str) -> str:
         """The gateway that a client's deadman belongs to, which is called GATEWAY:TOPIC; or the route itself."""

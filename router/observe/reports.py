@@ -1,16 +1,20 @@
-"""Logs what was lost and what deadmen do."""
+"""Logs what was lost and what deadmen do, and remembers who sends what no route takes from them."""
 
 from __future__ import annotations
 
 import errno
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from router.compiler.metrics import Report
+from router.clock import boottime_ns
+from router.compiler.metrics import Mismatch, Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import nobody_listens
 from router.table.addresses import Address
 from router.threads import Thread, join_or_leave
+
+MOST_MISMATCHES = 64
+"""Hosts are strangers': their number is bounded, and those of last come first."""
 
 
 class Reporter:
@@ -20,6 +24,8 @@ class Reporter:
         """`address_of` returns the address of an endpoint of the running table, None for any other target."""
         self._address_of = address_of
         self._floods = FloodLog()
+        self._mismatches: dict[Mismatch, int] = {}
+        self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._thread = Thread(self._summarise, "log")  # the start may fail
         self._thread.start()
@@ -30,7 +36,21 @@ class Reporter:
         join_or_leave(self._thread)
         self._floods.flush(final=True)
 
+    def mismatches(self) -> Mapping[Mismatch, int]:
+        """When each of the latest mismatches was seen last: ns of the boot clock."""
+        with self._lock:
+            return self._mismatches.copy()
+
+    def _remember(self, mismatch: Mismatch) -> None:
+        with self._lock:
+            self._mismatches.pop(mismatch, None)
+            self._mismatches[mismatch] = boottime_ns()
+            if len(self._mismatches) > MOST_MISMATCHES:
+                del self._mismatches[next(iter(self._mismatches))]
+
     def report(self, report: Report) -> None:
+        if report.mismatch is not None:
+            self._remember(report.mismatch)
         if report.kind == "reject":
             self._floods.note(
                 (report.place, report.reason),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.errors import Diagnostic
 from router.recording.mirror import Mirror
@@ -36,6 +37,9 @@ class Running(Protocol):
 
     def collect(self) -> Iterator[Family]:
         """All metrics, for prometheus_client."""
+
+    def mismatches(self) -> Mapping[Mismatch, int]:
+        """What came from a host that no route takes it from, and when last: ns of the boot clock."""
 
     def progress(self) -> int:
         """Return a number that changes at least every half second unless the receive thread is stuck."""

@@ -57,7 +57,8 @@ class Watch:
             if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
                 self._snapshots.append(latest)
         silence = {name: (now - then) / 1e9 for name, then in seen.items()}
-        return Look(program, snapshots, silence, self.standing(now), tripped)
+        recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
+        return Look(program, snapshots, silence, self.standing(now), tripped, recent)
 
     def standing(self, now: int) -> float:
         """For how long the receive thread has made no progress, s, as far as it was looked at."""

@@ -53,7 +53,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     yield from shared_memory(variables)
     yield from open_domain(program, variables)
     yield from clock()
-    yield from endpoints(program)
+    yield from endpoints(program, _in_place_of(running))
     yield from _running(program, running)
 
 
@@ -115,6 +115,12 @@ def _told(program: Program, running: Health) -> Iterator[CheckResult]:
         yield grade("router", each.text, f"{each.remedy} See {each.page}")
     if all(each.kind.level is Level.CALM for each in running.problems):
         yield fine("router", f"it runs and loses nothing; {plural(running.received, 'datagram')} received")
+
+
+def _in_place_of(running: Health | None) -> Mapping[str, str]:
+    """By endpoint the host that sends what it should, as the running router says."""
+    labels = [each.labels for each in running.problems] if running is not None else []
+    return {each["endpoint"]: each["sender"] for each in labels if "sender" in each}
 
 
 def _health(program: Program) -> Health | None:

@@ -280,8 +280,11 @@ def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Ite
             yield grade("endpoints", f"{endpoint.name}: nothing can be sent to {address.host}: {why}", remedy)
 
 
-def endpoints(program: Program) -> Iterator[CheckResult]:
-    """Check that a route leads to each endpoint, and that it answers a ping."""
+def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[CheckResult]:
+    """Check that a route leads to each endpoint, and that it answers a ping.
+
+    `in_place_of`: by endpoint, another host that sends what it should.
+    """
     yield from ways(program, problem)
     reachable = {each.name: each.address.value.host for each in program.table.endpoints.values() if _has_way(each)}
     try:
@@ -293,6 +296,9 @@ def endpoints(program: Program) -> Iterator[CheckResult]:
     for name, host in reachable.items():
         if host in answered:
             yield fine("endpoints", f"{name}: {host} answers a ping")
+        elif name in in_place_of:
+            what = f"{name}: {host} does not answer a ping, and {in_place_of[name]} sends what it should"
+            yield warning("endpoints", what, "has it another address than the table says? See `router` below")
         else:
             remedy = "is it on, and is its cable in? Some boards never answer a ping"
             yield warning("endpoints", f"{name}: {host} does not answer a ping", remedy)

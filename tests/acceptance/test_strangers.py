@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 
 from router.datagrams import wire_of_protos
 from router.recording.reader import Recording
+from router.tools.doctor import examine
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import ROUTER
 from tests.acceptance.site import ROOT, ROVER, RouterProcess, Site, site, total, udp, wait_until
@@ -152,3 +153,16 @@ def test_a_recording_has_everything_in_order_and_the_stranger_on_a_topic_of_its_
     found = list(Recording(looked.recording).datagrams())
     order = [*([("", "source_mismatch")] * TIMES), ("sensor_board", "")] * ROUNDS + [("", "source_mismatch")]
     assert [(each.endpoint, each.reason) for each in found] == order
+
+
+def test_a_board_with_another_address_is_found_out(tmp_path: Path) -> None:
+    said = "127.0.0.9 sends what sensor_board, 127.0.0.30, should"
+    with site(tmp_path) as place, udp("127.0.0.9") as board:
+        table = place.table(ROVER)
+
+        def is_told() -> bool:
+            board.sendto(gps(1.0), (ROUTER, place.listen))
+            return any(said in each.text for each in examine(table, {}))
+
+        with RouterProcess(tmp_path, table):
+            wait_until(is_told, "the doctor's finding")

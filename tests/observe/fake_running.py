@@ -13,6 +13,7 @@ from prometheus_client.metrics_core import Metric as Family
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
+from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import SourceSpan
@@ -47,6 +48,7 @@ class FakeRunning:
         self.is_stuck = False
         self.reloads = RELOADED
         self.failures: list[Exception] = []
+        self.seen: dict[Mismatch, int] = {}
         self.collected = 0
         self.mirror = Mirror(self, self.failures.append)
         self.lost = 0
@@ -79,6 +81,9 @@ class FakeRunning:
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         }
         return CountersCollector(self.program.counters, lambda: [self.counts], asked, {"version": "1"}).collect()
+
+    def mismatches(self) -> dict[Mismatch, int]:
+        return self.seen
 
     def progress(self) -> int:
         self._turns += not self.is_stuck

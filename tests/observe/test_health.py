@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from router.compiler import metrics
+from router.compiler.metrics import Mismatch
 from router.observe import watch
 from router.observe.health import PAGE, PERIOD, REMEDIES, WINDOW, Kind, Level, Problem
 from router.observe.watch import Health
@@ -164,6 +165,61 @@ def test_who_was_never_heard_may_be_switched_off(router: Counting) -> None:
     assert "basestation was never heard since the router started" in [problem.text for problem in found]
     silent = {problem.labels["endpoint"] for problem in router.look(1000).problems}
     assert not silent & {"arm_board", "container_board"}  # `never` is stale; is no source
+
+
+def mismatched(router: Counting, host: str, case: str, listener: str = "rover") -> None:
+    router.count("datagrams_rejected", listener, "source_mismatch", to=9)
+    router.seen[Mismatch(listener, host, case)] = router.now
+
+
+def test_a_board_with_another_address_is_named_with_the_one_that_it_should_have(router: Counting) -> None:
+    router.look(5)
+    mismatched(router, "192.168.0.20", "imu_info")
+    mismatched(router, "192.168.0.20", "gps_info")
+    found = {problem.labels.get("endpoint", problem.kind.alert): problem for problem in router.look(1).problems}
+    told = found["DatagramsRejected"]
+    assert told.text == (
+        "rover rejects datagrams: source_mismatch, 9 in 6 s: 192.168.0.20 sends what sensor_board, 192.168.0.30, should"
+    )
+    assert told.routes == ("imu_info", "gps_info")
+    silent = found["sensor_board"]
+    assert silent.text == (
+        "sensor_board was never heard since the router started, and 192.168.0.20 sends what it should"
+    )
+    assert "If 192.168.0.20 is sensor_board, give it the address 192.168.0.30, or correct `endpoints`" in silent.remedy
+    assert "sends what" not in found["basestation"].text
+    router.count("datagrams_rejected", "rover", "source_mismatch", to=10)
+    assert "192.168.0.20" not in "; ".join(router.told(WINDOW))
+
+
+@pytest.mark.parametrize(
+    ("host", "case", "told"),
+    [
+        ("192.168.0.40", "imu_info", "arm_board, 192.168.0.40, sends what sensor_board, 192.168.0.30, should"),
+        (
+            "192.168.0.9",
+            "ph_info",
+            "192.168.0.9 sends what arm_board, 192.168.0.40, or sensor_board, 192.168.0.30, should",
+        ),
+        (
+            "192.168.0.30",
+            "imu_info",
+            "sensor_board, 192.168.0.30, sends from another port, or to another listener, than the table says",
+        ),
+    ],
+)
+def test_who_sends_what_another_should_is_named(router: Counting, host: str, case: str, told: str) -> None:
+    mismatched(router, host, case)
+    [rejected] = [each for each in router.look(1).problems if each.kind is Kind.DATAGRAMS_REJECTED]
+    assert rejected.more == f", 9 in 1 s: {told}"
+
+
+def test_of_many_strangers_a_few_are_named(router: Counting) -> None:
+    for number in range(20):
+        mismatched(router, f"10.0.0.{number}", "imu_info")
+    [rejected] = [each for each in router.look(1).problems if each.kind is Kind.DATAGRAMS_REJECTED]
+    assert rejected.more.count("sends what sensor_board") == 3
+    assert rejected.more.endswith("; and 17 more")
 
 
 def test_where_all_are_silent_it_is_the_network(router: Counting) -> None:

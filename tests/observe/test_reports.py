@@ -6,9 +6,9 @@ import errno
 
 import pytest
 
-from router.compiler.metrics import Report
+from router.compiler.metrics import Mismatch, Report
 from router.log import logger
-from router.observe.reports import Reporter
+from router.observe.reports import MOST_MISMATCHES, Reporter
 from router.table.addresses import Address
 
 REFUSED = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
@@ -32,3 +32,14 @@ def test_a_refused_datagram_is_explained(
     reporter.report(Report(kind, "manual_drive", target, "send_error", error))
     reporter.close()
     assert logged == [said]
+
+
+def test_of_strangers_the_latest_are_remembered() -> None:
+    reporter = Reporter(lambda _: None)
+    seen = [
+        Mismatch("rover", f"10.0.{number >> 8}.{number & 255}", "imu_info") for number in range(MOST_MISMATCHES + 9)
+    ]
+    for mismatch in (seen[0], *seen[1:40], seen[0], *seen[40:]):
+        reporter.report(Report("reject", "rover", "", "source_mismatch", mismatch=mismatch))
+    reporter.close()
+    assert list(reporter.mismatches()) == [*seen[10:40], seen[0], *seen[40:]]

@@ -339,7 +339,7 @@ def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_
 
     monkeypatch.setattr(doctor_checks, "why_unreachable", no_way)
     text = "sensor_board: nothing can be sent to 127.0.0.30: no network leads there"
-    [first, *others] = endpoints(compiled(table))
+    [first, *others] = endpoints(compiled(table), {})
     assert first == (Grade.PROBLEM, "endpoints", text, "plug it in")
     assert "sensor_board" not in " ".join(finding.text for finding in others)
     assert list(before_start(table, {})) == [(Grade.WARNING, "endpoints", text, "plug it in")]
@@ -404,6 +404,16 @@ def test_a_rover_that_nobody_drives_is_fine(table: Path) -> None:
         first, second = told(table)
     assert first == fine("router", "drive is halted: no commands for 27 min")
     assert second.grade is Grade.FINE
+
+
+def test_who_sends_in_place_of_an_endpoint_that_answers_no_ping_is_named(
+    table: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor_checks, "answering", lambda hosts: hosts - {"127.0.0.30"})
+    labels = {"endpoint": "sensor_board", "sender": "127.0.0.20"}
+    with serving(compiled(table), Problem(Kind.ENDPOINT_NEVER_HEARD, labels)):
+        found = [each.text for each in examine(table, {}) if each.about == "endpoints" and each.grade is Grade.WARNING]
+    assert found == ["sensor_board: 127.0.0.30 does not answer a ping, and 127.0.0.20 sends what it should"]
 
 
 def test_a_router_that_runs_another_table_is_told(table: Path) -> None:
