@@ -314,6 +314,61 @@ def test_the_address_keeps_what_is_chosen(browser: Browser, gateway: FakeGateway
     opened.close()
 
 
+PLOTTED = "[...plots.keys()]"
+
+
+def test_a_new_address_in_an_open_page_is_followed(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/imu", "/odom"])
+    gateway.say(data_document("/imu", {"linear": {"x": 3, "y": 4}}), data_document("/odom", {"list": [1, 2]}))
+    choose(page, "/imu")
+    plot(page, "/imu", "linear.x")
+    for address, topic, plotted in (
+        ("topic=/odom", "/odom", []),
+        ("topic=/imu&field=linear.x&field=linear.y&plot=/odom:list[1]", "/imu", ["linear.x", "linear.y", "list[1]"]),
+        ("topic=/imu&field=linear.y", "/imu", ["linear.y"]),
+        ("plot=/odom:list[0]", "/imu", ["list[0]"]),
+        ("topic=%2Fodom&field=list%5B1%5D", "/odom", ["list[1]"]),
+    ):
+        page.evaluate(f"location.hash = {json.dumps(address)}")
+        page.until(f"document.querySelector('#chosen').textContent === {json.dumps(topic)}")
+        page.until(f"{PLOTTED}.map(key => key.split(':')[1]).join() === {json.dumps(','.join(plotted))}")
+        names = "document.querySelectorAll('#legend li span:nth-child(2) b')"
+        shown = page.evaluate(f"[...{names}].map(e => e.textContent)")
+        assert shown == plotted
+        kept = page.evaluate("Object.fromEntries(new URLSearchParams(location.hash.slice(1)))")
+        assert kept["topic"] == topic
+    page.until("document.querySelector('#tree').textContent.includes('list')")
+
+
+def test_back_and_forward_go_from_address_to_address(gateway: FakeGateway, page: Page) -> None:
+    gateway.say(*(data_document(f"/{name}", {"x": 1, "y": 2}) for name in "abc"))
+    choose(page, "/a")
+    plot(page, "/a", "x")
+    page.evaluate("location.hash = 'topic=/b&field=y'")
+    page.until(f"{PLOTTED}.join() === '/b:y'")
+    choose(page, "/c")
+    page.evaluate("location.hash = 'topic=/a'")
+    page.until("document.querySelector('#chosen').textContent === '/a'")
+    for step, topic, plotted in (("back", "/c", "/b:y"), ("back", "/a", "/a:x"), ("forward", "/c", "/b:y")):
+        page.evaluate(f"history.{step}()")
+        page.until(f"document.querySelector('#chosen').textContent === {json.dumps(topic)}")
+        page.until(f"{PLOTTED}.join() === {json.dumps(plotted)}")
+
+
+def test_a_new_address_opens_the_sheet_of_its_topic_on_a_phone(gateway: FakeGateway, page: Page) -> None:
+    show_at(page, PHONE)
+    gateway.say(data_document("/a", {"x": 1}), data_document("/b", {"y": 1}))
+    choose(page, "/a")
+    for _ in range(2):  # from within a sheet, and from the list
+        page.evaluate("location.hash = 'topic=/b'")
+        page.until("document.querySelector('#chosen').textContent === '/b' && document.body.dataset.sheet === 'detail'")
+        plot(page, "/b", "y")
+        page.click("#detail .back")
+        page.until("document.body.dataset.sheet === ''")
+        assert page.evaluate(f"[document.querySelector('#chosen').textContent, {PLOTTED}.join()]") == ["/b", "/b:y"]
+        page.evaluate("removePlot('/b:y')")
+
+
 # Pictures
 
 
