@@ -80,6 +80,7 @@ class Code(enum.Enum):
     # the wire definitions
     BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
     UNUSED_PROTO = ("unused-proto", "A `.proto` file that the envelope does not import is broken, or clashes.")
+    UNUSED_OPTION = ("unused-option", "A line of an `.options` file names nothing in its `.proto` file.")
     WIRE_NUMBER_CONFLICT = (
         "wire-number-conflict",
         "A field number was reused, renumbered, retyped or renamed, or the envelope is another message.",
@@ -140,6 +141,7 @@ class Code(enum.Enum):
 _WARNINGS = frozenset(
     {
         Code.UNUSED_PROTO,
+        Code.UNUSED_OPTION,
         Code.UNCOVERED_PAYLOAD_CASE,
         Code.UNUSED_LISTENER,
         Code.NOT_LOCKED,

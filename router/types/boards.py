@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
 from router.types.descriptors import container, enum_of, message_of
@@ -59,10 +60,19 @@ NO_OPTIONS = BoardOptions()
 
 
 @dataclass(frozen=True, slots=True)
-class OptionsFile:
-    """The lines of one file: which names (a pattern with wildcards), and what changes for them."""
+class OptionsLine:
+    """`changes` of what has a full name that `pattern`, with wildcards, matches."""
 
-    lines: tuple[tuple[str, Mapping[str, int | bool]], ...] = ()
+    span: SourceSpan
+    pattern: str
+    changes: Mapping[str, int | bool]
+
+
+@dataclass(frozen=True, slots=True)
+class OptionsFile:
+    """The lines of one file, in their order."""
+
+    lines: tuple[OptionsLine, ...] = ()
 
     def of(self, message: str, field: str) -> BoardOptions:
         """Full name of the message (or of the enclosing ones, by pattern), name of the field.
@@ -71,10 +81,37 @@ class OptionsFile:
         """
         options = NO_OPTIONS
         for name in (message, f"{message}.{field}"):
-            for pattern, changes in self.lines:
-                if fnmatchcase(name, pattern):
-                    options = replace(options, **changes)  # type: ignore[arg-type]
+            for line in self.lines:
+                if fnmatchcase(name, line.pattern):
+                    options = replace(options, **line.changes)  # type: ignore[arg-type]
         return options
+
+    def unused(self, proto: FileDescriptorProto) -> Iterator[Diagnostic]:
+        """A warning for each line that matches nothing in its `.proto` file, so that what it bounds is unbounded."""
+        names = set(_names(proto))
+        for line in self.lines:
+            if any(fnmatchcase(name, line.pattern) for name in names):
+                continue
+            full = f"{proto.package}.{line.pattern}"
+            lacks_package = any(fnmatchcase(name, full) for name in names)
+            hint = f"names begin with the package: '{full}'" if lacks_package else did_you_mean(line.pattern, names)
+            yield Diagnostic(line.span, Code.UNUSED_OPTION, f"nothing in {proto.name} is called '{line.pattern}'", hint)
+
+
+def _names(proto: FileDescriptorProto) -> Iterator[str]:
+    """The full names that nanopb knows options for."""
+    scope = f"{proto.package}." if proto.package else ""
+    yield from (f"{scope}{enum.name}" for enum in proto.enum_type)
+    yield from (f"{scope}{extension.name}" for extension in proto.extension)
+    waiting = [(scope, message) for message in proto.message_type]
+    while waiting:
+        scope, message = waiting.pop()
+        inside = f"{scope}{message.name}."
+        yield inside[:-1]
+        yield from (f"{inside}{field.name}" for field in (*message.field, *message.extension))
+        yield from (f"{inside}{oneof.name}" for oneof in message.oneof_decl)
+        yield from (f"{inside}{enum.name}" for enum in message.enum_type)
+        waiting += [(inside, nested) for nested in message.nested_type]
 
 
 def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
@@ -94,7 +131,7 @@ def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
         column = len(line) - len(line.lstrip()) + 1
         span = SourceSpan(shown_path(path), number, column, column + len(bare))
         findings += [Diagnostic(span, Code.BAD_PROTO, message, hint) for message, hint in complaints]
-        lines.append((pattern, changes))
+        lines.append(OptionsLine(replace(span, end_column=column + len(pattern)), pattern, changes))
     return OptionsFile(tuple(lines)), findings
 
 

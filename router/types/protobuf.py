@@ -44,7 +44,8 @@ class ProtoSchema:
 
     What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes of all
     `.proto` and `.options` files of the folder; `files` has the names of the compiled ones. `envelope` is the full name
-    of the message that was asked for, `lock` the path of the lock file, `warnings` what is wrong with other files.
+    of the message that was asked for, `lock` the path of the lock file, `warnings` what is wrong with other files and
+    with `.options` files.
     """
 
     def __init__(
@@ -164,15 +165,16 @@ def load_protos(
     warnings, valid = _check_others(folder, names)
     if with_others and valid:
         compiled = compile_protos(folder, [*names, *valid])
-        names = [each.name for each in compiled.file]
+    files = {each.name: each for each in compiled.file}
     findings = _same_name_findings(folder, compiled)
     options = {}
     for name in folder.files:
         if name.endswith(OPTIONS):
             proto = proto_of(name)
             options[proto], complaints = read_options(root / name)
-            if proto in names:
+            if proto in files:
                 findings += complaints
+                warnings += options[proto].unused(files[proto])
             elif complaints:
                 warnings.append(_unused(proto, complaints))
     if findings:

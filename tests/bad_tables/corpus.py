@@ -1,8 +1,9 @@
 """The corpus of bad tables: `CODE.md` has tables with one kind of finding, and what `router validate` says of each.
 
-A page begins with what to write in place of its first table: a table that has no findings, or an envelope.proto. Each
-section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table, with its encoding if that is
-not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it.
+A page begins with what to write in place of its first table: a table that has no findings, an envelope.proto, or the
+envelope.options of `protos/options`. Each section is named after its table, `bad_tables/NAME.yaml`, and has two
+blocks: the table, with its encoding if that is not UTF-8, and the exact text. Most tables extend `base/base.yaml`,
+which has nothing wrong in it.
 docs/reference/findings.md has the first section and what to write in its place.
 
 To write the texts of new or changed sections: `python -m tests.bad_tables.corpus`; then read them as if you had made
@@ -30,7 +31,7 @@ _SECTION = re.compile(
     r"^## (?P<name>\S+)\n\n```yaml ?(?P<encoding>\S*)\n(?P<table>.*?)^```\n\n```text\n(?P<said>.*?)^```\n",
     re.MULTILINE | re.DOTALL,
 )
-_GOOD = re.compile(r"^```(?P<kind>yaml|proto) good\n(?P<text>.*?)^```\n", re.MULTILINE | re.DOTALL)
+_GOOD = re.compile(r"^```(?P<kind>yaml|proto|options) good\n(?P<text>.*?)^```\n", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def sections(page: Path) -> Iterator[BadTable]:
 
 
 def good(page: Path) -> tuple[str, str]:
-    """What to write in place of a page's first table: `yaml` or `proto`, and the text."""
+    """What to write in place of a page's first table: `yaml`, `proto` or `options`, and the text."""
     [(kind, text)] = _GOOD.findall(page.read_text(encoding="utf-8"))
     return kind, text
 

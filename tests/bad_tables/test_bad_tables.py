@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -48,10 +49,12 @@ def test_what_to_write_in_its_place_has_nothing_wrong(
 ) -> None:
     kind, text = good(page)
     table = unpacked / "bad_tables" / "good.yaml"
-    if kind == "proto":
+    if kind != "yaml":
         protos = table.parent / "protos" / f"good-{page.stem}"
         protos.mkdir()
-        (protos / "envelope.proto").write_text(text)
+        if kind == "options":
+            shutil.copy(HERE / "protos" / "options" / "envelope.proto", protos)
+        (protos / f"envelope.{kind}").write_text(text)
         assert main(["schema", "lock", "--protos", str(protos)]) == OK
         text = GOOD_PROTO.format(protos=protos.name)
     table.write_text(text, encoding="utf-8")

@@ -55,6 +55,33 @@ def test_options_of_no_effect_on_sizes_are_accepted(tmp_path: Path) -> None:
     assert options.of("A", "x") == NO_OPTIONS
 
 
+NAMES = """\
+syntax = "proto3";
+package boat;
+enum Mode { OFF = 0; }
+message Hull { message Tank { string label = 1; } oneof fill { Tank water = 1; } enum Kind { WOOD = 0; } }
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("*", None),
+        ("boat.Mode", None),
+        ("boat.Hull.fill", None),
+        ("boat.Hull.Kind", None),
+        ("boat.Hull.Tank", None),
+        ("boat.Hull.*.label", None),
+        ("boat.Hull.Tank.lable", "did you mean 'boat.Hull.Tank.label'?"),
+        ("Hull.Tank.label", "names begin with the package: 'boat.Hull.Tank.label'"),
+        ("Hull.*", "names begin with the package: 'boat.Hull.*'"),
+    ],
+)
+def test_line_that_names_nothing_is_a_warning(write: Write, name: str, hint: str | None) -> None:
+    schema = load_protos(*settings(write({"a.proto": NAMES, "a.options": f"{name} max_size:4\n"}), "boat.Hull"))
+    assert [(found.code, found.hint) for found in schema.warnings] == ([(Code.UNUSED_OPTION, hint)] if hint else [])
+
+
 def test_file_that_is_no_text_is_a_finding(tmp_path: Path) -> None:
     path = tmp_path / "a.options"
     path.write_bytes(b"\xff\xfe")
