@@ -50,7 +50,8 @@ At the top:"""
 _COMMANDS = """\
 `router VERB --help` says the same. Every command is about `routes/rover.yaml`, unless `-t TABLE` or the variable
 `ROUTER_TABLE` names another table. `eval "$(router --completion bash)"`, or `zsh`, has the shell complete verbs and
-options; in fish it is `router --completion fish | source`.
+options, and the table's payload cases, fields, endpoints and topics; in fish it is
+`router --completion fish | source`.
 """
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route

@@ -92,7 +92,7 @@ class _Version(argparse.Action):
 
 
 class _Completion(argparse.Action):
-    """Prints what a shell has to evaluate so that it completes verbs and options."""
+    """Prints what a shell has to evaluate so that it completes command lines of the router."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: object, shell: object, *rest: object) -> None:
         from argcomplete.shell_integration import shellcode
@@ -274,7 +274,7 @@ def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoRetu
     import argcomplete
 
     _add_verbs(subparsers, _verb(os.environ.get("COMP_LINE", "").split()[1:]))
-    argcomplete.autocomplete(parser)
+    argcomplete.autocomplete(parser, always_complete_options=False)
     sys.exit(OK)
 
 

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb
+from router.cli.completion import completes, fields, routed
 from router.cli.tool_options import add_for, add_table, good_table, table_path
-from router.compiler.checked import CheckedRoute
-from router.compiler.lookup import Definitions
 from router.errors import UsageError, did_you_mean
-from router.tools.explain import (
-    diff,
-    explained_gateway,
-    explained_route,
-    ignored_gateway,
-    known_topics,
-    seen_topics,
-    tried_route,
-)
-from router.tools.listing import listed_route
+
+if TYPE_CHECKING:
+    from router.compiler.checked import CheckedRoute
 
 _DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
 mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
@@ -40,14 +33,14 @@ _LIVE = 2.0
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "explain", _DESCRIPTION, *_EXAMPLES)
     everything = "payload cases and gateways; all of the table when none is named"
-    parser.add_argument("names", nargs="*", metavar="NAME", help=everything)
+    completes(parser.add_argument("names", nargs="*", metavar="NAME", help=everything), routed)
     add_table(parser)
     parser.add_argument(
         "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
     )
     parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
     given = "show what each target gets of a payload with these fields, from the route's first source"
-    parser.add_argument("--given", nargs="*", metavar="FIELD=VALUE", help=given)
+    completes(parser.add_argument("--given", nargs="*", metavar="FIELD=VALUE", help=given), fields)
     parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
     add_for(parser, f"look for them for so long, as 5s (default: {_LIVE:g}s)")
 
@@ -61,6 +54,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _explain(args: argparse.Namespace) -> int:
+    from router.tools.explain import (
+        explained_gateway,
+        explained_route,
+        ignored_gateway,
+        known_topics,
+        seen_topics,
+        tried_route,
+    )
+    from router.tools.listing import listed_route
+
     path = table_path(args)
     checked, program = good_table(path)
     routes: dict[str, list[CheckedRoute]] = {}
@@ -88,6 +91,9 @@ def _explain(args: argparse.Namespace) -> int:
 
 
 def _diff(old: Path, new: Path) -> int:
+    from router.compiler.lookup import Definitions
+    from router.tools.explain import diff
+
     definitions = Definitions()
     (before, _), (after, _) = (good_table(path, definitions=definitions) for path in (old, new))
     lines = list(diff(before, after))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb
+from router.cli.completion import completes, listened, topics
 from router.cli.tool_options import (
     add_count,
     add_for,
@@ -66,14 +67,17 @@ _EXAMPLES = (
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "listen", _DESCRIPTION, *_EXAMPLES, more=_PLACES)
-    parser.add_argument("place", metavar="PLACE", help="udp://, tcp://, ws://, zenoh://, envelope:// or topic://")
+    completes(
+        parser.add_argument("place", metavar="PLACE", help="udp://, tcp://, ws://, zenoh://, envelope:// or topic://"),
+        listened,
+    )
     add_count(parser)
     add_for(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object per line, data as it is received")
     parser.add_argument("--hex", action="store_true", help="envelopes and ROS: with the bytes of each")
     parser.add_argument("--type", metavar="TYPE", help="ROS: the topic's type (default: what its publishers say)")
     about = "gateways: only such topics, as /loki_1/**; several are possible"
-    parser.add_argument("--topic", dest="topics", action="append", metavar="GLOB", help=about)
+    completes(parser.add_argument("--topic", dest="topics", action="append", metavar="GLOB", help=about), topics)
     parser.add_argument("--record", type=Path, metavar="FILE", help="gateways: append JSON lines to this file as well")
     parser.add_argument("--format", choices=FORMATS, help="tcp: how it is split (default: what the first bytes say)")
     parser.add_argument("--ask", metavar="HOST:PORT", help="udp: ask this 'receive' address of a gateway for schemas")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
+from router.cli.completion import completes, senders
 from router.cli.findings import print_findings
 from router.cli.tool_options import add_table, integer, table_path
 
@@ -34,8 +35,11 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "new", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("name", metavar="NAME", help="of the message: its board, then what it is, as one word each")
     parser.add_argument("--number", type=integer, required=True, metavar="N", help="in the envelope, never used before")
-    parser.add_argument(
-        "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
+    completes(
+        parser.add_argument(
+            "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
+        ),
+        senders,
     )
     parser.add_argument("--fields", nargs="+", default=(), metavar="FIELD", help=_FIELDS)
     add_table(parser)

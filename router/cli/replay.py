@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb, with_help
+from router.cli.completion import completes, endpoints, places
 from router.cli.tool_options import add_table, good_table, progress, speed, table_if_any, table_path, until_interrupted
 from router.errors import UsageError
 
@@ -39,8 +40,14 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="what 'record' has written")
     about = "2x is twice as fast, max without waiting (default: 1x)"
     parser.add_argument("--speed", type=speed, metavar="SPEED", help=about)
-    parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name of the table (default: its listeners)")
-    parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
+    completes(
+        parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name of the table (default: its listeners)"),
+        places,
+    )
+    completes(
+        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table"),
+        endpoints,
+    )
     add_table(parser)
     parser.add_argument("--against", type=Path, metavar="NEW", help="compare TABLE with this table instead")
 

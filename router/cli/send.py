@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb, with_help
+from router.cli.completion import cases, completes, endpoints, fields, places
 from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, until_interrupted, whole
 
 if TYPE_CHECKING:
@@ -25,10 +26,18 @@ _EXAMPLES = (
 def add_parser(subparsers: Subparsers) -> None:
     description = "Build a payload from field=value words and send it in an envelope."
     parser = add_verb(subparsers, "send", description, *_EXAMPLES)
-    parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info")
-    parser.add_argument("fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, state=NAME")
-    parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name of the table")
-    parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
+    completes(parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info"), cases)
+    completes(
+        parser.add_argument("fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, state=NAME"),
+        fields,
+    )
+    completes(
+        parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name of the table"), places
+    )
+    completes(
+        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table"),
+        endpoints,
+    )
     parser.add_argument("--rate", type=hertz, metavar="RATE", help="as 20Hz (default: as fast as possible)")
     add_count(parser, "how many (default: 1, with --rate until Ctrl-C)")
     parser.add_argument("--trim", action="store_true", help="remove trailing zero bytes, as the old boards do")

@@ -9,6 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb
+from router.cli.completion import completes, silences
 from router.cli.tool_options import add_for, add_table, factor, good_table, integer, table_path
 
 if TYPE_CHECKING:
@@ -40,13 +41,16 @@ def add_parser(subparsers: Subparsers) -> None:
     add_for(parser)
     parser.add_argument("--seed", type=integer, default=1, metavar="N", help="the same seed sends the same values")
     parser.add_argument("--speed", type=factor, default=1.0, metavar="SPEED", help="2x sends twice as often")
-    parser.add_argument(
-        "--silent",
-        action="append",
-        default=[],
-        metavar="NAME:FROM-TO",
-        help="nothing is sent by this endpoint, or of this payload case, from second FROM to second TO; without TO for "
-        "ever. Several are possible",
+    completes(
+        parser.add_argument(
+            "--silent",
+            action="append",
+            default=[],
+            metavar="NAME:FROM-TO",
+            help="nothing is sent by this endpoint, or of this payload case, from second FROM to second TO; without "
+            "TO for ever. Several are possible",
+        ),
+        silences,
     )
     parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
 

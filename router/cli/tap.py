@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from router.cli import Subparsers, add_verb
+from router.cli.completion import cases, completes, endpoints
 from router.cli.tool_options import (
     add_count,
     add_for,
@@ -32,9 +33,15 @@ _EXAMPLES = (
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "tap", _DESCRIPTION, *_EXAMPLES)
-    parser.add_argument("cases", nargs="*", metavar="CASE", help="only these payload cases (default: everything)")
+    completes(
+        parser.add_argument("cases", nargs="*", metavar="CASE", help="only these payload cases (default: everything)"),
+        cases,
+    )
     about = "only from this endpoint or IP address; several are possible"
-    parser.add_argument("--from", dest="sources", action="append", default=[], metavar="ENDPOINT", help=about)
+    completes(
+        parser.add_argument("--from", dest="sources", action="append", default=[], metavar="ENDPOINT", help=about),
+        endpoints,
+    )
     about = "only what a route took, or only what none took"
     parser.add_argument("--only", choices=("accepted", "rejected"), help=about)
     about = "only what this expression of the table's language holds for: 'satellites < 4'"

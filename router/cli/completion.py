@@ -1,0 +1,159 @@
+"""What of a table a shell completes: payload cases and their fields, endpoints, listeners, gateways and topics.
+
+A table with errors completes what is valid of it. Nothing is said of what cannot be read: the verb says it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli.tool_options import table_if_any
+from router.errors import RouterError, TableError
+
+if TYPE_CHECKING:
+    from router.datagrams import Wire
+    from router.table.model import RouteTable
+    from router.types.model import Field, MessageType
+
+Words = Callable[[argparse.Namespace, str], Iterable[str]]
+"""Of the arguments before the word that is completed, and what is typed of that: what it may become."""
+
+
+def completes(action: argparse.Action, words: Words) -> None:
+    """Have the shell complete an argument by `words`."""
+
+    def completer(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
+        found: list[str] = []
+        with suppress(RouterError, OSError, LookupError):
+            found.extend(words(parsed_args, prefix))
+        return list(dict.fromkeys(found))
+
+    action.completer = completer  # type: ignore[attr-defined]  # where argcomplete looks
+
+
+def routed(args: argparse.Namespace, _: str = "") -> Iterator[str]:
+    """The payload cases that the table routes, and its gateways."""
+    if table := _table(args):
+        yield from (route.case.value for route in table.routes if route.case.value)
+        yield from (*table.gateways, *table.ignored_gateways)
+
+
+def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:
+    """The payload cases of the envelope."""
+    return _wire(args).envelope.cases
+
+
+def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
+    table = _table(args)
+    return table.endpoints if table else ()
+
+
+def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
+    """The endpoints of which a message may be."""
+    from router.table.model import EndpointKind
+
+    if table := _table(args):
+        yield from (each.name for each in table.endpoints.values() if each.kind is not EndpointKind.TOOL)
+
+
+def places(args: argparse.Namespace, _: str = "") -> Iterable[str]:
+    """Where datagrams are sent to: listeners and endpoints."""
+    table = _table(args)
+    return (*table.listeners, *table.endpoints) if table else ()
+
+
+def silences(args: argparse.Namespace, _: str = "") -> Iterator[str]:
+    """`basestation:`, to be followed by seconds."""
+    if table := _table(args):
+        yield from (f"{name}:" for name in (*table.endpoints, *(route.case.value for route in table.routes)) if name)
+
+
+def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
+    """The topics of routes and gateways by their full names, as gateways send them."""
+    from router.compiler.topics import resolved
+
+    if table := _table(args):
+        yield from (resolved(name, table.node) for name in _topics(table))
+
+
+def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
+    """Places of `router listen`: a scheme, then what of the table has it."""
+    scheme, separator, _ = prefix.partition("://")
+    if not separator:
+        return [f"{name}://" for name in ("envelope", "topic", "udp", "tcp", "ws", "zenoh")]
+    names: Iterable[str] = ()
+    if scheme == "envelope":
+        names = places(args)
+    elif scheme == "topic" and (table := _table(args)):
+        names = _topics(table)
+    return [f"{scheme}://{name}" for name in names]
+
+
+def fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
+    """`accel_x=`, `bbox.x=` or `state=NAME` of the payload case that stands before."""
+    case = getattr(args, "case", None) or args.names[0]
+    return _assignments(_wire(args).envelope.cases[case].type, prefix)
+
+
+def _assignments(kind: MessageType, prefix: str) -> Iterator[str]:
+    from router.types.model import Bool, Enum, MessageType
+
+    path, has_value, _ = prefix.partition("=")
+    *parents, last = path.split(".")
+    before = "".join(f"{parent}." for parent in parents)
+    for parent in parents:
+        inner = _element(_field(kind, parent))
+        if not isinstance(inner, MessageType):
+            return
+        kind = inner
+    if not has_value:
+        for field in kind.fields:
+            yield f"{before}{field.name}{'.' if isinstance(_element(field), MessageType) else '='}"
+        return
+    element = _element(_field(kind, last))
+    values = [name for name, _ in element.values] if isinstance(element, Enum) else []
+    yield from (f"{path}={name}" for name in (("true", "false") if isinstance(element, Bool) else values))
+
+
+def _field(kind: MessageType, step: str) -> Field:
+    """Raises LookupError."""
+    name = step.partition("[")[0]
+    return {field.name: field for field in kind.fields}[name]
+
+
+def _element(field: Field) -> object:
+    from router.types.model import List
+
+    return field.type.element if isinstance(field.type, List) else field.type
+
+
+def _topics(table: RouteTable) -> Iterator[str]:
+    yield from (topic.topic.value for route in table.routes for topic in route.all_topics)
+    yield from (inbound.topic.topic.value for gateway in table.gateways.values() for inbound in gateway.inbound)
+
+
+def _table(args: argparse.Namespace) -> RouteTable | None:
+    """The valid part of the table that is named before, or of the default one."""
+    from router.table import load_table
+
+    path: Path | None = table_if_any(args)
+    return load_table(path)[0] if path is not None else None
+
+
+def _wire(args: argparse.Namespace) -> Wire:
+    """As `load_wire`, also of a table with errors elsewhere. Raises TableError, UsageError and FileNotFoundError."""
+    from router.assets import asset
+    from router.datagrams import wire_of_protos, wire_of_table
+    from router.table import load_table
+
+    protos: Path | None = getattr(args, "protos", None)
+    if protos is not None or (path := table_if_any(args)) is None:
+        return wire_of_protos(protos or asset("protos"))
+    table, findings = load_table(path)
+    if table is None:
+        raise TableError(findings)
+    return wire_of_table(table)
