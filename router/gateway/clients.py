@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import count
+from typing import Any
 
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Encoding
@@ -24,10 +25,12 @@ class ClientQueue:
         self.number = number
         self.sent = 0
         self.dropped = 0
+        self.lacking: set[str] = set()
+        """Topics of which frames gave way to newer ones."""
         self._on_wire = on_wire
         self._behind_since: int | None = None
         self._schemas: dict[Hashable, Frame] = {}
-        self._values: dict[Hashable, Frame] = {}
+        self._values: dict[str, Frame] = {}
 
     @property
     def waiting(self) -> int:
@@ -47,11 +50,12 @@ class ClientQueue:
         self.client.write(self._on_wire(frames))
         self.sent += len(frames)
 
-    def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[Hashable, Frame], frames: int, now: int) -> int:
+    def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[str, Frame], frames: int, now: int) -> int:
         """Queue the newest of so many `frames`. Return how many frames gave way to newer ones."""
         if self._behind_since is None:
             self._behind_since = now
         before = self.waiting
+        self.lacking |= self._values.keys() & values.keys()
         self._schemas.update(schemas)
         self._values.update(values)
         superseded = before + frames - self.waiting
@@ -69,7 +73,8 @@ class ClientQueue:
         """Remove frames from the front of the queue: HIGH_WATER bytes, or one frame that is larger."""
         taken: list[Frame] = []
         size = 0
-        for queue in (self._schemas, self._values):
+        queues: tuple[dict[Any, Frame], ...] = self._schemas, self._values
+        for queue in queues:
             for key, frame in list(queue.items()):
                 size += len(frame.data)
                 if taken and size > HIGH_WATER:
@@ -124,6 +129,11 @@ class Clients:
         elif ready:
             ready[0].write(frames)
 
+    def lack(self, topic: str) -> None:
+        """Record that no client got some message of the topic."""
+        for queue in self.queues.values():
+            queue.lacking.add(topic)
+
     def send_to(self, queue: ClientQueue, frames: Sequence[Frame]) -> None:
         """Answer one client."""
         if not frames:
@@ -153,7 +163,12 @@ class Clients:
 
     def _queue(self, queues: Sequence[ClientQueue], frames: Sequence[Frame]) -> None:
         schemas: dict[Hashable, Frame] = {(each.topic, each.type_name): each for each in frames if each.is_schema}
-        values: dict[Hashable, Frame] = {each.topic: each for each in frames if not each.is_schema}
+        values: dict[str, Frame] = {}
+        for frame in (each for each in frames if not each.is_schema):
+            if frame.topic in values:
+                for queue in queues:
+                    queue.lacking.add(frame.topic)
+            values[frame.topic] = frame
         now = self._clock_ns()
         self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))
 

@@ -11,9 +11,10 @@ if TYPE_CHECKING:  # which imports rclpy
 
 
 class Selection(NamedTuple):
-    """How a topic is subscribed to. `keeps` requests what publishers keep for late joiners.
+    """How a topic is subscribed to. `keeps` requests what publishers keep for late joiners, which all of them do.
 
     `others` are the types that are not served, most publishers first. `is_ours`: only this router publishes on it.
+    `keepers` are the gids of the publishers that keep messages.
     """
 
     type_name: str
@@ -21,6 +22,12 @@ class Selection(NamedTuple):
     keeps: bool
     others: tuple[str, ...]
     is_ours: bool = False
+    keepers: frozenset[bytes] = frozenset()
+
+    @property
+    def is_mixed(self) -> bool:
+        """Some keep messages and others do not: a subscription that hears all of them gets nothing that is kept."""
+        return bool(self.keepers) and not self.keeps
 
 
 def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Selection | None:
@@ -37,7 +44,13 @@ def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Se
     is_reliable = all(publisher.is_reliable for publisher in selected)
     keeps = is_reliable and all(publisher.keeps for publisher in selected)
     is_ours = all(publisher.is_ours for publisher in counted)
-    return Selection(type_name, is_reliable, keeps, tuple(others), is_ours)
+    return Selection(type_name, is_reliable, keeps, tuple(others), is_ours, keepers(counted, type_name))
+
+
+def keepers(publishers: Iterable[DiscoveredPublisher], type_name: str) -> frozenset[bytes]:
+    """Return the gids of those that keep messages for late joiners."""
+    kept = (each for each in publishers if each.type_name == type_name and each.keeps and each.is_reliable)
+    return frozenset(each.gid for each in kept)
 
 
 def by_frequency(type_names: Iterable[str]) -> dict[str, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Hashable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from router.gateway.clients import Clients
@@ -14,11 +15,15 @@ from router.gateway.encoding import LARGE, Encoding, Sample
 from router.gateway.json_codec import UnreadableError
 from router.gateway.publishers import Selection
 from router.gateway.subscriptions import TopicSubscription
-from router.gateway.transport.base import Frame
+from router.gateway.transport.base import PER_TURN, Frame
 from router.table.model import EACH, Gateway, Transport
 
 MOST_UNCONVERTED = 4
 """Large messages of one topic that wait to be converted, where every message is sent."""
+
+
+MOST_LOOKS = 20
+"""How often in vain it is looked whether a topic of several publishers is quiet."""
 
 
 @dataclass(slots=True)
@@ -28,6 +33,8 @@ class ServedTopic:
     `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` where every
     message is sent), `reported` the part that clients were told as a rate. `sample` is the latest one that was looked
     at, `readable` the latest that could be converted. `is_busy` while a large one is converted; `unconverted` wait.
+    `awaits_kept` until clients got what publishers keep, which comes to a new subscription as well. Of kept messages
+    up to `refused_ns` those that cannot be sent are counted.
     """
 
     subscription: TopicSubscription
@@ -40,6 +47,10 @@ class ServedTopic:
     readable: Sample | None = None
     is_busy: bool = False
     has_ended: bool = False
+    awaits_kept: bool = False
+    refused_ns: int = 0
+    seen: int = -1
+    looks: int = 0
     unconverted: deque[Sample] = field(default_factory=deque)
 
     @classmethod
@@ -49,10 +60,21 @@ class ServedTopic:
         A latest value that is there already, because another gateway subscribes to the topic, counts as one that
         arrives: publishers that keep it for late joiners do not send it again.
         """
-        known = subscription.latest() is not None
+        known = subscription.latest() is not None and not selection.keeps
         arrived = subscription.arrived
         counted = subscription.missed if period == EACH else arrived - known
         return cls(subscription, selection, period, number, counted=counted, reported=arrived)
+
+    def is_quiet(self) -> bool:
+        """Return whether nothing arrived since the last call.
+
+        Of several publishers one may never stop while another keeps what gave way: so that ends after some calls.
+        """
+        before, self.seen = self.seen, self.subscription.arrived
+        self.looks = 0 if before == self.seen else self.looks + 1
+        if is_quiet := self.looks == 0 or (self.looks > MOST_LOOKS and len(self.selection.keepers) > 1):
+            self.seen, self.looks = -1, 0
+        return is_quiet
 
     def uncounted(self) -> int:
         """Return, and mark as counted, the messages since the last call; with EACH, those that were missed."""
@@ -91,12 +113,15 @@ class TopicSender:
             return
         new = served.uncounted()
         self._counters.received(new)
-        if not self._clients:  # the middleware keeps the newest message for the next client
+        if not self._clients or served.awaits_kept:  # the middleware keeps the newest message for later
             self._counters.filtered(new)
             return
         sample = served.subscription.latest() if new or served.sample is None else served.sample
         is_new = new > 0 and sample is not None and sample is not served.sample
-        self._counters.filtered(new - is_new)
+        if new > is_new:
+            self._counters.filtered(new - is_new)
+            if served.selection.keepers:
+                self._clients.lack(served.subscription.topic)
         served.sample = sample
         if sample is not None and is_new:
             self._offer(served, sample, frames, is_new=True)
@@ -115,6 +140,7 @@ class TopicSender:
             served.unconverted.append(sample)
         else:
             self._counters.dropped("overloaded", sample.topic)
+            self._clients.lack(sample.topic)
 
     def count_missed(self, served: ServedTopic) -> None:
         """Count what arrived and gave way to newer messages before it was looked at."""
@@ -122,6 +148,8 @@ class TopicSender:
         self._counters.received(new)
         if served.period == EACH:
             self._counters.dropped("overloaded", served.subscription.topic, messages=new)
+            if new:
+                self._clients.lack(served.subscription.topic)
         else:
             self._counters.filtered(new)
 
@@ -154,11 +182,7 @@ class TopicSender:
     async def _convert(self, served: ServedTopic, sample: Sample, *, is_new: bool) -> None:
         """Convert a large message in another thread: the topic's next value waits for it, other topics do not."""
         try:
-            await asyncio.get_running_loop().run_in_executor(
-                self._context.converting, sample.payload, self._encoding.style, self._encoding.level
-            )
-        except UnreadableError:
-            pass  # raised, and counted, again by `_encode`
+            await self._prepare(sample)
         finally:
             served.is_busy = False
         if served.has_ended:
@@ -168,19 +192,18 @@ class TopicSender:
         while served.unconverted and not served.is_busy:
             self._offer(served, served.unconverted.popleft(), self._queue(), is_new=True)
 
+    async def _prepare(self, sample: Sample) -> None:
+        """Convert a message in another thread."""
+        with suppress(UnreadableError):  # raised, and counted, again when it is to be sent
+            await asyncio.get_running_loop().run_in_executor(
+                self._context.converting, sample.payload, self._encoding.style, self._encoding.level
+            )
+
     def _encode(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
         """Append the value, and before the first of its kind the schema."""
-        try:
-            data = self._frame(sample)
-        except UnreadableError as error:
-            if is_new:
-                self._counters.dropped("mapping_error", sample.topic, error)
-            return
-        served.readable = sample
-        if len(data.data) > self._most:
-            if is_new:
-                detail = f"{len(data.data)} bytes, and at most {self._most} can be sent; {self._remedy}"
-                self._counters.dropped("too_large", sample.topic, detail=detail)
+        if is_new:
+            served.refused_ns = max(served.refused_ns, sample.sent_ns)
+        if (data := self._checked(served, sample, is_new=is_new)) is None:
             return
         if is_new:
             self._counters.sent()
@@ -189,6 +212,22 @@ class TopicSender:
             self._introduced.add(key)
             frames.append(self.schema(served))
         frames.append(data)
+
+    def _checked(self, served: ServedTopic, sample: Sample, *, is_new: bool) -> Frame | None:
+        """Return the value, or None if it cannot be sent, which counts if it is new."""
+        try:
+            data = self._frame(sample)
+        except UnreadableError as error:
+            if is_new:
+                self._counters.dropped("mapping_error", sample.topic, error)
+            return None
+        served.readable = sample
+        if len(data.data) > self._most:
+            if is_new:
+                detail = f"{len(data.data)} bytes, and at most {self._most} can be sent; {self._remedy}"
+                self._counters.dropped("too_large", sample.topic, detail=detail)
+            return None
+        return data
 
     def _frame(self, sample: Sample) -> Frame:
         """Raises UnreadableError."""
@@ -204,11 +243,37 @@ class TopicSender:
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 
-    def show(self, served: ServedTopic, frames: list[Frame]) -> None:
-        """Append schema and latest value. `served` stays as it is: other clients are still to get the value.
+    async def kept(self, served: ServedTopic) -> list[Frame]:
+        """Return what publishers keep for late joiners, oldest first, and the latest value if it may be another's."""
+        topic = served.subscription
+        samples = list(await topic.kept.get())
+        if served.selection.is_mixed and (latest := topic.latest()):
+            same = [each for each in samples if (each.sent_ns, each.cdr) != (latest.sent_ns, latest.cdr)]
+            samples = [*same, latest]
+        frames: list[Frame] = []
+        for number, sample in enumerate(samples, 1):
+            if not self._is_quick(sample):
+                await self._prepare(sample)
+            elif number % PER_TURN == 0:
+                await asyncio.sleep(0)
+            is_new = sample.sent_ns > served.refused_ns
+            if data := self._checked(served, sample, is_new=False):
+                frames.append(data._replace(older=len(samples) - number))
+            elif is_new:
+                self._counters.received(1)
+                self._checked(served, sample, is_new=True)
+            served.refused_ns = max(served.refused_ns, sample.sent_ns)
+        return frames
 
-        A large value that is not converted yet goes to everybody a little later.
+    def show(self, served: ServedTopic, frames: list[Frame]) -> None:
+        """Append schema and latest value; of a topic whose publishers keep messages, only the schema.
+
+        `served` stays as it is: other clients are still to get the value. A large value that is not converted yet goes
+        to everybody a little later.
         """
+        if served.selection.keepers:
+            frames.append(self.schema(served))
+            return
         sample = served.subscription.latest()
         if sample is None:
             return

@@ -88,7 +88,7 @@ class GatewayService:
     def joined(self, client: Client) -> None:
         queue = self.clients.joined(client)
         is_alone = len(self.clients.queues) == 1
-        self.clients.send_to(queue, self._hello() + self._topics.snapshot(is_for_all=is_alone))
+        self.clients.send_to(queue, self._hello() + self._topics.snapshot(queue, is_for_all=is_alone))
         if is_alone:
             self._topics.discover_now()
 
@@ -107,8 +107,8 @@ class GatewayService:
     def connected(self, number: int) -> None:
         self._counters.connected(number)
 
-    def snapshot(self) -> list[Frame]:
-        return self._topics.snapshot()
+    async def snapshot(self) -> list[Frame]:
+        return await self._topics.everything()
 
     def refused(self, reason: str) -> None:
         self._counters.arrived(0)
@@ -140,7 +140,7 @@ class GatewayService:
             self._tell(client, refused)
             return
         self._answered = now
-        self.clients.send_to(queue, self._topics.snapshot(type_name))
+        self.clients.send_to(queue, self._topics.snapshot(queue, type_name))
 
     def _hello(self) -> list[Frame]:
         """Return what a client may send, for one that can show that to a person."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from router.compiler.lookup import definitions_of
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
+from router.gateway.kept import KeptMessages
 from router.gateway.publishers import Selection, select
 from router.gateway.transport.base import PER_TURN
 from router.threads import DaemonThread
@@ -55,6 +56,8 @@ class TopicSubscription:
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
+        self.kept = KeptMessages(topic, ready, topics, loop, lambda: self.arrived)
+        """What publishers keep for late joiners."""
 
     @property
     def arrived(self) -> int:
@@ -113,6 +116,7 @@ class TopicSubscription:
 
     def close(self) -> None:
         """Unsubscribe; `latest` and `arrived` keep their values."""
+        self.kept.close()
         if self._tap is None:
             return
         self._count()
@@ -214,6 +218,10 @@ class Subscriptions:
                     ready = await self._loop.run_in_executor(self._loader, self._load, selection.type_name)
                     self._types[selection.type_name] = ready
         return found
+
+    def is_joined(self, topic: str, callback: OnSample | None) -> bool:
+        """Return whether there is a subscription of the kind that this `callback`, or None, would join."""
+        return (topic, callback is not None) in self._open
 
     def join(self, topic: str, wanted: Selection, callback: OnSample | None) -> TopicSubscription:
         """Use a subscription: `callback` is called for every message; without it, ask for `latest`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import chain, count, repeat
@@ -11,7 +11,7 @@ from itertools import chain, count, repeat
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
 from router.errors import StartError
-from router.gateway.clients import Clients
+from router.gateway.clients import ClientQueue, Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Sample
@@ -28,6 +28,9 @@ buffer lose some of a burst of two hundred."""
 
 SHORTEST_PAUSE_S = 0.1
 """Seconds between two discoveries at least, also when many clients come."""
+
+MEND_S = 0.5
+"""Between two looks for clients that lack messages which publishers still keep."""
 
 SHORTEST_TURN = 10_000_000
 """ns between turns, at least: more often costs more than it spreads."""
@@ -65,9 +68,8 @@ class Topics:
         self._not_installed: set[str] = set()
         self._numbers = count()
         self._discover_now = asyncio.Event()
-        self._spreads = plan.settings.format is GatewayFormat.GATEWAY_V1 and (
-            plan.settings.transport.value is Transport.UDP
-        )
+        self._is_udp = plan.settings.transport.value is Transport.UDP
+        self._spreads = self._is_udp and plan.settings.format is GatewayFormat.GATEWAY_V1
 
     def start(self) -> None:
         settings = self._plan.settings
@@ -77,6 +79,7 @@ class Topics:
             self._in_turns(period, partial(self._publish, period))
         if settings.transport.value in (Transport.UDP, Transport.ZENOH):
             self._in_turns(settings.schema_period, self._repeat_schemas)
+        self._tasks.each(MEND_S, self._mend)
 
     def close(self) -> None:
         for topic in list(self._served):
@@ -133,18 +136,24 @@ class Topics:
         before = self._served.get(topic)
         period = self._selector.period(topic)
         callback = self._on_sample if period == EACH else None
+        is_new = not self._subscriptions.is_joined(topic, callback)
         subscription = self._subscriptions.join(topic, selection, callback)
         self._not_installed.discard(topic)
         if before and before.subscription is subscription:
             self._subscriptions.leave(subscription, callback)  # it had been joined before
+            if selection.is_mixed and selection.keepers - before.selection.keepers:
+                self._clients.lack(topic)  # this subscription does not get what they keep
+            if before.selection.keepers - selection.keepers:
+                before.readable = None  # it may be of a publisher that is gone
             before.selection = selection
             return
         if before:
             self._forget(topic)
         served = ServedTopic.begin(subscription, selection, period, next(self._numbers))
         self._served[topic] = served
-        if callback and selection.keeps and (kept := subscription.latest()):
-            self._sender.send(served, kept)  # publishers do not send it again to a subscription that exists already
+        if self._clients and selection.keepers and not (callback and is_new and selection.keeps):
+            served.awaits_kept = selection.keeps
+            self._tasks.run(self._introduce(served))
         if selection.others:
             logger.warning(
                 "a topic has several types, and is served as that of most publishers",
@@ -196,22 +205,77 @@ class Topics:
             self._sender.send(served, sample)
 
     async def _repeat_schemas(self, due: Sequence[ServedTopic]) -> None:
-        self._clients.send([self._sender.schema(served) for served in due if served.readable is not None])
+        is_known = [served for served in due if served.readable is not None or served.selection.keepers]
+        self._clients.send([self._sender.schema(served) for served in is_known])
+        if self._is_udp:  # whose client may have come unnoticed
+            for queue in self._clients.queues.values():
+                self._show_kept(queue, is_known)
+
+    # -- what publishers keep for late joiners -----------------------------------------------------------------
+
+    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic]) -> None:
+        """Send a client, a little later, what publishers of these topics keep."""
+        for served in topics:
+            if served.selection.keepers:
+                self._tasks.run(self._show(queue, served))
+
+    async def _show(self, queue: ClientQueue, served: ServedTopic) -> None:
+        queue.lacking.discard(served.subscription.topic)
+        frames = await self._sender.kept(served)
+        if served.has_ended or queue.client not in self._clients.queues:
+            return
+        if queue.keeps_up:
+            self._clients.send_to(queue, frames)
+        else:
+            queue.lacking.add(served.subscription.topic)
+
+    async def _introduce(self, served: ServedTopic) -> None:
+        """Begin to serve a topic while there are clients."""
+        schema = self._sender.schema(served)
+        self._clients.send([schema])
+        self._sender.introduced([schema])
+        try:
+            await asyncio.gather(*(self._show(queue, served) for queue in self._clients.queues.values()))
+        finally:
+            served.awaits_kept = False
+
+    async def _mend(self) -> None:
+        """Show clients what they lack of a topic, once nothing comes on it and they keep up."""
+        lacking = [queue for queue in self._clients.queues.values() if queue.lacking and queue.keeps_up]
+        for topic in {topic for queue in lacking for topic in queue.lacking}:
+            served = self._served.get(topic)
+            if served and served.selection.keepers and not served.is_quiet():
+                continue
+            for queue in lacking:
+                if topic in queue.lacking:
+                    queue.lacking.discard(topic)
+                    self._show_kept(queue, [served] if served else [])
 
     # -- answers -----------------------------------------------------------------------------------------------
 
-    def snapshot(self, type_name: str | None = None, *, is_for_all: bool = False) -> list[Frame]:
+    def snapshot(self, queue: ClientQueue, type_name: str | None = None, *, is_for_all: bool = False) -> list[Frame]:
         """Return schemas and latest values of all topics, or of those of one type. `is_for_all`: all clients get them.
 
-        A large value that is not converted yet goes to everybody a little later.
+        What publishers keep goes to the client, and a large value that is not converted yet to everybody, a little
+        later.
         """
         frames: list[Frame] = []
-        for served in self._served.values():
-            if type_name in (None, served.subscription.type_name):
-                self._sender.show(served, frames)
+        topics = [served for served in self._served.values() if type_name in (None, served.subscription.type_name)]
+        for served in topics:
+            self._sender.show(served, frames)
         if is_for_all:
             self._sender.introduced(frames)
+        self._show_kept(queue, topics)
         return frames
+
+    async def everything(self) -> list[Frame]:
+        """Return all schemas, latest values, and what publishers keep."""
+        frames: list[Frame] = []
+        topics = list(self._served.values())
+        for served in topics:
+            self._sender.show(served, frames)
+        kept = [self._sender.kept(served) for served in topics if served.selection.keepers]
+        return frames + [frame for frames in await asyncio.gather(*kept) for frame in frames]
 
     def rates(self, seconds: float) -> Iterator[tuple[str, str, float]]:
         """Yield every topic with its type and its rate over the `seconds` since the last call."""

@@ -29,12 +29,16 @@ _DISCOVERY_INTERVAL = 0.05
 
 
 class DiscoveredPublisher(NamedTuple):
-    """A publisher. `keeps`: it keeps messages for late joiners. `is_ours`: it belongs to the discovering node."""
+    """A publisher. `keeps`: it keeps messages for late joiners. `is_ours`: it belongs to the discovering node.
+
+    No two have the same `gid`.
+    """
 
     type_name: str
     is_reliable: bool
     keeps: bool
     is_ours: bool
+    gid: bytes
 
 
 class RosTopics:
@@ -57,6 +61,7 @@ class RosTopics:
                 is_reliable=seen["qos_profile"]["reliability"] == ReliabilityPolicy.RELIABLE,
                 keeps=seen["qos_profile"]["durability"] == DurabilityPolicy.TRANSIENT_LOCAL,
                 is_ours=self._is_ours(seen),
+                gid=bytes(seen["endpoint_gid"]),
             )
             for seen in self._query(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
         ]

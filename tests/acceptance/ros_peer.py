@@ -89,8 +89,17 @@ class RosPeer:
     def nothing_left(self) -> bool:
         return self._arrivals.empty()
 
-    def open(self, topic: str, type_name: str, *, reliable: bool = True, keeps: bool = False, name: str = "") -> None:
-        self._ask("open", name or topic, topic=topic, type=type_name, reliable=reliable, keeps=keeps)
+    def open(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        reliable: bool = True,
+        keeps: bool = False,
+        name: str = "",
+        depth: int = 100,
+    ) -> None:
+        self._ask("open", name or topic, topic=topic, type=type_name, reliable=reliable, keeps=keeps, depth=depth)
 
     def open_heard(self, topics: Mapping[str, str]) -> None:
         """Opens reliable publishers, and waits until each has a subscriber."""
@@ -171,7 +180,7 @@ def main() -> None:
 
 def _publisher(node: Node, asked: Mapping[str, Any]) -> Any:
     durability = DurabilityPolicy.TRANSIENT_LOCAL if asked["keeps"] else DurabilityPolicy.VOLATILE
-    qos = QoSProfile(depth=100, reliability=_reliability(asked["reliable"]), durability=durability)
+    qos = QoSProfile(depth=asked["depth"], reliability=_reliability(asked["reliable"]), durability=durability)
     return node.create_publisher(message_class(asked["type"]), asked["topic"], qos)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 import zenoh
 from backports import zstd
 
+from router.gateway.kept import FRESH_S
 from router.gateway.packets import unbatched
 from tests.acceptance.gateway_clients import (
     Dashboard,
@@ -325,16 +327,22 @@ def test_a_message_of_two_megabytes_passes(now: Scene) -> None:
         received.close()
 
 
-def test_a_late_joiner_on_zenoh_gets_schema_and_latest_value_at_once_and_can_send(now: Scene) -> None:
-    now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
-    now.await_subscription("/gw/word")
-    now.peer.say("/gw/word", {"data": "latest"})
+@contextmanager
+def earthling(now: Scene) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{now.ports["EARTH"]}"]')
     config.insert_json5("scouting/multicast/enabled", "false")
-    wanted = {"rovers/loki/data/gw/word", "rovers/loki/schema/std_msgs/msg/String"}
     with zenoh.open(config) as session:
+        yield session
+
+
+def test_a_late_joiner_on_zenoh_gets_schema_and_latest_value_at_once_and_can_send(now: Scene) -> None:
+    now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
+    now.await_subscription("/gw/word")
+    now.peer.say("/gw/word", {"data": "latest"})
+    wanted = {"rovers/loki/data/gw/word", "rovers/loki/schema/std_msgs/msg/String"}
+    with earthling(now) as session:
         found: dict[str, bytes] = {}
 
         def asked() -> bool:
@@ -353,6 +361,58 @@ def test_a_late_joiner_on_zenoh_gets_schema_and_latest_value_at_once_and_can_sen
         put = head("/gw/from_earth", "std_msgs/msg/Int32") + b'{"data":[5]}'
         with repeating(partial(session.put, "rovers/loki/inbound/gw/from_earth", put)):
             assert now.peer.receive_on("/gw/from_earth") == {"data": 5}
+
+
+KEPT = ["a", "b", "c", "d 2", "d 3", "d 4"]
+
+
+def kept(documents: Iterator[dict[str, Any]], number: int) -> list[str]:
+    """The next messages of /gw/kept."""
+    return sorted(islice(values(documents, "/gw/kept"), number))
+
+
+def answers(session: zenoh.Session, selector: str) -> list[str]:
+    """The messages of /gw/kept that a query finds."""
+    packets = [packet(reply.ok.payload.to_bytes()) for reply in session.get(selector)]
+    found = [json.loads(payload) for _, _, topic, _, payload in packets if topic == "/gw/kept"]
+    return sorted(value["data"][0] for value in found if "data" in value)
+
+
+def test_a_late_client_gets_what_a_late_subscriber_of_ros_would(now: Scene, client: Headset) -> None:
+    for name, depth in (("a", 1), ("b", 1), ("c", 1), ("d", 3)):
+        now.peer.open("/gw/kept", "std_msgs/msg/String", keeps=True, name=name, depth=depth)
+        texts = [f"{name} {number}" for number in range(5)] if depth > 1 else [f"old {name}", name]
+        now.peer.say(name, *({"data": text} for text in texts))
+    with Dashboard(now.ports["DASHBOARD"]) as dashboard, now.connect("LOGGER") as opened, earthling(now) as earth:
+        logged = lines(opened)
+        for documents in (dashboard.documents(), logged):
+            found = set[str]()
+            for text in values(documents, "/gw/kept"):  # some come as they are published
+                found.add(text)
+                if found >= {*KEPT}:
+                    break
+        for _ in range(2):
+            with Dashboard(now.ports["DASHBOARD"]) as late:
+                assert kept(late.documents(), len(KEPT)) == KEPT
+            with now.connect("LOGGER") as late_logger:
+                late_lines = lines(late_logger)
+                assert kept(late_lines, len(KEPT)) == KEPT
+                late_lines.close()
+        time.sleep(0.2)
+        dashboard.ask(op="schema", type="std_msgs/msg/String")
+        assert kept(dashboard.documents(), len(KEPT)) == KEPT
+        wait_until(lambda: answers(earth, "rovers/loki/**") == KEPT, "the answers")
+        assert answers(earth, "rovers/loki/data/gw/kept/**") == KEPT
+        for _ in range(2):  # it may have come at any time, and gets them with the schemas
+            for text in KEPT:
+                client.wait_for("/gw/kept", value={"data": [text]})
+        now.peer.close("c")
+        now.peer.close("d")
+        time.sleep(FRESH_S)
+        with Dashboard(now.ports["DASHBOARD"]) as late:
+            assert kept(late.documents(), 2) == KEPT[:2]
+        wait_until(lambda: answers(earth, "rovers/loki/**") == KEPT[:2], "what is still kept")
+        logged.close()
 
 
 def test_the_books_of_a_gateway_balance(now: Scene) -> None:

@@ -93,7 +93,7 @@ class Graph:
         return [*self.types]
 
     def publishers(self, topic: str) -> list[DiscoveredPublisher]:
-        return [DiscoveredPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False)]
+        return [DiscoveredPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False, gid=b"one")]
 
     def installed_type(self, type_name: str) -> MessageType:
         raise StartError(f"{type_name} is not installed")

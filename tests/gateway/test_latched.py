@@ -1,9 +1,11 @@
-"""A latched value with several gateways: real publishers in processes of their own, clients that the test plays."""
+"""Latched messages with several publishers, gateways and clients: real processes publish, clients are played."""
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import closing
+import json
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, asynccontextmanager, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -11,8 +13,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from router.gateway.kept import FRESH_S
+from router.gateway.transport.base import HIGH_WATER
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.stage import Played, Stage, program
+from tests.gateway.stage import Played, PlayedClient, Stage, program
 from tests.ros.opening import STRING, cdr, open_ros
 from tests.ros.peers import Publisher
 
@@ -66,3 +70,175 @@ async def test_a_latched_value_is_sent_and_counted_once_however_many_gateways_jo
                 assert received == before[name] + 1 <= kept + 1
                 assert received == sum(stage.count(outcome, name, "clients") for outcome in OUTCOMES)
             assert stage.faults == []
+
+
+class LateClient(PlayedClient):
+    """A client that comes later; nothing is written to it while it `is_slow`."""
+
+    def __init__(self, played: Played) -> None:
+        super().__init__()
+        self.is_slow = False
+        self._played = played
+        played.service.joined(self)
+
+    def backlog(self) -> int:
+        return HIGH_WATER if self.is_slow else 0
+
+    def goes_on(self) -> None:
+        self.is_slow = False
+        self._played.service.drained(self)
+
+    @property
+    def texts(self) -> list[str]:
+        return [json.loads(frame.data)["data"]["data"] for frame in self.values]
+
+
+@contextmanager
+def publishers(*depths: int) -> Iterator[list[Publisher]]:
+    """Each keeps so many messages; 0 for one that keeps none."""
+    with ExitStack() as opened:
+        options = (("--transient-local", "--depth", str(depth)) if depth else () for depth in depths)
+        peers = [Publisher("greeting", STRING, *each) for each in options]
+        for peer in peers:
+            opened.callback(end, peer)
+        yield peers
+
+
+def end(peer: Publisher) -> None:
+    if peer.process.poll() is None:
+        peer.close()
+
+
+def acknowledged(peer: Publisher) -> None:
+    """It has published, and those who subscribe by now have all of it."""
+    peer.publish([b""])
+    while peer.line() != "acknowledged":
+        pass  # but of subscribers that it found
+
+
+@asynccontextmanager
+async def gateway(folder: Path, period: str) -> AsyncIterator[tuple[Stage, Played]]:
+    with closing(open_ros()) as ros:
+        async with Stage(program(folder, f"it: {GATEWAY.format(port=8600, period=period)}"), ros.topics) as stage:
+            await stage.played["it"].start()
+            yield stage, stage.played["it"]
+            assert stage.faults == []
+
+
+async def subscribed(*peers: Publisher) -> None:
+    for peer in peers:
+        assert await asyncio.to_thread(peer.line) == "matched"
+
+
+@pytest.mark.parametrize("period", ["20ms", "each"])
+@asynchronous
+async def test_a_late_client_gets_what_each_publisher_keeps_once_and_oldest_first(tmp_path: Path, period: str) -> None:
+    with publishers(1, 1, 1, 3) as peers:
+        for number, peer in enumerate(peers):
+            peer.publish([cdr(f"{number} {time}") for time in range(5)])
+            acknowledged(peer)
+        expected = ["0 4", "1 4", "2 4", "3 2", "3 3", "3 4"]
+        async with gateway(tmp_path, period) as (_, played):
+            await until(lambda: {*texts(played)} == {*expected})
+            for _ in range(2):
+                late = LateClient(played)
+                await until(lambda late=late: late.texts == expected)  # type: ignore[misc]
+            peers[1].kill()
+            peers[3].close()
+            await asyncio.sleep(FRESH_S)
+            last = LateClient(played)
+            await until(lambda: last.texts == ["0 4", "2 4"])
+
+
+@pytest.mark.parametrize("period", ["500ms", "each"])
+@asynchronous
+async def test_a_client_that_is_there_gets_what_gave_way_within_a_period(tmp_path: Path, period: str) -> None:
+    with publishers(1, 1, 3) as peers:
+        async with gateway(tmp_path, period) as (_, played):
+            await subscribed(*peers)
+            late = LateClient(played)
+            for peer, said in zip(peers, (["a"], ["b"], ["1", "2", "3", "4"]), strict=True):
+                peer.publish([cdr(text) for text in said])
+                acknowledged(peer)
+            await until(lambda: {*late.texts} >= {"a", "b", "2", "3", "4"})
+            assert late.texts[-1] == max(late.texts, key="ab1234".index)
+
+
+@asynchronous
+async def test_what_publishers_keep_comes_to_a_slow_client_when_it_keeps_up_again(tmp_path: Path) -> None:
+    with publishers(1, 1, 1) as peers:
+        async with gateway(tmp_path, "each") as (stage, played):
+            await subscribed(*peers)
+            slow, behind = LateClient(played), LateClient(played)
+            slow.is_slow = True
+            for number, peer in enumerate(peers):
+                peer.publish([cdr(str(number))])
+                acknowledged(peer)
+            await until(lambda: len(behind.texts) == 3)
+            later = LateClient(played)
+            later.is_slow = True  # before it gets what it came for
+            assert stage.count("client_messages_dropped", "it", "superseded") == 2
+            await asyncio.sleep(1.0)
+            assert slow.texts == later.texts == []
+            for each in (slow, later):
+                each.goes_on()
+            await until(lambda: {*slow.texts} == {*later.texts} == {"0", "1", "2"})
+            assert slow.texts[-1] == later.texts[-1] == "2"
+
+
+@asynchronous
+async def test_of_a_mixed_topic_a_late_client_gets_what_is_kept_and_the_latest_value(tmp_path: Path) -> None:
+    with publishers(1, 1, 0) as peers:
+        async with gateway(tmp_path, "20ms") as (_, played):
+            await subscribed(*peers)
+            for peer, text in zip(peers, ("a", "b", "c"), strict=True):
+                peer.publish([cdr(text)])
+                await until(partial(has_come, played, text))
+            late = LateClient(played)
+            await until(lambda: late.texts == ["a", "b", "c"])
+
+
+@asynchronous
+async def test_behind_a_publisher_that_never_stops_nothing_is_lost_for_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("router.gateway.sending.MOST_LOOKS", 2)
+    with publishers(1, 1) as [peer, busy]:
+        async with gateway(tmp_path, "500ms") as (_, played):
+            await subscribed(peer, busy)
+
+            def has_come() -> bool:
+                busy.publish([cdr("again")])
+                return "once" in texts(played)
+
+            await until(lambda: has_come() or "again" in texts(played))
+            peer.publish([cdr("once")])
+            await until(has_come)
+
+
+@asynchronous
+async def test_large_messages_that_are_kept_go_to_a_late_client_only(tmp_path: Path) -> None:
+    with publishers(1, 1) as peers:
+        large = ["a" * 100_000, "b" * 100_000]
+        for peer, text in zip(peers, large, strict=True):
+            peer.publish([cdr(text)])
+        async with gateway(tmp_path, "20ms") as (_, played):
+            await until(lambda: {*texts(played)} == {*large})
+            late = LateClient(played)
+            await until(lambda: {*late.texts} == {*large})
+            assert len(texts(played)) == 2
+
+
+@asynchronous
+async def test_what_is_kept_and_too_large_is_counted_once_however_many_clients_come(tmp_path: Path) -> None:
+    with publishers(1, 1) as peers:
+        for peer, length in zip(peers, (10, 20_000_000), strict=True):
+            peer.publish([cdr("x" * length)])
+        async with gateway(tmp_path, "20ms") as (stage, played):
+            for _ in range(2):
+                late = LateClient(played)
+                await until(lambda late=late: late.texts == ["x" * 10])  # type: ignore[misc]
+                await until(lambda: stage.count("messages_dropped", "it", "clients", "too_large") == 1)
+            outcomes = ("messages_sent", "messages_filtered")
+            balance = 1 + sum(stage.count(outcome, "it", "clients") for outcome in outcomes)
+            assert stage.count("messages_received", "it", "ros") == balance

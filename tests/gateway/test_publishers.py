@@ -12,14 +12,15 @@ from hypothesis import strategies as st
 from router.gateway.publishers import Selection, select
 from router.ros.topics import DiscoveredPublisher
 
-RELIABLE = DiscoveredPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
+RELIABLE = DiscoveredPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False, gid=b"one")
 LATCHED = RELIABLE._replace(keeps=True)
 LOSSY = RELIABLE._replace(is_reliable=False)
 LOSSY_LATCHED = LATCHED._replace(is_reliable=False)
 OTHER = RELIABLE._replace(type_name="b/msg/B")
 THIRD = RELIABLE._replace(type_name="c/msg/C")
 
-seen = st.builds(DiscoveredPublisher, st.sampled_from("abc"), st.booleans(), st.booleans(), st.booleans())
+FLAG = st.booleans()
+seen = st.builds(DiscoveredPublisher, st.sampled_from("abc"), FLAG, FLAG, FLAG, st.binary(max_size=1))
 
 
 @pytest.mark.parametrize(
@@ -56,6 +57,17 @@ def test_the_type_of_most_publishers_is_served(
     publishers: list[DiscoveredPublisher], type_name: str, others: tuple[str, ...]
 ) -> None:
     assert select(publishers, is_inbound=False) == Selection(type_name, is_reliable=True, keeps=False, others=others)
+
+
+def test_those_that_keep_messages_are_known_also_among_others() -> None:
+    second, other = LATCHED._replace(gid=b"two"), RELIABLE._replace(gid=b"three")
+    all_keep = select([LATCHED, second], is_inbound=False)
+    mixed = select([LATCHED, second, other, LOSSY_LATCHED._replace(gid=b"four")], is_inbound=False)
+    none = select([other], is_inbound=False)
+    assert all_keep and mixed and none  # noqa: PT018
+    assert (all_keep.keepers, all_keep.is_mixed) == (frozenset({b"one", b"two"}), False)
+    assert (mixed.keepers, mixed.is_mixed) == (frozenset({b"one", b"two"}), True)
+    assert (none.keepers, none.is_mixed) == (frozenset(), False)
 
 
 def test_a_topic_without_publishers_is_not_served() -> None:

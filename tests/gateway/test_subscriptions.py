@@ -91,9 +91,10 @@ async def heard(peer: Publisher, cdr: bytes, subscription: TopicSubscription) ->
 async def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish) -> None:
     publisher(STRING, "--transient-local")
     async with opened(string_topic(topic="own")) as subscriptions:
-        await seen(subscriptions)
+        keepers = (await seen(subscriptions)).keepers
+        assert len(keepers) == 1
         assert await subscriptions.discover((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
-            "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=()),
+            "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=(), keepers=keepers),
             "/own": OURS,
         }
         assert await subscriptions.discover(["/own"], lambda topic: topic == "/own") == {}

@@ -66,7 +66,7 @@ class Events:
     def connected(self, number: int) -> None:
         self.connections.append(number)
 
-    def snapshot(self) -> Sequence[Frame]:
+    async def snapshot(self) -> Sequence[Frame]:
         return self.shown
 
 

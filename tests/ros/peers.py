@@ -67,11 +67,12 @@ def main() -> None:
     parser.add_argument("type")
     parser.add_argument("--transient-local", action="store_true")
     parser.add_argument("--best-effort", action="store_true")
+    parser.add_argument("--depth", type=int, default=1000)
     parser.add_argument("--flood", action="store_true")
     arguments = parser.parse_args()
     lines = own_stdout()
     qos = QoSProfile(
-        depth=1000,
+        depth=arguments.depth,
         reliability=ReliabilityPolicy.BEST_EFFORT if arguments.best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if arguments.transient_local else DurabilityPolicy.VOLATILE,
     )

@@ -47,11 +47,13 @@ def test_publishers_are_seen_with_type_and_qos(ros: RouterNode, publisher: Publi
     publisher(STRING, "--transient-local")
     publisher(STRING, "--best-effort")
     wait_until(lambda: len(ros.topics.publishers("/greeting")) == 3)
-    assert sorted(ros.topics.publishers("/greeting")) == [
-        DiscoveredPublisher(STRING, is_reliable=False, keeps=False, is_ours=False),
-        DiscoveredPublisher(STRING, is_reliable=True, keeps=False, is_ours=False),
-        DiscoveredPublisher(STRING, is_reliable=True, keeps=True, is_ours=False),
+    found = sorted(ros.topics.publishers("/greeting"))
+    assert found == [
+        DiscoveredPublisher(STRING, is_reliable=False, keeps=False, is_ours=False, gid=found[0].gid),
+        DiscoveredPublisher(STRING, is_reliable=True, keeps=False, is_ours=False, gid=found[1].gid),
+        DiscoveredPublisher(STRING, is_reliable=True, keeps=True, is_ours=False, gid=found[2].gid),
     ]
+    assert len({each.gid for each in found}) == 3
     assert "/greeting" in ros.topics.names()
 
 

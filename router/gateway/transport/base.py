@@ -22,13 +22,15 @@ PER_TURN = 32
 class Frame(NamedTuple):
     """One packet or document to send. `data` is what clients see, without the framing of the transport.
 
-    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`.
+    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers the messages that
+    publishers keep beside the newest one of the topic.
     """
 
     data: bytes
     topic: str
     type_name: str
     is_schema: bool
+    older: int = 0
 
 
 class Client(Protocol):
@@ -72,8 +74,8 @@ class Events(Protocol):
     def connected(self, number: int) -> None:
         """So many other routers and peers of the network are connected now."""
 
-    def snapshot(self) -> Sequence[Frame]:
-        """Return all schemas and latest values, schemas first."""
+    async def snapshot(self) -> Sequence[Frame]:
+        """Return all schemas, latest values, and what publishers keep for late joiners. A schema is before its data."""
 
 
 def report_fault(where: str, error: Exception) -> None:

@@ -18,7 +18,7 @@ import zenoh
 
 from router.errors import StartError, TransportError
 from router.gateway.transport.arrival import LoopClock
-from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
+from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame, report_fault
 from router.gateway.transport.binding import RETRY_SECONDS
 from router.gateway.transport.zenoh_session import (
     Owner,
@@ -106,10 +106,7 @@ class ZenohTransport:
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
-        if self._client is not None:
-            self._inbox.stop()
-            self._client.close()
-        self._client = None
+        self._stop_serving()
         if self._session is not None:
             closing = self._loop.run_in_executor(self._session_thread, self._session.close)
             await asyncio.wait([closing], timeout=CLOSING_SECONDS)
@@ -235,7 +232,7 @@ class ZenohTransport:
         Returns the first of the other owners. Raises ZError.
         """
         self._inbox = Inbox(self._events, self._most)
-        self._queries = Queries(self._answer)
+        self._queries = Queries()
         owner = this_owner(session)
         others = await self._loop.run_in_executor(self._session_thread, self._declare, session, owner)
         self._owner = owner
@@ -246,6 +243,7 @@ class ZenohTransport:
         self._client = ZenohClient(self._key, Putter(session, self._key), self._events)
         self._events.joined(self._client)
         self._inbox.start(self._client)
+        self._answering_queries = self._loop.create_task(self._answer_queries(self._queries))
         return min(self._others, default=None)
 
     def _declare(self, session: zenoh.Session, owner: Owner) -> set[Owner]:
@@ -260,11 +258,15 @@ class ZenohTransport:
     async def _give_up(self) -> None:
         """Stop serving. What waits is discarded: it may be old when the key is free."""
         self._owner = None
+        self._stop_serving()
+        await self._loop.run_in_executor(self._session_thread, self._release)
+
+    def _stop_serving(self) -> None:
         if self._client is not None:
+            self._answering_queries.cancel()
             self._inbox.stop()
             self._client.close()
             self._client = None
-        await self._loop.run_in_executor(self._session_thread, self._release)
 
     def _release(self) -> None:
         """Runs in the session's thread. Raises ZError."""
@@ -273,17 +275,20 @@ class ZenohTransport:
 
     # -- queries -------------------------------------------------------------------------------------------------
 
-    def _answer(self) -> None:
-        """Answer all queries that wait from one snapshot."""
-        if self._client is None:
-            return
-        queries, frames = self._queries.take(), self._events.snapshot()
-        answering = self._loop.run_in_executor(self._answering, _reply, queries, self._key, frames)
-        answering.add_done_callback(self._answered)
-
-    def _answered(self, answering: asyncio.Future[zenoh.ZError | None]) -> None:
-        if not answering.cancelled() and (error := answering.result()) is not None:
-            self._events.failed(None, error, 0)
+    async def _answer_queries(self, queries: Queries) -> None:
+        """Answer queries from now on, all that wait from one snapshot."""
+        while True:
+            await queries.came.wait()
+            queries.came.clear()
+            try:
+                waiting = queries.take()
+                frames = await self._events.snapshot()
+                error = await self._loop.run_in_executor(self._answering, _reply, waiting, self._key, frames)
+            except Exception as fault:  # noqa: BLE001 reported; the next query matters as much
+                report_fault("left a query without an answer", fault)
+            else:
+                if error is not None:
+                    self._events.failed(None, error, 0)
 
 
 class Inbox:
@@ -343,10 +348,10 @@ class Inbox:
 
 
 class Queries:
-    """Queries that wait for an answer. `wake` is called in the loop when there is one after there was none."""
+    """Queries that wait for an answer. `came` is set when there is one after there was none."""
 
-    def __init__(self, wake: Callable[[], None]) -> None:
-        self._wake = wake
+    def __init__(self) -> None:
+        self.came = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[zenoh.Query] = deque()
 
@@ -358,7 +363,7 @@ class Queries:
             return
         self._waiting.append(query)
         if len(self._waiting) == 1:
-            self._loop.call_soon_threadsafe(self._wake)
+            self._loop.call_soon_threadsafe(self.came.set)
 
     def take(self) -> list[zenoh.Query]:
         """Remove and return all that wait."""
@@ -500,7 +505,7 @@ def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -
     for query in queries:
         with query:
             for frame in frames:
-                key = key_of(root, frame)
+                key = key_of(root, frame) + (f"/{frame.older}" if frame.older else "")
                 try:
                     if query.key_expr.intersects(key):
                         query.reply(key, frame.data)

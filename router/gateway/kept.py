@@ -1,0 +1,129 @@
+"""What publishers of a topic keep for late joiners (`transient_local`), as a subscriber gets it that comes now."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from router.errors import StartError
+from router.gateway.encoding import ReadyType, Sample
+from router.gateway.publishers import keepers
+from router.gateway.transport.base import PER_TURN
+from router.log import logger
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.ros.topics import RosTopics, TopicTap
+
+MOST_KEPT = 1000
+MOST_KEPT_BYTES = 64 << 20
+"""Messages of one topic, and their bytes, that late clients get; the newest ones."""
+
+POLL_S = 0.02
+QUIET_S = 0.1
+"""Publishers have delivered all that they keep if nothing came for so long."""
+
+AT_MOST_S = 0.5
+"""How long it is waited for that, on a topic that is never quiet."""
+
+PATIENCE_S = 2.0
+"""How long it is waited for publishers from which nothing came: they may have published nothing yet."""
+
+FRESH_S = 1.0
+"""So long the messages serve others who ask, unless another one came: clients that come often cost no subscriptions."""
+
+
+class KeptMessages:
+    """Asks the publishers themselves, by a subscription of a moment.
+
+    How many messages a publisher keeps is not known to others, and what it keeps goes with it. So only the publishers
+    can tell. `arrived` is the number of messages that came on the topic so far.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        ready: ReadyType,
+        topics: RosTopics,
+        loop: asyncio.AbstractEventLoop,
+        arrived: Callable[[], int],
+    ) -> None:
+        self._topic = topic
+        self._ready = ready
+        self._topics = topics
+        self._loop = loop
+        self._arrived = arrived
+        self._tap: TopicTap | None = None
+        self._asking: asyncio.Task[None] | None = None
+        self._found: Sequence[Sample] = ()
+        self._found_at: tuple[int, frozenset[bytes]] | None = None  # when so many had arrived, of these publishers
+        self._forgetting: asyncio.TimerHandle | None = None
+
+    async def get(self) -> Sequence[Sample]:
+        """Return the messages, those first that set out first. All who ask meanwhile share them.
+
+        Nothing if publishers cannot be asked, which is logged, or if the subscription is closed meanwhile.
+        """
+        if self._asking is None:
+            publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
+            if self._found_at != (self._arrived(), publishers):
+                self._asking = self._loop.create_task(self._ask(publishers))
+        if asking := self._asking:
+            await asyncio.wait([asking])  # which goes on for others, even if this one is cancelled
+            if not asking.cancelled():
+                asking.result()
+        return self._found
+
+    def close(self) -> None:
+        """Unsubscribe and forget."""
+        if self._asking:
+            self._asking.cancel()
+            self._asking = None
+        if self._tap:
+            self._tap.close()
+            self._tap = None
+        self._forget()
+
+    async def _ask(self, publishers: frozenset[bytes]) -> None:
+        self._forget()
+        try:
+            self._tap = self._topics.tap(
+                self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
+            )
+        except StartError as error:
+            logger.warning("what publishers keep for late clients is not sent", topic=self._topic, error=str(error))
+        else:
+            self._found, arrived = await self._collect(self._tap, len(publishers))
+            self._found_at = arrived, publishers
+            self._tap.close()
+            self._tap = None
+            self._forgetting = self._loop.call_later(FRESH_S, self._forget)
+        self._asking = None
+
+    async def _collect(self, tap: TopicTap, publishers: int) -> tuple[Sequence[Sample], int]:
+        """Return the messages, and how many had arrived on the topic when the last of them was taken."""
+        samples: deque[Sample] = deque()
+        size = 0
+        begun = last = self._loop.time()
+        while True:
+            arrived = self._arrived()
+            await asyncio.sleep(POLL_S)
+            taken = 0
+            while taken < PER_TURN and (message := tap.take()):
+                taken, last = taken + 1, self._loop.time()
+                samples.append(Sample(self._topic, self._ready, *message))
+                size += len(message[0])
+                while len(samples) > MOST_KEPT or (size > MOST_KEPT_BYTES and len(samples) > 1):
+                    size -= len(samples.popleft().cdr)
+            now = self._loop.time()
+            is_quiet = len(samples) >= publishers and now - last > QUIET_S
+            is_late = now - begun > (AT_MOST_S if len(samples) >= publishers else PATIENCE_S)
+            if taken < PER_TURN and (is_quiet or is_late):
+                return sorted(samples, key=lambda sample: sample.sent_ns), arrived
+
+    def _forget(self) -> None:
+        self._found, self._found_at = (), None
+        if self._forgetting:
+            self._forgetting.cancel()
+            self._forgetting = None
