@@ -20,7 +20,19 @@ REFUSED = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
         ("deadman", "driving_board", REFUSED, "nobody listens at 127.0.0.222:25008"),
         ("drop", "driving_board", REFUSED, "nobody listens at 127.0.0.222:25008"),
         ("drop", "clients", REFUSED, str(REFUSED)),
-        ("drop", "driving_board", OSError(errno.EPERM, "not permitted"), "[Errno 1] not permitted"),
+        (
+            "drop",
+            "driving_board",
+            OSError(errno.EACCES, "x"),
+            "a route or rule of this computer prohibits sending to 127.0.0.222: `ip route get 127.0.0.222`",
+        ),
+        (
+            "deadman",
+            "driving_board",
+            OSError(errno.EPERM, "x"),
+            "a firewall of this computer forbids sending to 127.0.0.222:25008: `nft list ruleset`",
+        ),
+        ("drop", "driving_board", OSError(errno.EMSGSIZE, "Message too long"), "Message too long"),
     ],
 )
 def test_a_refused_datagram_is_explained(
