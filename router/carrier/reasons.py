@@ -136,7 +136,7 @@ def _always(words: str) -> Callable[[NativeRefusal, bytes], str]:
 
 
 _WORDS: Mapping[Refused, Callable[[NativeRefusal, bytes], str]] = {
-    Refused.MALFORMED: _always("malformed: it ends too early, or is of another type"),
+    Refused.MALFORMED: _always("it ends too early, or is of another type"),
     Refused.INTEGER: _integer,
     Refused.OVERFLOW: _always("the result does not fit 64 bits"),
     Refused.DIVISION: _always("division by zero"),
