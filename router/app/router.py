@@ -163,7 +163,8 @@ class Router:
         opening.callback(self.mirror.close)
 
     def _deadman_changed(self, route: str, active: bool) -> None:
-        self._reporter.deadman_changed(route, active)
+        plans = (*self.program.deadmen, *self.program.client_deadmen)
+        self._reporter.deadman_changed(route, active, {plan.route: plan for plan in plans}.get(route))
         if active:
             self._services.deadman_tripped(route)
 

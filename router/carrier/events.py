@@ -11,7 +11,7 @@ from socket import inet_ntoa
 from typing import cast
 
 from router.carrier.outlets import Names
-from router.carrier.reasons import LOSSES, REJECTIONS
+from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Mismatch, Report
 from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
@@ -78,7 +78,8 @@ class EventReader:
     def _lost(self, record: memoryview) -> Told:
         event = LostEvent.from_buffer(record)
         route, target = self._name(event.route), self._name(event.target)
-        detail = _text(record[ctypes.sizeof(event) :])
+        text = bytes(record[ctypes.sizeof(event) :]).partition(b"\0")[0]
+        detail = why_refused(event.refusal, text) if event.refusal.kind else text.decode(errors="replace")
         if event.generation:  # a program of the table refused the message
             topic = self._name(event.topic) if event.topic != NO_NAME else None
             place = self._place(route, topic, target, event.generation, event.place)

@@ -105,7 +105,7 @@ DROP_REASONS: Mapping[str, str] = {
     "non_finite": "NaN or infinity where an integer or a time is wanted, or for a board",
     "too_large": "the envelope, a text or a list is larger than the board takes",
     "stale": "older than `ttl`",
-    "rate_limited": "more often than `max_rate`",
+    "rate_limited": "more often than `max_rate`; not logged, as the table asks for it",
     "queue_full": "the endpoint's `bandwidth` was short, or a thread was behind, for longer than the queue lasts",
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it, or nobody listens there",

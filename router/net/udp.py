@@ -246,6 +246,23 @@ def nobody_listens(address: Address) -> str:
     return f"nobody listens at {address}"
 
 
+def why_not_sent(error: OSError, address: Address) -> str:
+    """Say in words why nothing was sent to an address, with what shows more."""
+    ask = f"`ip route get {address.host}`"
+    match error.errno:
+        case errno.ECONNREFUSED:
+            return nobody_listens(address)
+        case errno.EACCES:
+            return f"a route or rule of this computer prohibits sending to {address.host}: {ask}"
+        case errno.EPERM:
+            return f"a firewall of this computer forbids sending to {address}: `nft list ruleset`"
+        case errno.ENETUNREACH | errno.EHOSTUNREACH:
+            return f"no route leads to {address.host}, or nobody there answers: {ask}"
+        case errno.EINVAL:
+            return f"the routes of this computer discard what is sent to {address.host}: {ask}"
+    return error.strerror or str(error)
+
+
 def why_unreachable(address: Address) -> tuple[str, str] | None:
     """Why nothing can be sent to an address now, with a remedy; None if a route leads there.
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import errno
 import threading
 from collections.abc import Callable, Mapping
 
 from router.clock import boottime_ns
 from router.compiler.metrics import Mismatch, Report
+from router.compiler.program import DeadmanPlan
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
-from router.net.udp import nobody_listens
+from router.net.udp import why_not_sent
 from router.table.addresses import Address
 from router.threads import Thread, join_or_leave
 
@@ -26,6 +26,8 @@ class Reporter:
         self._floods = FloodLog()
         self._mismatches: dict[Mismatch, int] = {}
         self._lock = threading.Lock()
+        self._lost: dict[tuple[str, str], tuple[int, Report]] = {}
+        """By route and target, when a message was lost last, and how."""
         self._stopped = threading.Event()
         self._thread = Thread(self._summarise, "log")  # the start may fail
         self._thread.start()
@@ -62,6 +64,8 @@ class Reporter:
                 detail=report.detail,
             )
             return
+        if report.kind == "drop":
+            self._lost[report.place, report.target] = boottime_ns(), report
         event = "message dropped" if report.kind == "drop" else "the deadman could not send"
         detail = {"detail": report.detail} if report.detail else {}
         error = {"error": self._text(report.error, report.target)} if report.error is not None else {}
@@ -79,17 +83,34 @@ class Reporter:
         )
 
     def _text(self, error: BaseException, target: str) -> str:
-        address = self._address_of(target) if isinstance(error, OSError) and error.errno == errno.ECONNREFUSED else None
-        return str(error) if address is None else nobody_listens(address)
+        if not isinstance(error, OSError) or (address := self._address_of(target)) is None:
+            return str(error)
+        return why_not_sent(error, address)
 
     def failed(self, error: Exception) -> None:
         self._floods.note(("bug", type(error)), *fault(error, "lost a message"))
 
-    def deadman_changed(self, route: str, active: bool) -> None:
-        if active:
-            logger.warning("commands stopped coming: the deadman sends in their place", route=route)
-        else:
+    def deadman_changed(self, route: str, active: bool, plan: DeadmanPlan | None) -> None:
+        """Log that the deadman of a route has tripped or was released; `plan` is that of the running table."""
+        if not active:
             logger.warning("commands come again: the deadman is released", route=route)
+        elif lost := self._lost_for(plan):
+            what = "commands come and are dropped: the deadman sends in their place"
+            logger.warning(what, route=route, target=lost.target, reason=lost.reason, detail=lost.detail)
+        else:
+            logger.warning("commands stopped coming: the deadman sends in their place", route=route)
+
+    def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
+        """The last command that was lost since the last one left; None if there was none."""
+        if plan is None:
+            return None
+        since, last = boottime_ns() - plan.timeout, None
+        for target, _ in plan.datagrams:
+            place = plan.route.removesuffix(f":{target}")  # of a client's deadman, its gateway
+            at, lost = self._lost.get((place, target), (0, None))
+            if at >= since:
+                since, last = at, lost
+        return last
 
     def _summarise(self) -> None:
         while not self._stopped.wait(SUMMARY_INTERVAL_NS / 1e9):

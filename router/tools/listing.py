@@ -239,6 +239,7 @@ _OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
     Op.COMPARE: _compare,
     Op.DIGITS: lambda line: plural(line.index, "decimal"),
     Op.FIT_SIZE: lambda line: f"at most {_number(line)} bytes",
+    Op.FIT_COUNT: lambda line: f"{'at most ' * bool(line.operation.flag)}{_number(line)} elements",
     Op.OCTETS: _of_stored,
     Op.MEMBER: _member,
     Op.ELEMENT: _element,

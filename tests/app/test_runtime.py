@@ -320,7 +320,7 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
         site.send(NAN_PH, NAN_PH, NAN_PH)
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
     assert [(line["reason"], line.get("more")) for line in lines] == [("non_finite", None), ("non_finite", 2)]
-    assert lines[0]["detail"] == f"{program.table.path}:17:18: state"
+    assert lines[0]["detail"] == f"{program.table.path}:17:18: state: nan is no integer"
     assert router.totals()["datagrams_sent"] == router.totals()["messages_dropped"] == 3
 
 
@@ -343,7 +343,7 @@ def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program
     place = f"{router.program.table.path}:16:15: when"
     assert told == [place, ""]
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
-    assert [(line["reason"], line["detail"]) for line in lines] == [("mapping_error", place)]
+    assert [(line["reason"], line["detail"]) for line in lines] == [("mapping_error", f"{place}: division by zero")]
 
 
 def test_the_place_of_a_condition_of_a_destination_is_told(site: Site) -> None:
@@ -355,7 +355,7 @@ def test_the_place_of_a_condition_of_a_destination_is_told(site: Site) -> None:
         wait_until(lambda: router.totals()["messages_dropped"] == 1)
     (line,) = [entry for entry in logged if entry["event"] == "message dropped"]
     assert (line["reason"], line["target"]) == ("mapping_error", "basestation")
-    assert str(line["detail"]).endswith(": when")
+    assert str(line["detail"]).endswith(": when: division by zero")
 
 
 def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) -> None:

@@ -23,7 +23,7 @@ FILTERED = "filtered"
 _NOTED = Struct("@IIiIII")
 _OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_LOSS = range(6)
 _OF_TARGET = _FIRST_LOSS + c.LOSSES
-_LOSS = Struct("@6Ii3I")
+_LOSS = Struct("@6Ii3I2I3q")
 """`struct lost_event`."""
 
 

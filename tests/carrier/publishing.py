@@ -25,7 +25,7 @@ from router.compiler.program import Program
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 12
-_LOST = Struct("@IIIIIIiIII")
+_LOST = Struct("@IIIIIIiIIIII3q")
 _CALLED = "middleware_publish", "middleware_error", "middleware_forget_error"
 
 

@@ -26,7 +26,7 @@ from router.compiler.program import Program
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 16
-_LOST = Struct("@IIIIIIiIII")
+_LOST = Struct("@IIIIIIiIIIII3q")
 
 
 class Serialized(ctypes.Structure):

@@ -328,8 +328,6 @@ def test_decisions(machine: Machine) -> None:
     assert machine.value(integer(0), *choice) == Refusal("mapping_error", 6)
     assert machine.value(integer(0), integer(1), Operation("OP_EITHER")) == 1
     assert machine.value(integer(0), Operation("OP_NOT")) == 1
-    assert machine.value(integer(5), integer(1), Operation("OP_WANT")) == 5
-    assert machine.value(integer(5), integer(0), Operation("OP_WANT")) == Refusal("mapping_error", 2)
     assert machine.value(integer(5), Operation("OP_KEEP", 3), integer(6), Operation("OP_DROP"), load(3),
                          Operation("OP_SUBTRACT")) == 0  # fmt: skip
 

@@ -97,7 +97,7 @@ _TEMPLATES: Mapping[str, Sequence[str]] = {
     ),
     "s": (
         "({s} + {s})", "str({i})", "str({b})", "str({s})", "({s} if {b} else {s})", "text({f}, 0)", "text({f}, 2)",
-        "text({f}, 17)", "text({i}, 1)", "{S}[0]", "{S}[1]",
+        "text({f}, 17)", "text({i}, 1)", "{S}[0]", "{S}[1]", "strip({s})",
     ),
     "t": ("({t} if {b} else {t})", "time_from_seconds({f})", "time_from_milliseconds({f})", "time_from_seconds({k})"),
     "I": (
@@ -117,7 +117,7 @@ _TEMPLATES: Mapping[str, Sequence[str]] = {
     "B": ("[{b}, {b}]", "({B} if {b} else {B})"),
     "S": (
         "str({I})", "str({B})", "({S} + {s})", "({s} + {S})", "({S} + {S})", "str({S})", "text({F}, 2)",
-        "text({I}, 0)", "[{s}, {s}]", "({S} if {b} else {S})",
+        "text({I}, 0)", "[{s}, {s}]", "({S} if {b} else {S})", "strip({S})",
     ),
 }  # fmt: skip
 
@@ -358,7 +358,7 @@ def protobuf_fields(noise: random.Random) -> list[Field]:
 
 # ---- messages from ROS
 
-_TEXTS = ("", "a", "ab", "é", "wheel", "\U0001f600", "abcdefgh" * 3)
+_TEXTS = ("", "a", "ab", "é", "wheel", "\U0001f600", "abcdefgh" * 3, "\t a b\n", "ab\0\0", " \0")
 _EDGES = (0.0, -0.0, 0.5, 1.0, -1.5, 2.5, 90.0, 1e-45, 3.4028234663852886e38, 1e9, 9007199254740992.0, 1.7e308,
           -1e300, 9.223372036854775e18, 2.0**63, 2.0**64, math.inf, -math.inf, math.nan)  # fmt: skip
 

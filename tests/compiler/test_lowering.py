@@ -126,7 +126,7 @@ def test_lists_are_gone_through_in_loops(text: str, expected: str) -> None:
 
 def test_lists_side_by_side_have_one_length() -> None:
     made = listed(lowered("len(list + other)"))
-    both = "load:list keep:t size load:other keep:t size compare want load:t size"
+    both = "load:list keep:t size load:other keep:t size same_count"
     assert made.startswith(f"list keep:t drop {both} repeat:")
     assert made.endswith("real_add append:t again load:t size")
 
@@ -162,7 +162,7 @@ def test_an_element_goes_from_a_list_to_the_message() -> None:
         "known:00010000 load:list keep:t size keep:t put load:t repeat:4 next:t integer_to_real put_double again"
     )
     assert to_ros(a=(List(I32, None, 3), "list")).startswith(
-        "known:00010000 load:list keep:t size keep:t 3 compare want load:t keep:t put"
+        "known:00010000 load:list keep:t size fit_count keep:t put"
     )
 
 

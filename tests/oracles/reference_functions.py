@@ -227,6 +227,15 @@ def _text(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Comput
     return Text(), lambda x, digits: f"{float(x):.{digits}f}"
 
 
+def _strip(x: str) -> str:
+    padding = " \t\n\v\f\r\0"
+    while x and x[-1] in padding:
+        x = x[:-1]
+    while x and x[0] in padding:
+        x = x[1:]
+    return x
+
+
 def _int(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Compute]:
     return (Whole(0, 1) if isinstance(kinds[0], Truth) else number(kinds[0])), int
 
@@ -274,6 +283,7 @@ FUNCTIONS: dict[str, Rule] = {
     "float64": _real(float),
     "int": _int,
     "str": _str,
+    "strip": _always(Text(), _strip),
     "text": _text,
     "len": _always(Whole(0, (1 << 32) - 1), len),
     "seconds": _real(lambda time: time / NS),

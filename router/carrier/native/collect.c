@@ -348,6 +348,14 @@ static bool refuse(struct stage *stage, const struct targets *to, const struct m
     return false;
 }
 
+/* The machine refuses it. Returns false. */
+static bool refuse_value(struct stage *stage, const struct targets *to, const struct message *message, int reason) {
+    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
+    for (uint32_t index = 0; index < to->count; index++)
+        lose_refused(stage, to, &to->targets[index], message->now, lost);
+    return false;
+}
+
 /* Print an integer, signed unless `signs` says otherwise. */
 static const char *printed(char *text, size_t size, int64_t number, uint32_t is_unsigned) {
     if (is_unsigned) snprintf(text, size, "%" PRIu64, (uint64_t)number);
@@ -377,7 +385,7 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
     struct value by, count, order;
     char detail[LONGEST_DETAIL], numbers[2][24];
     uint32_t at;
-    if (!read_datagram(machine, to, message->datagram)) return refuse(stage, to, message, LOSS_MAPPING_ERROR, "");
+    if (!read_datagram(machine, to, message->datagram)) return refuse_value(stage, to, message, LOSS_MAPPING_ERROR);
     part->name.sender = of->senders[message->datagram->column];
     int outcome = evaluate_value(machine, &of->by, &by, &at);
     if (outcome == EVALUATED && !set_name(&part->name, of, &by)) {
@@ -386,7 +394,7 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
     }
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->count, &count, &at);
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->order, &order, &at);
-    if (outcome != EVALUATED) return refuse(stage, to, message, outcome, "");
+    if (outcome != EVALUATED) return refuse_value(stage, to, message, outcome);
     if (!has_place(of, count.integer, order.integer)) {
         printed(numbers[0], sizeof numbers[0], count.integer, of->signs & FIRST_UNSIGNED);
         printed(numbers[1], sizeof numbers[1], order.integer, of->signs & SECOND_UNSIGNED);
@@ -419,7 +427,8 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
     begin_datagram(machine, to, last);
     if (!machine_read(machine, SECTION_PAYLOAD, first.bytes, first.size)) return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
-        if (!list_add(machine, &items, payload_of(of->collector, frame, index))) return false;
+        if (!list_add(machine, &items, payload_of(of->collector, frame, index)))
+            return machine_refuse(machine, (struct refusal){.kind = REFUSED_ROOM});
     if (of->items != NONE) machine->slots[of->items] = items;
     if (of->counted != NONE) machine->slots[of->counted].integer = frame->count;
     return true;

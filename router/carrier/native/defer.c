@@ -60,7 +60,7 @@ static void release(struct timers *timers, struct deferral *deferral, int64_t no
     if (!deferral->is_held) return;
     forget(timers, deferral);
     if (now > deferral->expires) {
-        lose_stale(timers->stage, deferral->of.to, deferral->of.target, now);
+        lose_stale(timers->stage, deferral->of.to, deferral->of.target, now, deferral->expires, REFUSED_WAITING);
         return;
     }
     struct output *held = &deferral->held;

@@ -21,6 +21,8 @@ struct delivery {
 
 /* ---- losses ---- */
 
+enum { LONGEST_REFUSED = 48 /* bytes of a text that are reported */ };
+
 static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
 
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
@@ -33,9 +35,20 @@ void lose_message(struct stage *stage, const struct targets *to, const struct ta
     report_loss(&stage->reporter, now, lost, text);
 }
 
-void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
-    if (target->topic) lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_STALE}, "");
-    else stage_count(stage, target->dropped[LOSS_STALE], 1);
+void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+                  struct lost_event lost) {
+    const struct value *refused = &stage->machine.refused;
+    char text[LONGEST_REFUSED + 1] = {0};
+    size_t size = refused->size < LONGEST_REFUSED ? refused->size : LONGEST_REFUSED;
+    if (size) memcpy(text, refused->bytes, size);
+    lost.refusal = stage->machine.refusal;
+    lose_message(stage, to, target, now, lost, text);
+}
+
+void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
+                enum refused since) {
+    struct refusal refusal = {.kind = since, .values = {now - expires + to->ttl, to->ttl}};
+    lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_STALE, .refusal = refusal}, "");
 }
 
 /* Returns false. */
@@ -46,8 +59,9 @@ static bool lose(const struct delivery *of, struct lost_event lost, const char *
 
 /* A place in the table refuses the message. */
 static bool refuse(const struct delivery *of, int reason, uint32_t place) {
-    uint32_t generation = of->to->generation;
-    return lose(of, (struct lost_event){.reason = (uint32_t)reason, .generation = generation, .place = place}, "");
+    struct lost_event lost = {.reason = (uint32_t)reason, .generation = of->to->generation, .place = place};
+    lose_refused(of->stage, of->to, of->target, of->message->now, lost);
+    return false;
 }
 
 /* ---- fields ---- */
@@ -100,8 +114,10 @@ static int64_t expiry(const struct delivery *of) {
 }
 
 static bool is_fresh(const struct delivery *of) {
-    if (of->expires == NEVER || of->stage->now(of->stage) <= of->expires) return true;
-    lose_stale(of->stage, of->to, of->target, of->message->now);
+    if (of->expires == NEVER) return true;
+    int64_t now = of->stage->now(of->stage);
+    if (now <= of->expires) return true;
+    lose_stale(of->stage, of->to, of->target, now, of->expires, of->message->since);
     return false;
 }
 
@@ -141,8 +157,9 @@ static enum loss loss_of(int error) {
     return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
 }
 
-static void lose_unsent(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int error) {
-    if (error == COMMAND_STALE) lose_stale(stage, to, target, now);
+static void lose_unsent(struct stage *stage, const struct targets *to, const struct target *target, int64_t expires,
+                        int64_t now, int error) {
+    if (error == COMMAND_STALE) lose_stale(stage, to, target, stage->now(stage), expires, REFUSED_WAITING);
     else lose_message(stage, to, target, now, (struct lost_event){.reason = loss_of(error), .error = error}, "");
 }
 
@@ -163,7 +180,7 @@ static inline bool leave(struct stage *stage, const struct targets *to, const st
     if (target->topic) return publish_it(stage, to, target, now);
     int error = stage->send(stage, target, data, size, expires);
     if (error) {
-        lose_unsent(stage, to, target, now, error);
+        lose_unsent(stage, to, target, expires, now, error);
     } else {
         stage_count(stage, target->delivered, 1);
         stage_count(stage, target->delivered_bytes, (int64_t)size);

@@ -10,8 +10,7 @@
  *     defer       `on_limit: latest` and `bandwidth` (defer.h)
  *     send or publish, and feed deadmen
  *
- * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table asks for, and
- * stale commands.
+ * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table asks for.
  *
  * A stage provides the clock, sockets and middleware as functions, so that tests can do without them. */
 #ifndef DELIVER_H
@@ -94,6 +93,7 @@ struct message {
     const struct datagram *datagram; /* NULL if it is from ROS: then it has been read */
     int64_t now;                     /* boot clock: when it was received */
     struct born born;
+    enum refused since; /* what its age counts from */
     bool is_read;
     int outcome;    /* of reading: EVALUATED, or an enum loss */
     uint32_t place; /* that refused it, an enum place */
@@ -148,8 +148,13 @@ bool read_datagram(struct machine *machine, const struct targets *to, const stru
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost, const char *text);
 
-/* The message is older than `ttl`. Stale commands are only counted: after a stall there are many at once. */
-void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now);
+/* Likewise of what the machine has refused. */
+void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+                  struct lost_event lost);
+
+/* The message is older than `ttl`: it has expired. `since` says what its age counts from. */
+void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
+                enum refused since);
 
 /* Send these bytes, or publish the machine's output, and count that. Return false if the thread was abandoned. */
 bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,

@@ -29,6 +29,77 @@ static bool unpack(struct machine *machine, struct value *list, enum scalar stor
     return true;
 }
 
+/* ---- refusals ---- */
+
+static struct refusal two(enum refused kind, int64_t first, int64_t second) {
+    return (struct refusal){.kind = kind, .values = {first, second}};
+}
+
+static struct refusal real(enum refused kind, double number) {
+    return (struct refusal){.kind = kind, .flags = 1, .values = {(int64_t)float64_bits(number)}};
+}
+
+/* What an operation has refused, whose operands are at `top` and behind it. */
+static struct refusal refusal_of(const struct operation *op, const struct value *top) {
+    switch ((enum op)op->kind) {
+    case OP_CHECKED_ADD:
+    case OP_CHECKED_SUBTRACT:
+    case OP_CHECKED_MULTIPLY:
+    case OP_CHECKED_NEGATE: return (struct refusal){.kind = REFUSED_OVERFLOW};
+    case OP_DIVIDE:
+    case OP_MODULO: return (struct refusal){.kind = top[1].bits ? REFUSED_OVERFLOW : REFUSED_DIVISION};
+    case OP_REAL_DIVIDE:
+    case OP_REAL_FLOOR_DIVIDE:
+    case OP_REAL_MODULO: return (struct refusal){.kind = REFUSED_DIVISION};
+    case OP_FIT: return (struct refusal){REFUSED_INTEGER, op->flag, {top[0].integer, top[1].integer, top[2].integer}};
+    case OP_WRAP: return (struct refusal){REFUSED_BOUNDS, op->flag, {0, top[1].integer, top[2].integer}};
+    case OP_REAL_POWER: return (struct refusal){.kind = REFUSED_RESULT};
+    case OP_SQRT:
+    case OP_SIN:
+    case OP_COS:
+    case OP_TAN: return real(REFUSED_RESULT, top->real);
+    case OP_ROUND:
+    case OP_TRUNCATE:
+    case OP_FLOOR:
+    case OP_CEIL: return real(REFUSED_REAL, top->real);
+    case OP_FLOAT32: return real(REFUSED_FLOAT32, top->real);
+    case OP_PUT_FLOAT:
+    case OP_WRITE_FLOAT:
+        if (!fits_float32(top[1].real)) return real(REFUSED_FLOAT32, top[1].real);
+        break;
+    case OP_FIT_SIZE: return two(REFUSED_SIZE, top->size, op->integer);
+    case OP_UTF8: return two(REFUSED_UTF8, top->size, 0);
+    case OP_NAMELESS: return two(REFUSED_NAME, top->size, 0);
+    case OP_PUT_TEXT:
+        if (has_nul(top + 1)) return two(REFUSED_NUL, top[1].size, 0);
+        break;
+    case OP_MEMBER: return two(REFUSED_MEMBER, top->integer, 0);
+    case OP_ELEMENT: return two(REFUSED_ELEMENT, op->integer, top->size);
+    case OP_FIT_COUNT: return two(op->flag ? REFUSED_MOST : REFUSED_COUNT, top->integer, op->integer);
+    case OP_SAME_COUNT: return two(REFUSED_LENGTHS, top[0].integer, top[1].integer);
+    case OP_AGAIN: return (struct refusal){.kind = REFUSED_WORK};
+    default: break;
+    }
+    return (struct refusal){.kind = REFUSED_ROOM};
+}
+
+/* Note what an operation has refused, unless that was noted before, by what it has called. */
+static void explain(struct machine *machine, const struct operation *op, const struct value *top) {
+    if (op->kind == OP_ENTER || op->kind == OP_OCTETS) return;
+    machine_refuse(machine, refusal_of(op, top));
+    switch (machine->refusal.kind) {
+    case REFUSED_UTF8:
+    case REFUSED_NAME: machine->refused = top[0]; break;
+    case REFUSED_NUL: machine->refused = top[1]; break;
+    default: break;
+    }
+}
+
+static int outcome_of(const struct refusal *refusal) {
+    bool is_finite = refusal->kind != REFUSED_REAL || isfinite(of_float64((uint64_t)refusal->values[0]));
+    return is_finite ? LOSS_MAPPING_ERROR : LOSS_NON_FINITE;
+}
+
 /* ---- execution ---- */
 
 struct loop {
@@ -47,10 +118,7 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
 
 /* These end a case: the operation refuses the message unless the condition is true. */
 #define WANT(condition)                    \
-    if (!(condition)) {                    \
-        *at = (uint32_t)(op - operations); \
-        return LOSS_MAPPING_ERROR;         \
-    }                                      \
+    if (!(condition)) goto refused;        \
     break
 
 /* A function of one real number. */
@@ -58,15 +126,14 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
     {                                   \
         double of = top->real;          \
         top->real = function(of);       \
-        WANT(is_result(top->real, of)); \
+        if (is_result(top->real, of)) break; \
+        top->real = of;                 \
+        goto refused;                   \
     }
 
 /* A real number as the integer that `function` rounds it to. */
 #define ROUNDED(function)                      \
-    if (!isfinite(top->real)) {                \
-        *at = (uint32_t)(op - operations);     \
-        return LOSS_NON_FINITE;                \
-    }                                          \
+    if (!isfinite(top->real)) goto refused; \
     top->real = function(top->real);           \
     WANT(to_integer(top))
 
@@ -77,9 +144,10 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
     struct value *slots = machine->slots;
     struct output *output = &machine->output;
     struct value *top = machine->stack; /* the first one is never used; `top[1]` is what an operation has taken off */
+    const struct operation *op = operations, *end = op + routine->count;
     struct loop loops[MOST_LOOPS + 1], *loop = loops; /* nor is the first of these */
     struct opened opened[MOST_OPEN + 1], *open = opened;
-    for (const struct operation *op = operations, *end = op + routine->count; op < end; op++) {
+    for (; op < end; op++) {
         switch ((enum op)op->kind) {
         case OP_INTEGER: (++top)->integer = op->integer; break;
         case OP_REAL: (++top)->real = op->real; break;
@@ -142,7 +210,6 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         case OP_AND: if (!top->integer) op += op->size; else top--; break;
         case OP_OR: if (top->integer) op += op->size; else top--; break;
         case OP_EITHER: top--; top->integer |= top[1].integer; break;
-        case OP_WANT: top--; WANT(top[1].integer);
 
         case OP_JOIN: top--; WANT(join(machine, top, top + 1));
         case OP_DECIMAL: WANT(to_decimal(machine, top, op->flag));
@@ -150,10 +217,14 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         case OP_CHARACTERS: top->integer = characters(top); break;
         case OP_SIZE: top->integer = top->size; break;
         case OP_FIT_SIZE: WANT(top->size <= op->integer);
+        case OP_STRIP: strip(top); break;
         case OP_UTF8: WANT(is_utf8(top->bytes, top->size));
+        case OP_NAMELESS: goto refused;
         case OP_OCTETS: WANT(to_octets(machine, top, op->flag));
         case OP_MEMBER: WANT(is_among(top->integer, literals + op->integer, op->size));
 
+        case OP_FIT_COUNT: WANT(top->integer == op->integer || (op->flag && top->integer < op->integer));
+        case OP_SAME_COUNT: top--; WANT(top[0].integer == top[1].integer);
         case OP_ELEMENT: WANT(list_element(machine, top, op->flag, op->integer, top));
         case OP_ENTER: top--; WANT(machine_enter(machine, op->slot, top + 1));
         case OP_REPEAT:
@@ -193,6 +264,10 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         }
     }
     return EVALUATED;
+refused:
+    *at = (uint32_t)(op - operations);
+    explain(machine, op, top);
+    return outcome_of(&machine->refusal);
 }
 
 int evaluate_list(struct machine *machine, const struct routine *routine, struct value *list, uint32_t *at) {

@@ -34,15 +34,19 @@ void machine_begin(struct machine *machine, const struct layout *layout) {
     memcpy(machine->slots, layout->defaults, layout->slot_count * sizeof *machine->slots);
 }
 
+static bool check_read(struct machine *machine, bool is_read) {
+    return is_read || machine_refuse(machine, (struct refusal){.kind = REFUSED_MALFORMED});
+}
+
 bool machine_read(struct machine *machine, uint16_t section, const uint8_t *data, size_t size) {
-    if (!machine->layout->is_cdr) return read_protobuf(machine, section, data, size);
-    return read_cdr(machine, section, data, size);
+    bool is_cdr = machine->layout->is_cdr;
+    return check_read(machine, is_cdr ? read_cdr(machine, section, data, size) : read_protobuf(machine, section, data, size));
 }
 
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element) {
     const struct layout *layout = machine->layout;
     const struct section *of = &layout->sections[section];
     memcpy(machine->slots + of->first_slot, layout->defaults + of->first_slot, of->slot_count * sizeof *machine->slots);
-    if (!layout->is_cdr) return read_protobuf(machine, section, element->bytes, element->size);
-    return read_cdr_element(machine, section, element->bytes);
+    return check_read(machine, layout->is_cdr ? read_cdr_element(machine, section, element->bytes)
+                                              : read_protobuf(machine, section, element->bytes, element->size));
 }

@@ -14,6 +14,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "events.h"
 #include "operations.h"
 #include "output.h"
 
@@ -35,6 +36,8 @@ struct machine {
     uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* what was read last; offsets in CDR count from its first byte */
     struct output output;                 /* the message that was written last */
+    struct refusal refusal;               /* what was refused last; */
+    struct value refused;                 /* the text of it, or an empty one */
     struct value stack[MOST_STACKED];
 };
 
@@ -44,6 +47,13 @@ static inline bool spend(struct machine *machine, size_t work) {
     bool is_enough = work <= machine->work_left;
     machine->work_left = is_enough ? machine->work_left - (uint32_t)work : 0;
     return is_enough;
+}
+
+/* Note why a message is refused. Returns false. */
+static inline bool machine_refuse(struct machine *machine, struct refusal refusal) {
+    machine->refusal = refusal;
+    machine->refused.size = 0;
+    return false;
 }
 
 /* Allocate what a machine needs. Return false for lack of memory. Close the machine in either case. */

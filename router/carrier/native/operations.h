@@ -123,7 +123,6 @@ enum op {
     OP_AND,    /* skips `size` operations if the top is false, else pops it */
     OP_OR,     /* skips `size` operations if the top is true, else pops it */
     OP_EITHER, /* `or` of two that are both evaluated */
-    OP_WANT,   /* pops a truth, and refuses if it is false */
     /* Text and bytes: */
     OP_JOIN,
     OP_DECIMAL,    /* an integer as text; `flag` 1: it is unsigned */
@@ -131,10 +130,15 @@ enum op {
     OP_CHARACTERS, /* the number of characters in UTF-8 */
     OP_SIZE,       /* the number of bytes; of a list, its elements */
     OP_FIT_SIZE,   /* refuses more than `integer` bytes */
+    OP_STRIP,      /* text without the blanks and NULs at both of its ends: space, tab, line feed, vertical tab, form feed
+                      and carriage return */
     OP_UTF8,       /* refuses what is not UTF-8 */
+    OP_NAMELESS,   /* refuses the text, as a name of no value of an enum */
     OP_OCTETS,     /* a list of integers, stored as `flag` says, as bytes; refuses integers beyond 0 to 255 */
     OP_MEMBER,     /* refuses an integer that is not among `size` ascending int32 in the literals, from `integer` */
     /* Lists. `flag` (enum scalar) says how a list is stored: */
+    OP_FIT_COUNT,  /* refuses a number of elements other than `integer`; `flag` 1: only a larger one */
+    OP_SAME_COUNT, /* pops a number of elements, and refuses it unless the one below is the same */
     OP_ELEMENT, /* the element with the index `integer`; refuses a list that has none */
     OP_ENTER,   /* pops a message, and reads it into section `slot` */
     OP_REPEAT,  /* pops an integer, and repeats the next `size` operations so many times; the last of them is its OP_AGAIN.

@@ -110,7 +110,7 @@ static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *
     const struct waiting_datagram *first = take_off(pacer, lane);
     const struct route_target *of = first->of;
     if (now > first->expires) {
-        lose_stale(timers->stage, of->to, of->target, now);
+        lose_stale(timers->stage, of->to, of->target, now, first->expires, REFUSED_WAITING);
         return false;
     }
     pacer->paid_at += first->cost;

@@ -32,7 +32,8 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
     struct datagram datagram = {.data = routing->datagram, .size = envelope->size, .start = envelope->start,
                                 .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
                                 .received_at = received->received_at};
-    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born};
+    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born,
+                              .since = REFUSED_ARRIVAL};
     deliver_to_all(&routing->stage, to, &message);
 }
 
@@ -157,7 +158,8 @@ bool route_to_topics(struct stage *stage, const struct message_record *record) {
     struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};
-    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest}};
+    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest},
+                              .since = REFUSED_ARRIVAL};
     bool is_delivered = !to->collect || collect(stage, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {
         if (is_delivered && !deliver(stage, to, &to->targets[index], &message)) return false;

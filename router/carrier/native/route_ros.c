@@ -28,17 +28,18 @@ static struct born sent(struct ros_routing *routing, const struct taken *taken) 
     return earlier_of(sent, (struct born){arrived, arrived});
 }
 
-/* When the message was born: when it was sent, or when it was stamped, if that is earlier. */
-static struct born born(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken,
-                        struct born sent) {
-    if (route->seconds == NONE) return sent;
+/* If the message was stamped before it was sent, it was born then. */
+static void date_by_stamp(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken,
+                          struct message *message) {
+    if (route->seconds == NONE) return;
     const struct value *slots = routing->stage.machine.slots;
     int64_t stamp = slots[route->seconds].integer * 1000000000 + slots[route->nanoseconds].integer;
-    if (!stamp) return sent;
+    if (!stamp) return;
     struct born stamped = freshness_born(&routing->freshness, stamp, taken->received_at, taken->now,
                                          taken->publisher->stamped);
     taken->publisher->stamped = stamped.oldest;
-    return earlier_of(sent, stamped);
+    if (stamped.oldest < message->born.oldest) message->since = REFUSED_STAMP;
+    message->born = earlier_of(message->born, stamped);
 }
 
 /* ---- messages ---- */
@@ -65,7 +66,10 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
     uint32_t at;
     message->place = PLACE_ROUTE;
     message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
-    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) message->outcome = LOSS_MAPPING_ERROR;
+    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) {
+        machine_refuse(machine, (struct refusal){.kind = REFUSED_MOST, .values = {list.size, MOST_ELEMENTS}});
+        message->outcome = LOSS_MAPPING_ERROR;
+    }
     if (message->outcome != EVALUATED) {
         deliver_to_all(&routing->stage, &route->targets, message);
         return 1;
@@ -104,14 +108,15 @@ void follow_publisher(struct ros_routing *routing, const struct ros_publisher *k
 }
 
 void route_ros(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken) {
-    struct message message = {.now = taken->now, .is_read = true, .outcome = EVALUATED};
+    struct message message = {.now = taken->now, .is_read = true, .outcome = EVALUATED,
+                              .since = taken->published_at ? REFUSED_SENDING : REFUSED_ARRIVAL};
     struct machine *machine = &routing->stage.machine;
     int64_t count = 1;
     if (route->targets.ttl) message.born = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
     machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
     if (!machine_read(machine, 0, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;
-    else if (route->targets.ttl) message.born = born(routing, route, taken, message.born);
+    else if (route->targets.ttl) date_by_stamp(routing, route, taken, &message);
     if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
     else deliver_to_all(&routing->stage, &route->targets, &message);
     stage_count(&routing->stage, route->received, count);

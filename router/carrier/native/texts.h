@@ -72,15 +72,23 @@ static inline int64_t characters(const struct value *text) {
     return count;
 }
 
-/* A list of integers as bytes. */
+static inline bool is_padding(uint8_t byte) { return byte == ' ' || byte == 0 || (byte >= '\t' && byte <= '\r'); }
+
+static inline void strip(struct value *text) {
+    while (text->size && is_padding(text->bytes[text->size - 1])) text->size--;
+    for (; text->size && is_padding(*text->bytes); text->bytes++) text->size--;
+}
+
+/* A list of integers as bytes. Notes what it refuses. */
 static inline bool to_octets(struct machine *machine, struct value *list, enum scalar stored) {
     if (stored == SCALAR_UINT8) return true;
     struct value octets = text_of(take_text(machine, list->size), list->size);
-    if (!octets.bytes) return false;
+    if (!octets.bytes) return machine_refuse(machine, (struct refusal){.kind = REFUSED_ROOM});
     uint8_t *to = machine->text + machine->text_size - octets.size;
     while (list->size) {
         struct value element = list_next(machine, list, stored);
-        if (element.bits > UINT8_MAX) return false;
+        if (element.bits > UINT8_MAX)
+            return machine_refuse(machine, (struct refusal){REFUSED_INTEGER, 0, {element.integer, 0, UINT8_MAX}});
         *to++ = (uint8_t)element.bits;
     }
     *list = octets;

@@ -46,8 +46,10 @@ static inline bool put_double(struct output *output, double number) {
     return put_integer(output, float64_bits(number), sizeof number);
 }
 
+static inline bool has_nul(const struct value *text) { return text->size && memchr(text->bytes, 0, text->size); }
+
 static inline bool put_text(struct output *output, const struct value *text) {
-    if (text->size && memchr(text->bytes, 0, text->size)) return false;
+    if (has_nul(text)) return false;
     return put_integer(output, (uint64_t)text->size + 1, sizeof(uint32_t)) && put(output, text->bytes, text->size, 1) &&
            put_integer(output, 0, 1);
 }

@@ -122,6 +122,10 @@ def fixed(x: float, digits: int) -> str:
     return f"{float(x):.{digits}f}"
 
 
+def strip(x: str) -> str:
+    return x.strip(" \t\n\v\f\r\0")
+
+
 # kinds of results
 
 Rule = Callable[[Sequence[Node]], Kind]
@@ -358,6 +362,10 @@ _DECLARED = (
     Function("text", (Parameter("x", Number, "a number", becomes=FloatKind(64)), _whole("digits")), _written, fixed,
              "A number as text, with this many decimals, 0 to 17, which are a literal.",
              (("text(2.675, 1)", "2.7"), ("text(3, 2)", "3.00"))),
+    Function("strip", (Parameter("x", (StringKind,), "a string"),), _always(StringKind()), strip,
+             "Text without the NULs and blanks at both of its ends: spaces, tabs, ends of lines. Firmware fills "
+             "texts of fixed length with NULs, and a ROS string holds none.",
+             (("strip('  left ')", "left"), ("strip('a b')", "a b"))),
     Function("len", (Parameter("x", (StringKind,), "a list, a string or bytes"),), _always(UINT32),
              len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),),
              of_list=lambda _: UINT32),

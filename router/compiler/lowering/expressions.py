@@ -223,7 +223,7 @@ class Lowering:
 
 
 _COSTLY = frozenset({
-    Op.REPEAT, Op.ENTER, Op.JOIN, Op.DIGITS, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.ELEMENT,
+    Op.REPEAT, Op.ENTER, Op.JOIN, Op.DIGITS, Op.CHARACTERS, Op.STRIP, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.ELEMENT,
 })  # fmt: skip
 """Operations whose time grows with a list, a text or a message."""
 

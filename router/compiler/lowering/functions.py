@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.lowering import lists
 from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
-from router.compiler.lowering.operations import DROP, WANT, Operation, Routine, integer, keep, load, real, routine, text
+from router.compiler.lowering.operations import DROP, Operation, Routine, integer, keep, load, real, routine, text
 from router.declared import MAX_DATAGRAM, Compared, Op, Relation
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def _named(lowering: Lowering, node: tree.Call) -> Routine:
     """The number of a name. Another text is refused."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
-    found: Routine = (integer(0), WANT, integer(0))
+    found: Routine = (load(slot), Operation(Op.NAMELESS))
     for name, number in reversed(node.kind.enum.values):
         is_it = load(slot), text(name.encode()), Operation(Op.COMPARE, int(Compared.TEXTS), flag=Relation.EQUAL)
         found = routine(
@@ -155,6 +155,8 @@ def longest(node: tree.Node) -> int:
         case tree.Call(function="str"):
             is_text = isinstance(node.arguments[0].kind, StringKind)
             return longest(node.arguments[0]) if is_text else _LONGEST_DECIMAL
+        case tree.Call(function="strip"):
+            return longest(node.arguments[0])
         case tree.Call(function="text"):
             return _LONGEST_DIGITS
         case _:
@@ -216,6 +218,7 @@ _OTHERS: Mapping[str, Callable[[Lowering, tree.Call], Routine]] = {
     "named": _named,
     "octets": _octets,
     "seconds": _seconds,
+    "strip": lambda lowering, node: routine(lowering.value(node.arguments[0]), Operation(Op.STRIP)),
     "str": _str,
     "sum": lists.total,
     "text": _text,

@@ -26,9 +26,7 @@ from router.compiler.lowering.names import Loop
 from router.compiler.lowering.numbers import coerced, compare, signs
 from router.compiler.lowering.operations import (
     DROP,
-    EQUAL,
     SIZE,
-    WANT,
     Operation,
     Routine,
     Slot,
@@ -212,7 +210,7 @@ def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> 
         slot = lowering.names.temporary()
         made = routine(made, of.routine, keep(slot), SIZE)
         if taken:
-            made = routine(made, EQUAL, WANT, load(slot), SIZE)
+            made = routine(made, Operation(Op.SAME_COUNT))
         taken.append((variable, of, slot))
     return made, taken
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 from router.compiler.lowering import lists
 from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.lists import Taken
-from router.compiler.lowering.operations import WANT, Operation, Routine, integer, keep, known, load, repeat, routine
+from router.compiler.lowering.operations import Operation, Routine, known, repeat, routine
 from router.compiler.plan import Each
-from router.declared import Compared, Op, Relation
+from router.declared import Op
 from router.errors import SourceSpan
 from router.types.model import List
 
@@ -57,17 +57,10 @@ def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
     if declared.length is not None:
-        return routine(count, _wanted(lowering, declared.length, Relation.EQUAL)), taken
+        return routine(count, Operation(Op.FIT_COUNT, number=declared.length)), taken
     if declared.bound is not None:
-        return routine(count, _wanted(lowering, declared.bound, Relation.LESS_OR_EQUAL)), taken
+        return routine(count, Operation(Op.FIT_COUNT, flag=True, number=declared.bound)), taken
     return count, taken
-
-
-def _wanted(lowering: Lowering, limit: int, relation: Relation) -> Routine:
-    """Check the number on the stack."""
-    slot = lowering.names.temporary()
-    compared = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=relation)
-    return routine(keep(slot), integer(limit), compared, WANT, load(slot))
 
 
 def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Union
 
-from router.declared import MAX_DATAGRAM, Compared, Op, Relation
+from router.declared import MAX_DATAGRAM, Op
 
 if TYPE_CHECKING:
     from router.compiler.lowering.sections import Section
@@ -79,8 +79,7 @@ def keep(slot: Slot) -> Operation:
     return Operation(Op.KEEP, slot)
 
 
-DROP, SIZE, WANT = Operation(Op.DROP), Operation(Op.SIZE), Operation(Op.WANT)
-EQUAL = Operation(Op.COMPARE, int(Compared.SIGNED_INTEGERS), flag=Relation.EQUAL)
+DROP, SIZE = Operation(Op.DROP), Operation(Op.SIZE)
 
 
 def repeat(body: Routine, *, keeps: bool = False) -> Routine:
@@ -111,9 +110,9 @@ def once(made: Routine, flag: Flag, kept: Slot) -> Routine:
 
 _GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
 _TAKE_ONE = frozenset({
-    Op.DROP, Op.UNLESS, Op.AND, Op.OR, Op.WANT, Op.ENTER, Op.REPEAT, Op.APPEND, Op.PUT, Op.PUT_FLOAT, Op.PUT_DOUBLE,
-    Op.PUT_TEXT, Op.PUT_BYTES, Op.WRITE_VARINT, Op.WRITE_ZIGZAG, Op.WRITE_FIXED32, Op.WRITE_FIXED64, Op.WRITE_FLOAT,
-    Op.WRITE_DOUBLE, Op.WRITE_BYTES,
+    Op.DROP, Op.UNLESS, Op.AND, Op.OR, Op.SAME_COUNT, Op.ENTER, Op.REPEAT, Op.APPEND, Op.PUT, Op.PUT_FLOAT,
+    Op.PUT_DOUBLE, Op.PUT_TEXT, Op.PUT_BYTES, Op.WRITE_VARINT, Op.WRITE_ZIGZAG, Op.WRITE_FIXED32, Op.WRITE_FIXED64,
+    Op.WRITE_FLOAT, Op.WRITE_DOUBLE, Op.WRITE_BYTES,
 })  # fmt: skip
 _TAKE_TWO_GIVE_ONE = frozenset({
     Op.ADD, Op.SUBTRACT, Op.MULTIPLY, Op.CHECKED_ADD, Op.CHECKED_SUBTRACT, Op.CHECKED_MULTIPLY, Op.DIVIDE, Op.MODULO,
@@ -155,7 +154,7 @@ def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> Iterator[
         yield depth
 
 
-_BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.DIGITS})
+_BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.STRIP, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.DIGITS})
 """Operations that take as long as their text or list, at the most that of a datagram."""
 
 _BYTES_AT_A_TIME = 16

@@ -458,7 +458,8 @@ class _Messages:
         if messages and depth and self.expressions.loops < 3 and self.noise.random() < 0.5:
             return self.expressions.for_elements(self.noise.choice(messages), lambda: self._enclosed(depth - 1))
         if self.noise.random() < 0.1 * self.expressions.boldness:
-            return [*self.expressions.of(TRUTH), Operation("OP_WANT"), *self._value()]
+            fits = Operation("OP_FIT_COUNT", flag=self.noise.randrange(2), number=self.noise.randrange(2))
+            return [*self.expressions.of(TRUTH), fits, Operation("OP_DROP"), *self._value()]
         if depth and self.noise.random() < 0.3:
             return self._enclosed(depth - 1)
         if depth and self.noise.random() < 0.3:
