@@ -100,7 +100,7 @@ def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, s
     members: list[tuple[Field, Plan]] = []
     for member in target.fields:
         given = same_named(value, member)
-        members.append((member, convert(given, member.type, scope) if given else unset(member, value.span)))
+        members.append((member, _to_member(given, member, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
         is_time = {source.name, target.name} == STAMP_TYPES
         hint = (
@@ -108,6 +108,15 @@ def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, s
         )
         raise mismatch(value, target, hint)
     return Record(target, tuple(members), value.span)
+
+
+def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
+    """Fill a field by one of its name. The error says which one it is."""
+    try:
+        return convert(given, member.type, scope)
+    except ExpressionError as error:
+        found = error.diagnostic
+        raise ExpressionError(found.span, found.code, f"{member.name}: {found.message}", found.hint) from error
 
 
 # lists
@@ -125,7 +134,22 @@ def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
     if isinstance(value, tree.Each):
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
     element = tree.Variable(element_kind, value.span, scope.element_variable())
-    return Each(target, ((element.name, value),), convert(element, target.element, scope), value.span)
+    return Each(target, ((element.name, value),), _to_element(element, target.element, scope), value.span)
+
+
+def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
+    """Fill an element by one of another list. No entry of the table can fill its fields: the hint says what can."""
+    try:
+        return convert(element, target, scope)
+    except ExpressionError as error:
+        found = error.diagnostic
+        if not isinstance(element.kind, MessageKind):
+            raise
+        if isinstance(target, MessageType):
+            hint = f"elements are filled by name, as they are: {element.kind} and {target} need fields of one name and type"
+        else:
+            hint = "write the elements, as in [x[0].y, x[1].y]"
+        raise ExpressionError(found.span, found.code, f"an element: {found.message}", hint) from error
 
 
 def _want_length(value: tree.Node, target: List, length: int) -> None:
