@@ -146,7 +146,8 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
         if not isinstance(element.kind, MessageKind):
             raise
         if isinstance(target, MessageType):
-            hint = f"elements are filled by name, as they are: {element.kind} and {target} need fields of one name and type"
+            both = f"{element.kind} and {target}"
+            hint = f"elements are filled by name, as they are: {both} need fields of one name and type"
         else:
             hint = "write the elements, as in [x[0].y, x[1].y]"
         raise ExpressionError(found.span, found.code, f"an element: {found.message}", hint) from error

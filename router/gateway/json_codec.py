@@ -204,7 +204,16 @@ def _cut_off(cdr: bytes) -> NoReturn:
 
 def _text(data: bytes) -> str:
     """A string from its bytes. The final NUL may be missing, as Fast CDR takes it."""
-    return data.removesuffix(b"\0").decode()
+    text = data.removesuffix(b"\0")
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        begin = text[:_MOST_SAID].decode(errors="backslashreplace") + "..." * (len(text) > _MOST_SAID)
+        raise UnreadableError(f"the text '{begin}' is not UTF-8: correct its publisher") from None
+
+
+_MOST_SAID = 48
+"""Bytes of a text in an error."""
 
 
 def _units(data: bytes) -> Any:

@@ -294,3 +294,11 @@ def test_traceback_shows_the_generated_line() -> None:
     lines = "".join(traceback.format_exception(caught.value))
     assert 'File "<json of made/msg/Made>", line 7, in encode' in lines
     assert "v1, = unpack(cdr, at)" in lines
+
+
+@STYLES
+def test_text_that_is_not_utf8_is_quoted_with_what_to_do(style: Style) -> None:
+    declared = MessageType("made/msg/Note", (Field("text", String()),))
+    said = r"^the text 'caf\\xe9' is not UTF-8: correct its publisher$"
+    with pytest.raises(UnreadableError, match=said):
+        encoder(declared, style)(HEADER + b"\5\0\0\0caf\xe9\0")
