@@ -58,6 +58,9 @@ Every series exists at 0 from the start. The counters balance. Per listener, rec
 and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
 frames, the queue of a `bandwidth`, what `on_limit: latest` holds. Delivered is sent or published. With `for_each`,
 each element is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
+_COMMANDED = """\
+`command` is `true` for messages that go to a board or feed a deadman, and for what clients of a gateway publish where
+`inbound` has a `ttl` or a deadman; else `false`."""
 _GATEWAYS = """\
 A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
@@ -110,11 +113,13 @@ def metrics_page() -> str:
     for metric in METRICS:
         kind = metric.kind if metric.kind in ("counter", "histogram") else "gauge"
         name = f"router_{metric.name}_total" if kind == "counter" else f"router_{metric.name}"
-        lines.append(f"| `{name}` | {kind} | {', '.join(metric.labels)} | {metric.help} |")
+        lines.append(f"| `{name}` | {kind} | {', '.join(metric.exported_labels)} | {metric.help} |")
     lines += [
         "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
         "",
         fill(_COUNTERS, WIDTH),
+        "",
+        fill(_COMMANDED, WIDTH),
         "",
         "`route` is the payload case, and where a case has several routes its first source as well:",
         "[names](table.md#several-routes-of-one-case).",

@@ -9,7 +9,7 @@ from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import SourceSpan
-from router.table.model import Destination, Endpoint, OnLimit, Priority, Route, Topic
+from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -29,8 +29,18 @@ class CheckedTarget:
     when: Node | None = None
     plan: Record | None = None
     rows: tuple[Row, ...] = ()
-    priority: Priority = Priority.TELEMETRY
+    declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
+
+    @property
+    def is_command(self) -> bool:
+        """Whether what it gets are commands: they go to a board, or feed or disarm a deadman."""
+        return bool(self.deadmen) or (self.endpoint is not None and self.endpoint.kind is EndpointKind.BOARD)
+
+    @property
+    def priority(self) -> Priority:
+        """Commands go first unless the route says something else."""
+        return self.declared_priority or (Priority.COMMAND if self.is_command else Priority.TELEMETRY)
 
     @property
     def topic(self) -> Topic | None:

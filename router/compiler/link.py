@@ -116,5 +116,6 @@ def _target_plan(target: CheckedTarget) -> TargetPlan:
         on_limit=target.declared.on_limit,
         priority=target.priority,
         is_deferred=target.is_deferred,
+        is_command=target.is_command,
         deadmen=target.deadmen,
     )

@@ -15,13 +15,23 @@ from typing import NamedTuple
 class Metric:
     """One metric. `kind` is counter, histogram, number, level, or time (nanoseconds in the counters, seconds exported).
 
-    One thread sets a number or a time; several add to a level and subtract from it.
+    One thread sets a number or a time; several add to a level and subtract from it. `tells_commands`: it is exported
+    with a label COMMAND as well, which follows from its `route` and `target`.
     """
 
     name: str
     kind: str
     labels: tuple[str, ...]
     help: str
+    tells_commands: bool = False
+
+    @property
+    def exported_labels(self) -> tuple[str, ...]:
+        return (*self.labels, COMMAND) if self.tells_commands else self.labels
+
+
+COMMAND = "command"
+"""The label that is `true` where commands are counted, else `false`."""
 
 
 METRICS = (
@@ -37,7 +47,13 @@ METRICS = (
     Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
     Metric("messages_sent", "counter", ("route", "target"), "ROS messages that a gateway handed to its clients."),
-    Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
+    Metric(
+        "messages_dropped",
+        "counter",
+        ("route", "target", "reason"),
+        "Messages that a target should have got.",
+        tells_commands=True,
+    ),
     Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
     Metric("messages_waiting", "level", ("route", "target"), "Messages that wait between two threads of the router."),
@@ -231,12 +247,24 @@ class Counters:
     _current: set[Series] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
+    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
 
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
         return Counters(
-            self._indexes.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size
+            self._indexes.copy(),
+            set(),
+            {length: starts.copy() for length, starts in self._free.items()},
+            self._size,
+            self._commanded.copy(),
         )
+
+    def set_commands(self, route: str, target: str, *, are_commands: bool) -> None:
+        """Say whether what a target of a route gets are commands."""
+        self._commanded[route, target] = are_commands
+
+    def are_commands(self, route: str, target: str) -> bool:
+        return self._commanded.get((route, target), False)
 
     def index(self, metric: str, *labels: str) -> int:
         """Return the first index of a series, which is current from now on."""

@@ -64,8 +64,9 @@ class TargetPlan:
     """A target of a route: `label` in metrics.
 
     `is_deferred` says that it may be served later and by another thread: it has `on_limit: latest`, or its
-    endpoint has a bandwidth. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or
-    disarms. It holds no positions of the table, since a reload keeps state by it.
+    endpoint has a bandwidth. `is_command`: what it gets are commands. `deadmen` are the routes whose deadmen each
+    command to it feeds (its own route's) or disarms. It holds no positions of the table, since a reload keeps state
+    by it.
     """
 
     label: str
@@ -74,6 +75,7 @@ class TargetPlan:
     on_limit: OnLimit = OnLimit.FIRST
     priority: Priority = Priority.TELEMETRY
     is_deferred: bool = False
+    is_command: bool = False
     deadmen: tuple[str, ...] = ()
 
 
@@ -104,6 +106,11 @@ class InboundPlan:
     label: str
     type: MessageType
     deadman: DeadmanPlan | None
+
+    @property
+    def is_command(self) -> bool:
+        """Whether what clients publish there are commands: they have a deadman or a `ttl`."""
+        return self.deadman is not None or self.settings.ttl is not None
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,7 @@ from router.table.model import (
     Collect,
     Destination,
     Endpoint,
-    EndpointKind,
     Expression,
-    Priority,
     Route,
     RouteTable,
     Topic,
@@ -114,13 +112,12 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
 def _destination(
     lookup: Lookup, route: Route, destination: Destination, endpoint: Endpoint | None, scope: Scope
 ) -> CheckedTarget:
-    """A destination without its plan. Messages to a board are commands unless the route says something else."""
-    to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
+    """A destination without its plan."""
     return CheckedTarget(
         destination,
         endpoint=endpoint,
         when=lookup.when(destination.when, scope),
-        priority=route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY),
+        declared_priority=route.priority,
         deadmen=deadmen_of(lookup.table, route, destination),
     )
 

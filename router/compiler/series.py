@@ -82,6 +82,7 @@ def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
     else:
         counters.index("messages_received", route, plan.topic)
     for target in plan.targets:
+        counters.set_commands(route, target.label, are_commands=target.is_command)
         _open_each(counters, "messages_dropped", route, target.label, last=DROP_REASONS)
         _open(counters, ("messages_filtered", "messages_waiting"), route, target.label)
         delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
@@ -111,6 +112,7 @@ def _open_gateway(counters: Counters, plan: GatewayPlan) -> None:
     _open_each(counters, "gateway_topics", name, last=TOPIC_STATES)
     _open_each(counters, "client_messages_dropped", name, last=CLIENT_DROP_REASONS)
     for topic, inbound in plan.inbound.items():
+        counters.set_commands(name, topic, are_commands=inbound.is_command)
         _open(counters, ("messages_published",), name, topic)
         _open_each(counters, "messages_dropped", name, topic, last=INBOUND_DROP_REASONS)
         _open_each(counters, "qos_incompatible", name, topic, last=QOS_POLICIES)

@@ -79,6 +79,13 @@ class Kind(enum.Enum):
         "Nobody listens at {address}, or the network refuses it. Stop the rover by other means.",
         "deadman_send_errors",
     )
+    COMMANDS_DROPPED = (
+        Level.CRITICAL,
+        "commands for {target} are dropped: {reason}",
+        "",
+        "messages_dropped",
+        0.05,
+    )
     ENDPOINT_SILENT = (
         Level.WARNING,
         "{endpoint} is silent",
@@ -252,10 +259,13 @@ _MORE: Mapping[Kind, str] = {
 }
 """By how much a value is too large, where that is of interest."""
 
+DROPS = (Kind.COMMANDS_DROPPED, Kind.MESSAGES_DROPPED)
+"""What a target loses."""
+
 _GAUGES = (Kind.LISTENER_WAITING, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
-    Kind.MESSAGES_DROPPED,
+    *DROPS,
     Kind.KERNEL_DROPS,
     Kind.DATAGRAMS_REJECTED,
     Kind.UNHANDLED_CASE,
@@ -458,7 +468,7 @@ class Look:
         for metric in (kind.metric, *(["mirror_dropped"] if kind is Kind.RECORDING_INCOMPLETE else [])):
             for values, count in self.grown(metric):
                 labels = dict(zip(SERIES[metric], values, strict=True))
-                if labels.get("reason") not in _NO_LOSS:
+                if labels.get("reason") not in _NO_LOSS and (kind not in DROPS or kind is self._drop(labels)):
                     route = self._owner(labels.get("route", ""))
                     sums[tuple(labels[label] for label in kind.labels)][route] += count
         for values, counts in sums.items():
@@ -472,6 +482,10 @@ class Look:
                     who, routes = self._mismatched(labels["listener"])
                     more += f": {who}" if who else ""
                 yield self._problem(kind, labels, more, routes)
+
+    def _drop(self, labels: Mapping[str, str]) -> Kind:
+        are_commands = self.program.counters.are_commands(labels["route"], labels["target"])
+        return Kind.COMMANDS_DROPPED if are_commands else Kind.MESSAGES_DROPPED
 
     def _owner(self, route: str) -> str:
         """The gateway that a client's deadman belongs to, which is called GATEWAY:TOPIC; or the route itself."""

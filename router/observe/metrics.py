@@ -11,7 +11,7 @@ from prometheus_client.metrics_core import Metric as Family
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, METRICS, Counters, Metric
+from router.compiler.metrics import COMMAND, HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, METRICS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
 from router.observe.snapshot import BUCKETS, PREFIX
 
@@ -46,7 +46,10 @@ class CountersCollector(Collector):
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
             if series.cell == 0:
-                labels = dict(zip(metric_named(series.metric).labels, series.labels, strict=True))
+                metric = metric_named(series.metric)
+                labels = dict(zip(metric.labels, series.labels, strict=True))
+                if metric.tells_commands:
+                    labels[COMMAND] = str(counters.are_commands(labels["route"], labels["target"])).lower()
                 self._indexes[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:

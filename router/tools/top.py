@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.metrics import INTENDED_REASONS
-from router.observe.health import Kind, Level, Problem
+from router.observe.health import DROPS, Kind, Level, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
 WINDOW = 3.0
@@ -225,7 +225,7 @@ def _target_row(
         rate=_rate(before, after, metric, route, target),
         dropped=_dropped(route, target, after),
         filtered=after.total("messages_filtered", route, target),
-        is_losing=_has(problems, Kind.MESSAGES_DROPPED, route, target=target),
+        is_losing=any(_has(problems, kind, route, target=target) for kind in DROPS),
     )
 
 

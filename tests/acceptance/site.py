@@ -58,6 +58,9 @@ SERVED = "route_duration_seconds_count"
 """Counts the messages whose targets have all been served."""
 
 
+_COMMAND = re.compile(r'command="\w+",?')
+
+
 def key(metric: str, **labels: str) -> str:
     """A counter as Prometheus writes it, without the prefix."""
     return f"{metric}{{{','.join(f'{name}={json.dumps(labels[name])}' for name in sorted(labels))}}}"
@@ -183,10 +186,13 @@ class Site:
         )
 
     def samples(self) -> dict[str, float]:
-        """Everything that the router tells of itself, without the prefix `router_`."""
+        """Everything that the router tells of itself, without the prefix `router_`.
+
+        Without the label `command`, which follows from the others.
+        """
         with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics}/metrics", timeout=PATIENCE) as answer:
             text = answer.read().decode()
-        lines = (line.rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
+        lines = (_COMMAND.sub("", line).rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
         return {name[len("router_") :]: float(value) for name, _, value in lines}
 
     def changes(self, before: Counter[str]) -> Counter[str]:

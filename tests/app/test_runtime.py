@@ -262,7 +262,7 @@ def test_metrics_are_served_while_it_runs(site: Site) -> None:
     }
     assert samples["router_datagrams_received_total", "rover"] == 2
     assert samples["router_datagrams_sent_total", "basestation", "ph_info"] == 1
-    assert samples["router_messages_dropped_total", "basestation", "ph_info", "send_error"] == 0
+    assert samples["router_messages_dropped_total", "basestation", "false", "ph_info", "send_error"] == 0
     [build] = [labels for name, *labels in samples if name == "router_build_info"]
     assert router.program.table.sha256 in build
     assert router.program.protos_sha256 in build

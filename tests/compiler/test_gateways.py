@@ -306,6 +306,18 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
     assert {each for each in series if each[1:] and re.match("it(:|$)", each[1])} == expected
 
 
+@pytest.mark.parametrize(
+    ("keys", "are_commands"), [("ttl: 1s", True), ("deadman: {timeout: 1s, send: {}}", True), ("max_rate: 1 Hz", False)]
+)
+def test_what_clients_publish_with_a_time_limit_or_a_deadman_are_commands(
+    check_text: CheckText, keys: str, are_commands: bool
+) -> None:
+    program = checked(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, {keys}}}]}}").program
+    assert program
+    assert program.counters.are_commands("it", "/cmd_vel") is are_commands
+    assert not program.counters.are_commands("it", CLIENTS)
+
+
 def test_a_deadman_of_clients_may_publish_nan(check_text: CheckText) -> None:
     deadman = "{timeout: 1s, send: {linear.x: nan}}"
     assert codes(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, deadman: {deadman}}}]}}") == []

@@ -86,3 +86,14 @@ def test_books_that_continue_others_keep_what_was_counted() -> None:
         "deadman_active",
         "route_duration_seconds",
     }  # as they were
+
+
+def test_what_is_said_of_a_route_that_is_gone_stays() -> None:
+    """Its series stay as well, and would be others with another label."""
+    first = Counters()
+    first.set_commands("drive", "board", are_commands=True)
+    first.set_commands("arm", "board", are_commands=True)
+    then = first.continued()
+    then.set_commands("arm", "board", are_commands=False)
+    assert (then.are_commands("drive", "board"), then.are_commands("arm", "board")) == (True, False)
+    assert first.are_commands("arm", "board")

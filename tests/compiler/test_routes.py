@@ -237,6 +237,18 @@ def test_what_goes_to_a_board_is_a_command_where_the_route_says_nothing(check_te
 
 
 @pytest.mark.parametrize("routes", [INBOUND, OUTBOUND], ids=["inbound", "outbound"])
+def test_what_feeds_a_deadman_is_a_command_whatever_it_goes_to(check_text: CheckText, routes: str) -> None:
+    assert [target.is_command for target in targets(check_text, routes)] == [True, False]
+    watched = routes.replace(
+        "{{none: not part of this test}}",
+        "{{timeout: 1s, send: {{manual_brake: {{}}}}, to: base, because: it is a test}}",
+    )
+    board, base = targets(check_text, f"{watched}    ttl: 1s\n")
+    assert (board.is_command, base.is_command) == (True, True)
+    assert base.priority is Priority.COMMAND
+
+
+@pytest.mark.parametrize("routes", [INBOUND, OUTBOUND], ids=["inbound", "outbound"])
 def test_target_has_what_its_endpoint_and_its_destination_say(check_text: CheckText, routes: str) -> None:
     board, base = targets(check_text, routes)
     assert board.endpoint is not None

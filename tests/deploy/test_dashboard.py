@@ -25,7 +25,7 @@ def _labels() -> Iterator[tuple[str, set[str]]]:
         if metric.kind == "histogram":
             yield f"router_{metric.name}_bucket", {*metric.labels, "le"}
         else:
-            yield f"router_{metric.name}{'_total' if metric.kind == 'counter' else ''}", set(metric.labels)
+            yield f"router_{metric.name}{'_total' if metric.kind == 'counter' else ''}", set(metric.exported_labels)
     yield "router_build_info", BUILD_LABELS
     yield from ((name, set()) for name in OF_THE_PROCESS)
 

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from router.compiler.metrics import INTENDED_REASONS
+from router.observe.health import DROPS, Kind
 from router.observe.health import PAGE as HEALTH_PAGE
-from router.observe.health import Kind
 from tests.deploy.promql import selectors
 
 pytestmark = pytest.mark.slow
@@ -115,11 +115,14 @@ def test_an_alert_has_words_level_metric_and_threshold_of_its_kind_of_problem(ki
         assert float(compared[1]) == kind.threshold
 
 
-@pytest.mark.parametrize("kind", [Kind.MESSAGES_DROPPED, Kind.DATAGRAMS_REJECTED], ids=lambda kind: kind.alert)
+@pytest.mark.parametrize("kind", [*DROPS, Kind.DATAGRAMS_REJECTED], ids=lambda kind: kind.alert)
 def test_losses_that_the_table_asks_for_raise_no_alert(kind: Kind) -> None:
     [selector] = selectors(ALERTS[kind.alert]["expr"])
-    assert selector.selects(selector.metric, {"reason": "malformed"})
-    assert not any(selector.selects(selector.metric, {"reason": reason}) for reason in INTENDED_REASONS)
+    command = str(kind is Kind.COMMANDS_DROPPED).lower()
+    assert selector.selects(selector.metric, {"reason": "malformed", "command": command})
+    assert not any(
+        selector.selects(selector.metric, {"reason": reason, "command": command}) for reason in INTENDED_REASONS
+    )
 
 
 @pytest.mark.parametrize("name", ALERTS)

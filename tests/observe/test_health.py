@@ -46,6 +46,17 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
             9,
             "messages for basestation are dropped: send_error, 9 of imu_info in 2 s",
         ),
+        (
+            "messages_dropped manual_drive driving_board stale",
+            9,
+            "commands for driving_board are dropped: stale, 9 of manual_drive in 2 s",
+        ),
+        (
+            "messages_dropped dashboard /cmd_vel stale",
+            9,
+            "commands for /cmd_vel are dropped: stale, 9 of dashboard in 2 s",
+        ),
+        ("messages_dropped manual_drive driving_board rate_limited", 9, None),
         ("messages_waiting imu_info imu_data", 20, None),
         ("messages_dropped imu_info imu_data rate_limited", 9, None),
         ("datagrams_rejected rover malformed", 9, "rover rejects datagrams: malformed, 9 in 2 s"),

@@ -39,6 +39,7 @@ LABELS = {
     "policy": "reliability",
     "state": "served",
     "client": "0",
+    "command": "true",
 }
 NO_HEALTH = cast("Health", None)
 """Nobody asks for it."""
@@ -64,7 +65,7 @@ class Scraped:
 
     def value(self, name: str, **labels: str) -> float:
         metric = next(metric for metric in METRICS if name.startswith(f"router_{metric.name}"))
-        labels |= {label: LABELS[label] for label in metric.labels}
+        labels |= {label: LABELS[label] for label in metric.exported_labels}
         return self.values()[name, frozenset(labels.items())]
 
 
@@ -72,6 +73,7 @@ class Scraped:
 def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     monkeypatch.setattr("router.observe.responses.KEPT_SECONDS", 0)
     counters = Counters()
+    counters.set_commands(LABELS["route"], LABELS["target"], are_commands=True)
     indexes = {
         metric.name: counters.index(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS
     }
@@ -88,7 +90,7 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
 def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
     values = scraped.values()
     for metric in METRICS:
-        labels = frozenset((label, LABELS[label]) for label in metric.labels)
+        labels = frozenset((label, LABELS[label]) for label in metric.exported_labels)
         suffix = {"counter": "_total", "time": "", "number": "", "level": "", "histogram": "_count"}[metric.kind]
         assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
 
