@@ -16,6 +16,7 @@ from textwrap import indent
 from typing import IO
 
 import pytest
+import yaml
 
 from router.assets import asset
 from router.compiler import check_table
@@ -103,6 +104,15 @@ def test_examples_with_gateways_only_need_nothing_but_the_version(tmp_path: Path
         version = "" if re.search(r"^version:", example, re.MULTILINE) else "version: 1\n"
         table.write_text(version + example)
         assert list(map(str, check_table(table, {}).diagnostics)) == []
+
+
+@pytest.mark.parametrize("page", ["guides/gateways.md", "guides/from-cpp.md"])
+def test_no_headset_gets_compressed_packets(page: str) -> None:
+    """The app of the C++ gateway's project refuses them."""
+    tables = [yaml.safe_load(text) for text in examples(page, "yaml") if "\ngateways:" in f"\n{text}"]
+    headsets = [gateway for table in tables for name, gateway in table["gateways"].items() if "headset" in name]
+    assert headsets
+    assert [gateway["compression"] for gateway in headsets if "compression" in gateway] == []
 
 
 # -- links ---------------------------------------------------------------------------------------------------------
