@@ -328,6 +328,12 @@ def test_decisions(machine: Machine) -> None:
     assert machine.value(integer(0), *choice) == Refusal("mapping_error", 6)
     assert machine.value(integer(0), integer(1), Operation("OP_EITHER")) == 1
     assert machine.value(integer(0), Operation("OP_NOT")) == 1
+    assert machine.value(integer(3), Operation("OP_FIT_COUNT", number=3)) == 3
+    assert machine.value(integer(2), Operation("OP_FIT_COUNT", number=3)) == Refusal("mapping_error", 1)
+    assert machine.value(integer(2), Operation("OP_FIT_COUNT", flag=1, number=3)) == 2
+    assert machine.value(integer(4), Operation("OP_FIT_COUNT", flag=1, number=3)) == Refusal("mapping_error", 1)
+    assert machine.value(integer(4), integer(4), Operation("OP_SAME_COUNT")) == 4
+    assert machine.value(integer(4), integer(5), Operation("OP_SAME_COUNT")) == Refusal("mapping_error", 2)
     assert machine.value(integer(5), Operation("OP_KEEP", 3), integer(6), Operation("OP_DROP"), load(3),
                          Operation("OP_SUBTRACT")) == 0  # fmt: skip
 

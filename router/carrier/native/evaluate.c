@@ -117,24 +117,24 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
 }
 
 /* These end a case: the operation refuses the message unless the condition is true. */
-#define WANT(condition)                    \
-    if (!(condition)) goto refused;        \
+#define WANT(condition)             \
+    if (!(condition)) goto refused; \
     break
 
-/* A function of one real number. */
-#define FUNCTION(function)              \
-    {                                   \
-        double of = top->real;          \
-        top->real = function(of);       \
+/* A function of one real number, which stays if the function has no result. */
+#define FUNCTION(function)                   \
+    {                                        \
+        double of = top->real;               \
+        top->real = function(of);            \
         if (is_result(top->real, of)) break; \
-        top->real = of;                 \
-        goto refused;                   \
+        top->real = of;                      \
+        goto refused;                        \
     }
 
 /* A real number as the integer that `function` rounds it to. */
-#define ROUNDED(function)                      \
+#define ROUNDED(function)                   \
     if (!isfinite(top->real)) goto refused; \
-    top->real = function(top->real);           \
+    top->real = function(top->real);        \
     WANT(to_integer(top))
 
 /* Execute operations. What they leave on the stack is in its second value. */

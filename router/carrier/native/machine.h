@@ -36,8 +36,8 @@ struct machine {
     uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* what was read last; offsets in CDR count from its first byte */
     struct output output;                 /* the message that was written last */
-    struct refusal refusal;               /* what was refused last; */
-    struct value refused;                 /* the text of it, or an empty one */
+    struct refusal refusal;               /* what was refused last, */
+    struct value refused;                 /* and its text, or an empty one */
     struct value stack[MOST_STACKED];
 };
 
