@@ -129,6 +129,7 @@ def _report(message: NewMessage, written: Written, unrouted: Sequence[Path], bef
     for path in unrouted:
         print(f"  route it yourself in {shown_path(path)}: what that does with it nobody but you knows")
     if after.envelope.max_size > before.envelope.max_size:
-        print(f"The largest envelope grew from {before.envelope.max_size} to {after.envelope.max_size} bytes:")
+        bounded = " that has a bound" if after.schema.unbounded(after.envelope.name) else ""
+        print(f"The largest envelope{bounded} grew from {before.envelope.max_size} to {after.envelope.max_size} bytes:")
         print("flash all boards, because those that decode it have to have room for that.")
     print("Next: `make setup` builds the ROS message; `router validate --strict` and `router test` prove the table.")

@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(what, "copy the protos with `router init --rover DIR`, and name yours: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
-    lock = LockComparison(schema, find_envelope(schema, settings.oneof))
+    envelope = find_envelope(schema, settings.oneof)
+    lock = LockComparison(schema, envelope)
     found = lock.conflicts
     accepted = _accepted(args.accept, found)
     if refused := [each for each in found if each not in accepted]:
@@ -77,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         write_lock(path, new)
     for conflict in accepted:
         print(f"accepted: {conflict.finding.message}")
-    print(f"{shown_path(path)}: {_summary(lock.lock, new)}")
+    print(f"{shown_path(path)}: {_summary(lock.lock, new, schema.unbounded(envelope.name))}")
     return OK
 
 
@@ -137,9 +138,13 @@ def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
     raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
 
 
-def _summary(old: Lock | None, new: Lock) -> str:
+def _summary(old: Lock | None, new: Lock, unbounded: str) -> str:
+    """`unbounded` is why there is no largest envelope, "" where there is one."""
     added = _numbers(new) - (_numbers(old) if old is not None else set())
     size = f"an envelope takes up to {new.max_size} bytes"
+    if unbounded:
+        size = f"an envelope has no largest size, as {unbounded}"
+        size += f"; all else takes up to {new.max_size} bytes" if new.max_size else ""
     if old is not None and old.max_size != new.max_size:
         size += f" (it was {old.max_size}: flash the boards)"
     return f"{plural(len(new.messages), 'message')}, {plural(len(added), 'new number')}; {size}"

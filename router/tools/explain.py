@@ -60,6 +60,8 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
     if case.max_size is not None:
         datagram = framed_size(case.number, case.max_size)
         yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
+    elif everything.program is not None:
+        yield f"  largest encoding: none, as {everything.program.protos.unbounded(case.type.name)}"
     if route.ignore is not None:
         yield f"  ignored: {route.ignore}"
         return

@@ -134,7 +134,8 @@ class LockComparison:
             more = f", and so for {len(names) - 1} more" if len(names) > 1 else ""
             self._add(span, f"the lock has {old} for what is {names[old]} now{more}", "the wire is the same; ")
         if lock.max_size != envelope.max_size and not self.conflicts:
-            message = f"{envelope.name} takes up to {envelope.max_size} bytes, the lock says {lock.max_size}"
+            but = ", fields without a bound not counted" if self._schema.unbounded(envelope.name) else ""
+            message = f"{envelope.name} takes up to {envelope.max_size} bytes{but}; the lock says {lock.max_size}"
             self._add(span, message, "flash the boards, then ")
 
     def _compare(self, owner: str, locked: Declaration, current: Declaration) -> None:

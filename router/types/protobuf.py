@@ -17,7 +17,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, plural, shown_path
 from router.types.boards import (
     NO_OPTIONS,
     BoardOptions,
@@ -26,6 +26,7 @@ from router.types.boards import (
     largest_beside,
     largest_encoding,
     read_options,
+    unbounded_fields,
 )
 from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
@@ -95,6 +96,15 @@ class ProtoSchema:
         """What the `.options` file beside the field's `.proto` says about it."""
         options = self._options.get(container(field).file.name)
         return options.of(container(field).full_name, field.name) if options is not None else NO_OPTIONS
+
+    def unbounded(self, message: str) -> str:
+        """Which field of a message, by full name, has no largest encoding, and why; how many more. "" without any."""
+        found = [*unbounded_fields(self.descriptor(message), self.board_options)]
+        if not found:
+            return ""
+        path = ".".join(step.name for step in found[0].path)
+        more = f" (and {plural(len(found) - 1, 'more field')})" if len(found) > 1 else ""
+        return f"{path} {found[0].why}{more}"
 
     def span(self, message: str, field: str | None = None) -> SourceSpan:
         """The place of a declaration in its `.proto` file: of a message or enum, of a field or enum value."""

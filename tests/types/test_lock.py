@@ -299,7 +299,7 @@ def test_envelope_that_grows_says_so(changed: Callable[..., list[Diagnostic]]) -
     findings = changed("float voltage = 3;", "float voltage = 3;\n  double energy = 4;")
     (finding,) = [found for found in findings if "bytes" in found.message]
     assert str(finding) == (
-        "motor.proto:15:9: warning[not-locked]: Envelope takes up to 23 bytes, the lock says 14; "
+        "motor.proto:15:9: warning[not-locked]: Envelope takes up to 23 bytes; the lock says 14; "
         "flash the boards, then record it with `router schema lock --protos .`"
     )
 
