@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import enum
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -263,14 +264,47 @@ def did_you_mean_file(written: str, path: Path) -> str:
 
 
 def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
-    """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal."""
+    """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal.
+
+    The same words in another order are near. What all known names begin with does not count: `MODE_X` is not near
+    `MODE_A`.
+    """
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
-    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=closeness)
-    if not close:
-        return None
-    ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
-    best = (candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))
-    return folded[min(best, key=lambda candidate: (sorted(candidate) != sorted(name.lower()), candidate))]
+    words = sorted(name.lower().split("_"))
+    if closeness < 1 and (same := [each for each in folded if sorted(each.split("_")) == words]):
+        return folded[same[0]]
+    start = _common_start(folded)
+    wanted = name.lower().removeprefix(start)
+    ends = {candidate.removeprefix(start): full for candidate, full in folded.items()}
+    if not name.lower().startswith(start) and wanted not in ends:
+        start, ends = "", folded
+    found = {candidate: _likeness(candidate, wanted) for candidate in ends}
+    best = max(found.values(), default=0.0)
+    if best >= closeness:
+        return ends[min(each for each, likeness in found.items() if likeness == best)]
+    longer = [candidate for candidate in ends if len(wanted) >= _SHORTEST and candidate.startswith(wanted)]
+    return ends[longer[0]] if len(longer) == 1 and closeness < 1 else None
+
+
+_SHORTEST = 3
+"""Letters with which a name begins that stand for all of it."""
+
+
+def _likeness(known: str, wanted: str) -> float:
+    """From 0 to 1: what both have in common, and a little more if they begin alike or have the same letters."""
+    ratio = difflib.SequenceMatcher(a=known, b=wanted).ratio()
+    alike = next((at for at, pair in enumerate(zip(known, wanted, strict=False)) if len({*pair}) > 1), len(wanted))
+    return ratio + (1 - ratio) * (min(alike, 4) * 0.1 + (sorted(known) == sorted(wanted)) * 0.1)
+
+
+def _common_start(names: Collection[str]) -> str:
+    """The whole words that several names all begin with, such as `board_mode_`; empty if there are none."""
+    if len(names) <= 1:
+        return ""
+    first, last = min(names), max(names)
+    same = next((at for at, pair in enumerate(zip(first, last, strict=False)) if len({*pair}) > 1), len(first))
+    found = re.match(r".*[\W_]", first[:same])
+    return found[0] if found else ""
 
 
 def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
@@ -282,3 +316,17 @@ def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str
         return ""
     shown = ", ".join(candidates[:8])
     return f"known: {shown}" + (f" and {len(candidates) - 8} more" if len(candidates) > 8 else "")
+
+
+MOST_MEANT = 3
+"""Of the names that a hint offers."""
+
+
+def one_of(names: Sequence[str]) -> str:
+    """A hint that offers several names; empty if there are none."""
+    quoted = [f"'{name}'" for name in names[:MOST_MEANT]]
+    if not quoted:
+        return ""
+    if len(names) > MOST_MEANT:
+        return f"did you mean {', '.join(quoted)} or another one?"
+    return f"did you mean {' or '.join([', '.join(quoted[:-1]), quoted[-1]] if quoted[:-1] else quoted)}?"

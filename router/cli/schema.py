@@ -65,8 +65,7 @@ def run(args: argparse.Namespace) -> int:
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
     found = lock.conflicts
-    _refuse_unknown(args.accept, found)
-    accepted = [each for each in found if each.name in args.accept or each.owner in args.accept]
+    accepted = _accepted(args.accept, found)
     if refused := [each for each in found if each not in accepted]:
         print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
         if len(found) > 1:
@@ -113,13 +112,29 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
     return replace(settings, message=Located(message, span), oneof=Located(oneof, span))
 
 
-def _refuse_unknown(names: Sequence[str], found: Sequence[Conflict]) -> None:
-    """Raises UsageError for a name to accept that no conflict has."""
-    known = {name for each in found for name in (each.name, each.owner)}
-    for name in names:
-        if name not in known:
-            hint = did_you_mean(name, known) or "nothing conflicts with the lock"
-            raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
+def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]:
+    """The conflicts that `names` mean, of those `found`. Raises UsageError for a name that means none, or several."""
+    accepted = [each for name in names for each in _meant(name, found)]
+    return [each for each in found if each in accepted]
+
+
+def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
+    """The conflict of that name, or those of a message; its package and the messages around it may be left out.
+
+    A field may be called as the lock has it.
+    """
+    if exact := [each for each in found if name in (each.name, each.owner)]:
+        return exact
+    known = {full for each in found for full in (each.name, each.owner)}
+    former = {f"{each.owner}.{entry.name}": each.name for each in found for entry in each.entries}
+    full = sorted(each for each in known if each.endswith(f".{name}"))
+    full = full or sorted({now for was, now in former.items() if f".{was}".endswith(f".{name}")})
+    if len(full) == 1:
+        return _meant(full[0], found)
+    if full:
+        raise UsageError(f"'{name}' may be {' or '.join(full)}; nothing was written", "write its full name")
+    hint = did_you_mean(name, known) or "nothing conflicts with the lock"
+    raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
 
 
 def _summary(old: Lock | None, new: Lock) -> str:

@@ -28,6 +28,7 @@ from router.compiler.expressions.kinds import (
     StringKind,
     TimeKind,
     element_of,
+    fields_hint,
     length_of,
 )
 from router.compiler.expressions.lists import fitted, limited
@@ -203,6 +204,8 @@ def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
     """The error for a value whose kind cannot fill the type."""
     if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
         hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
+    if not isinstance(target, (List, MessageType)):
+        hint = hint or fields_hint(value.kind)
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 

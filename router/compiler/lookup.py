@@ -11,9 +11,10 @@ from pathlib import Path
 
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind, Kind
+from router.compiler.expressions.operators import presence_hint
 from router.compiler.expressions.tree import Node
 from router.compiler.network import loop_finding
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, one_of
 from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, Route, RouteTable, Topic
 from router.types.board_limits import BoardLimits
 from router.types.boards import board_findings
@@ -128,8 +129,8 @@ class Lookup:
         known = self.definitions.interfaces.names()
         packages = {full.partition("/")[0] for full in known}
         if package is not None and package.value not in packages:
-            near = nearest(package.value, packages)
-            hint = f"did you mean '{near}'?" if near else "build and source it, or name another one"
+            near = nearest(package.value, packages, _SAME_PACKAGE)
+            hint = f"did you mean '{near}'?" if near else _SOURCE.format(package.value)
             message = f"no package '{package.value}' has ROS messages"
             self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
             return
@@ -161,6 +162,7 @@ class Lookup:
         try:
             node = check(expression, scope)
             if not isinstance(node.kind, kinds):
+                hint = (presence_hint(node) if BoolKind in kinds else "") or hint
                 raise ExpressionError(node.span, Code.TYPE_MISMATCH, f"{wanted}, not {node.kind}", hint)
         except ExpressionError as error:
             self.findings.append(error.diagnostic)
@@ -213,10 +215,21 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     package, short = parts[0], parts[-1]
     if (exact := f"{package}/msg/{short}") in known:
         return f"did you mean '{exact}'?"
-    namesakes = [full for full in known if full.rpartition("/")[2] == short]
+    namesakes = sorted(full for full in known if full.rpartition("/")[2] == short)
     siblings = [full for full in known if full.partition("/")[0] == package]
     source = Path("schemas", package, "msg", f"{short}.msg")
     if source.is_file():  # in an installation, what is built and sourced counts
         return f"it is in {source.parent}, but not built: build and source {package}"
-    general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"
-    return did_you_mean(name, namesakes or siblings) or general
+    if siblings or len(parts) == 1:
+        general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"
+        return one_of(namesakes) or did_you_mean(name, siblings) or general
+    near = nearest(package, {full.partition("/")[0] for full in known}, _SAME_PACKAGE)
+    if near:
+        return did_you_mean(f"{near}/msg/{short}", [full for full in known if full.partition("/")[0] == near])
+    other = one_of(namesakes)
+    return f"{_SOURCE.format(package)}{'; or ' * bool(other)}{other}"
+
+
+_SAME_PACKAGE = 0.85
+"""How near the name of a package is to be a misspelt one: `my_interfaces` is not `rcl_interfaces`."""
+_SOURCE = "build '{}' and source its workspace, as with `source install/setup.bash`"

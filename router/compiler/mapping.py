@@ -15,10 +15,11 @@ from router.compiler.conversion import convert, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.tree import Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest, one_of
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TEXT
 from router.types.model import Field, MessageType, String, Type
+from router.types.paths import ways
 
 _FRAME = re.compile(r"/?\w+(?:[/-]\w+)+|/\w+")
 """Text that looks like a division or a difference: `base/imu_link`, `imu-link`."""
@@ -42,6 +43,20 @@ class FieldMapping:
     plan: Record
     rows: list[Row] = field(default_factory=list)
     findings: list[Diagnostic] = field(default_factory=list)
+
+
+_MISSPELT = 0.9
+"""How near a name is to one of the target's own fields if it can only be that."""
+
+
+def _of_one_key(spans: Sequence[SourceSpan], depth: int) -> tuple[int, int]:
+    """The first and the last of the names that stand in one key, `a.b.c`, with the one at `depth`."""
+    first = last = depth
+    while first > 0 and spans[first - 1].end_column + 1 == spans[first].column:
+        first -= 1
+    while last + 1 < len(spans) and spans[last].end_column + 1 == spans[last + 1].column:
+        last += 1
+    return first, last
 
 
 def _nested(entry: FieldEntry, target: MessageType) -> FieldEntry:
@@ -133,12 +148,15 @@ class _Builder:
         self.rows: list[Row] = []
         self.findings: list[Diagnostic] = []
         self._whole = set[tuple[str, ...]]()
+        self._taken = set[tuple[str, ...]]()
+        self._reported = set[SourceSpan]()
 
     # entries by field
 
     def sort(self, entries: Sequence[FieldEntry], target: MessageType) -> _Branch:
         """The entries by field. Unknown fields and fields that are given twice are reported and left out."""
         root = _Branch(target)
+        self._taken = {entry.path[: depth + 1] for entry in entries for depth in range(len(entry.path))}
         for entry in map(functools.partial(_nested, target=target), entries):
             if holders := self._holders(entry, target):
                 self._insert(root, entry, holders)
@@ -160,12 +178,27 @@ class _Builder:
                 return []
             member = holder.field(name)
             if member is None:
-                hint = did_you_mean(name, [member.name for member in holder.fields])
-                self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, f"{holder} has no field '{name}'", hint))
+                self._unknown(entry, depth, holder)
                 return []
             holders.append(holder)
             holder = member.type
         return holders
+
+    def _unknown(self, entry: FieldEntry, depth: int, holder: MessageType) -> None:
+        """Report that `holder` has no field of the name at `depth`, once for a key that stands above several others."""
+        name, span = entry.path[depth], entry.path_spans[depth]
+        if span in self._reported:
+            return
+        self._reported.add(span)
+        free = [member.name for member in holder.fields if (*entry.path[:depth], member.name) not in self._taken]
+        first, last = _of_one_key(entry.path_spans, depth)
+        hint = did_you_mean(name, free or [member.name for member in holder.fields])
+        if not nearest(name, free, _MISSPELT) and (found := ways(holder, entry.path[depth:])):
+            behind = sum(len(each) + 1 for each in entry.path[last + 1 :])
+            before = "".join(f"{each}." for each in entry.path[first:depth])
+            hint = one_of([before + way[: len(way) - behind] for way in found])
+            span = replace(entry.path_spans[first], end_column=entry.path_spans[last].end_column)
+        self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, f"{holder} has no field '{name}'", hint))
 
     def _insert(self, branch: _Branch, entry: FieldEntry, holders: Sequence[MessageType]) -> None:
         *way, last = entry.path

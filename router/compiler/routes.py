@@ -27,7 +27,7 @@ from router.table.model import (
     RouteTable,
     Topic,
 )
-from router.types.model import MessageType
+from router.types.model import List, MessageType
 from router.types.protobuf import PayloadCase
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
@@ -58,9 +58,32 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
     findings = lookup.findings
     before = len(findings)
     checked = _route(lookup, route)
+    findings[before:] = _said_once(findings[before:])
     if f"routes/{route.case.value}" in lookup.table.broken:
         findings[before:] = [finding for finding in findings[before:] if finding.code not in _OF_GAPS]
     return checked
+
+
+_NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' are of `for_each`, which this route lacks"
+_NO_COLLECT = f"'{ITEMS}' and '{COUNT}' are of `collect`, which this route lacks"
+_COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
+
+
+def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
+    """The findings, those about names that need `for_each` or `collect` once: that one key is the mistake."""
+    said = set()
+    for finding in findings:
+        if finding.message not in said:
+            yield finding
+        said |= {finding.message} & {_NO_FOR_EACH, _NO_COLLECT}
+
+
+def _without_for_each(message: MessageType) -> dict[str, tuple[str, str]]:
+    """The names that a route from ROS lacks without `for_each`, with what to do: see `Scope.absent`."""
+    lists = [member.name for member in message.fields if isinstance(member.type, List)]
+    hint = f"add `for_each: {lists[0] if len(lists) == 1 else 'LIST'}`"
+    hint += f"; lists are {', '.join(lists)}" if len(lists) > 1 else ""
+    return dict.fromkeys((ITEM, INDEX, COUNT), (_NO_FOR_EACH, hint))
 
 
 def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
@@ -152,6 +175,8 @@ def _publish(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Node]
 ) -> CheckedTarget:
     scope = lookup.scope(case.type, ros_type, names, route)
+    if not names:
+        scope.absent = dict.fromkeys((ITEMS, COUNT), (_NO_COLLECT, _COLLECT))
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
     lookup.findings += mapping.findings
@@ -213,6 +238,8 @@ def _subscription(
         if for_each is None:
             return None
         scope = lookup.scope(ros_type, ros_type, _element_names(for_each))
+    else:
+        scope.absent = _without_for_each(ros_type)
     when = lookup.when(topic.when, scope)
     own = any(destination.fields for destination, _ in found)  # then the route need not have any
     targets = []

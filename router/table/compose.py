@@ -15,7 +15,7 @@ from typing import NamedTuple
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.mistakes import explain
+from router.table.mistakes import exclamation, explain
 from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
 from router.table.source import Source, fill, foreign_blank, has_variables, unusable_character
 
@@ -204,8 +204,9 @@ class _Composer:
             return False
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
         hint = "remove it; quotes make a value text"
-        if re.fullmatch(r"![a-z]\w*", name):
-            hint = f"write `not {name[1:]}` in an expression; elsewhere, remove it"
+        if (found := exclamation(self._source, span.line - 1)) is not None:
+            self._findings.append(found)
+            return True
         return self._report(span, f"the tag '{name}' has no place in a table", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from router.errors import did_you_mean, nearest
 from router.table.compose import resolve
-from router.table.nodes import MAP, MappingNode, Node, Path, ScalarNode, node_at, to_data
-from router.table.schema import SchemaError, matches, table_schema
+from router.table.nodes import MAP, Entry, MappingNode, Node, Path, ScalarNode, node_at, to_data
+from router.table.schema import SchemaError, keys_of, matches, table_schema
 from router.table.source import in_braces
 from router.table.units import meant_quantity
 
@@ -84,6 +83,24 @@ def in_other_words(name: str, known: Iterable[str]) -> str:
     return next((hint for key, names, hint in _IN_OTHER_WORDS if key in known and name in names), "")
 
 
+_IN_WORDS = ("none", "ignore", "because")
+"""Keys whose value is a reason in words."""
+
+
+def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
+    """A hint for a key that goes on with the words before it, or stands below fields and may be one of them."""
+    if before is None:
+        return ""
+    key, written = before[0], before[1].value
+    is_nothing = isinstance(entry.value, ScalarNode) and entry.value.value is None
+    if is_nothing and isinstance(written, ScalarNode) and key in _IN_WORDS:
+        return f"quote text that has ',' in it: `{key}: \"{written.text}, {name}\"`"
+    is_below = entry.key.span.line > before[1].key.span.line and not is_nothing
+    if key in NAME_FIELDS and isinstance(written, MappingNode) and is_below:
+        return f"indent it like the keys of '{key}', if it is one of them"
+    return ""
+
+
 _NAMED = {"topics": "topic", "destinations": "endpoint"}
 """Lists whose items are mappings, not keys of one, and the key that names an item."""
 
@@ -116,14 +133,10 @@ def _owners(name: str, path: Path) -> str:
     owners = [
         owner
         for owner, schema in definitions.items()
-        if _has(schema, name) and not owner.endswith(others) and not owner.startswith("complete")
+        if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
-    owners += ["the table itself"] if _has(table_schema(), name) else []
+    owners += ["the table itself"] if name in keys_of(table_schema()) else []
     return f"that is a key of: {', '.join(owners)}" if owners else ""
-
-
-def _has(schema: Any, name: str) -> bool:
-    return any(name in part.get("properties", ()) for part in (schema, schema.get("then", {}), schema.get("else", {})))
 
 
 def for_value(error: SchemaError) -> str:
@@ -183,8 +196,6 @@ def for_type(error: SchemaError, tree: Node) -> str:
     if isinstance(value, str) and "object" in error.limit and re.match(r"\w+:[^\s/]", value):
         return "a space is missing after ':'"
     if error.path[:-1] == ("routes",):
-        if name in table_schema()["definitions"]["route"]["properties"]:
-            return f"'{name}' is a key of a route: indent it further than the payload case that it is for"
         return f"write `{name}: {{ignore: why}}`" if value in (False, "ignore", "none") else ""
     if error.is_list_in_list:
         rows = to_data(node_at(tree, error.path[:-1]))
@@ -203,9 +214,20 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
         is_case = error.path[:-1] == ("routes",)
         return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
     siblings = node_at(tree, error.path[:-1])
+    if isinstance(siblings, MappingNode) and (number := _decimal(siblings, name)):
+        return f"a decimal number has a point: {number}"
     if isinstance(siblings, MappingNode) and MAP in siblings.entries:
         return f"say what it becomes: `{name}: VALUE`"
     return "a field that is left out keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
+
+
+def _decimal(siblings: MappingNode, name: str) -> str:
+    """`1.5` for `{x: y + 1,5}`, where `name` is what stands behind the ','; empty for anything else."""
+    names = list(siblings.entries)
+    before = siblings.get(names[names.index(name) - 1]) if names.index(name) else None
+    whole = re.search(r"(?<![\w.])\d+$", before.text) if isinstance(before, ScalarNode) else None
+    decimals = re.match(r"\d+(?![\w.])", name)
+    return f"{whole[0]}.{decimals[0]}" if whole and decimals else ""
 
 
 def _written_otherwise(error: SchemaError, name: str, value: object) -> str:

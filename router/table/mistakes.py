@@ -16,6 +16,7 @@ import yaml
 from router.errors import Code, Diagnostic, SourceSpan, plural
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import is_text
+from router.table.schema import is_misplaced
 from router.table.source import Source
 
 
@@ -111,6 +112,8 @@ _HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t
 _SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
 _WITHOUT_COLON = re.compile(r"(?!(?:if|else|and|or|not|in)\b)([\w./]+)(?: *[=:]>? *(.+)| +(\S+))?")
+_IN_WORDS = re.compile(r"[{,] *(?P<key>none|ignore|because): +(?P<text>[^\"',{}\[\]:][^,{}\[\]]*)$")
+"""A reason in words, which has a ':' in it."""
 _WITHOUT_COMMA = re.compile(r"[:,{\[] *([^\s,;:]+);? +([\w.]+) *$")
 
 
@@ -127,12 +130,14 @@ def explain(
     column = error.problem_mark.column if error.problem_mark else 0
     if open_quote:
         return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
-    if slip := _slip(source, line):
+    if slip := _slip(source, line) or exclamation(source, line):
         return slip
     if open_bracket and not any(text.strip() for text in source.lines[line:]):
         return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
     written = source.lines[line] if line < len(source.lines) else ""
     start = error.context_mark
+    if not open_bracket and (shallow := _too_shallow(source, line)) is not None:
+        return shallow
     if not open_bracket and written[column : column + 1] != "\t":
         begun = start.line if error.problem == _NO_KEY_ENDS and start else None
         if (bare := _bare_line(source, line) if begun is None else begun) is not None:
@@ -147,6 +152,32 @@ def explain(
 
 def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnostic:
     return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
+
+
+_EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?=[ ,}\]]|$))))")
+_NO_EXCLAMATION = "a value cannot begin with '!'"
+
+
+def exclamation(source: Source, line: int) -> Diagnostic | None:
+    """The finding for `!(a > b)`, as other languages write `not`."""
+    for number in (line, *_line_before(source, line)):
+        text = source.lines[number] if number < len(source.lines) else ""
+        if match := _EXCLAMATION.search(text):
+            start, end = match.start("what"), match.end("what")
+            end = _closing(text, end) if match["what"].endswith("(") else end
+            span = source.span(number, match.start("all"), number, end)
+            return Diagnostic(span, Code.BAD_YAML, _NO_EXCLAMATION, f"write `not {text[start:end]}`")
+    return None
+
+
+def _closing(text: str, start: int) -> int:
+    """Where the bracket that is open at `start` is closed; the end of the text if it is not."""
+    opened = 1
+    for at, character in enumerate(text[start:], start):
+        opened += (character == "(") - (character == ")")
+        if opened == 0:
+            return at + 1
+    return len(text.rstrip())
 
 
 def _slip(source: Source, line: int) -> Diagnostic | None:
@@ -183,9 +214,9 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
     if problem == _NO_KEY and character == "-" and not before.strip():
         return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
     if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
-        return _Advice(
-            _ITEM_AMONG_KEYS, "remove the '-', or indent the keys below that belong to the item", at_start=True
-        )
+        keys = _keys_at(source, start.line)
+        what = f"this line is indented like the '-' above, and the keys of that item by {keys}"
+        return _Advice(what, f"indent it by {keys} spaces, or remove the '-' in line {start.line + 1}")
     if problem in _NOT_CLOSED or (problem in _BETWEEN_KEYS and before.strip()):
         return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])
     passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
@@ -195,6 +226,10 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
 def _colon(problem: str, before: str, after: str) -> _Advice | None:
     if " ? " in before:
         return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
+    if problem in _NOT_CLOSED and (said := _IN_WORDS.search(before)):
+        rest = re.match(r"[^,}\]]*", after)
+        text = f"{said['text']}:{rest[0] if rest else ''}".replace('"', "'").rstrip()
+        return _Advice("a ':' cannot stand here", f'{_QUOTE_COLONS}: `{said["key"]}: "{text}"`')
     if problem in _NOT_CLOSED and (words := _WITHOUT_COMMA.search(before)):
         return _Advice(f"a ',' is missing before '{words[2]}'", f"write `{words[1]}, {words[2]}:`")
     if problem in _NOT_CLOSED:
@@ -293,6 +328,40 @@ def _misplaced(source: Source, line: int, neighbours: list[int]) -> Diagnostic:
     if (odd := _odd_line_above(source, line)) is not None:
         line, own, neighbours = odd, _indent(source.lines[odd]), [own]
     what = f"this line is indented by {plural(own, 'space')}, its neighbours by {' or '.join(map(str, neighbours))}"
+    return _indented(source, line, what)
+
+
+_KEY = re.compile(r"[ -]*([\w.]+):(?: |$)")
+
+
+def _too_shallow(source: Source, line: int) -> Diagnostic | None:
+    """The finding for a key above that left its mapping, so that this line, one of its mapping's, has no place.
+
+    That a mapping of that depth has no such key tells it from a line that is indented too far.
+    """
+    own = _indent(source.lines[line]) if line < len(source.lines) else 0
+    above = [number for number in reversed(range(line)) if _text(source, number)]
+    shallow = next((number for number in above if _keys_at(source, number) < own), None)
+    key = _KEY.match(source.lines[shallow]) if shallow is not None else None
+    if shallow is None or key is None:
+        return None
+    depth = _keys_at(source, shallow)
+    before = [number for number in above if number < shallow]
+    if next((_keys_at(source, number) for number in before if _keys_at(source, number) <= own), depth) != own:
+        return None
+    siblings = list[str]()
+    for number in before:
+        if _keys_at(source, number) < depth:
+            break
+        if _keys_at(source, number) == depth and (sibling := _KEY.match(source.lines[number])):
+            siblings.append(sibling[1])
+    if not is_misplaced(key[1], siblings):
+        return None
+    return _indented(source, shallow, f"this line is indented by {plural(depth, 'space')}, its neighbours by {own}")
+
+
+def _indented(source: Source, line: int, what: str) -> Diagnostic:
+    own = _indent(source.lines[line])
     hint = "indent the keys of one mapping alike, and the items of one list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
 

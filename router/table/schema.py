@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -68,6 +68,21 @@ def table_schema() -> dict[str, Any]:
 def _schema(name: str) -> dict[str, Any]:
     schema: dict[str, Any] = json.loads(asset(name).read_text(encoding="utf-8"))
     return schema
+
+
+def is_misplaced(name: str, siblings: Collection[str]) -> bool:
+    """Whether a key does not belong beside its siblings: either it is one of tables, or they are, but not both."""
+    mappings = [keys_of(schema) for schema in (table_schema(), *table_schema()["definitions"].values())]
+    of_siblings = [keys for keys in mappings if keys.issuperset(siblings)]
+    if not siblings or any(name in keys for keys in of_siblings):
+        return False
+    return bool(of_siblings) or any(name in keys for keys in mappings)
+
+
+def keys_of(schema: Mapping[str, Any]) -> set[str]:
+    """The keys of the mappings that a definition describes."""
+    parts = (schema, schema.get("then", {}), schema.get("else", {}))
+    return {key for part in parts for key in part.get("properties", ())}
 
 
 def schema_errors(tree: Node, schema: str) -> list[SchemaError]:

@@ -8,7 +8,7 @@ account.
 from __future__ import annotations
 
 import functools
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import replace
 
 from router.errors import Code, Diagnostic, SourceSpan, nearest
@@ -16,7 +16,7 @@ from router.table import hints
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten
 from router.table.reading import mapping
-from router.table.schema import SCHEMA, SchemaError, schema_errors
+from router.table.schema import SCHEMA, SchemaError, keys_of, schema_errors, table_schema
 
 _TYPES = {
     "object": "a mapping",
@@ -30,6 +30,13 @@ _LONGEST = 60
 _ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
 """Keys under which an address stands."""
 _NAME_DEPTH = len(("endpoints", "name"))
+_NAMED_PARTS = {
+    "listen": ("listener", "a"),
+    "endpoints": ("endpoint", "an"),
+    "routes": ("route", "a"),
+    "gateways": ("gateway", "a"),
+}
+"""Mappings whose keys are names, and what each of these is."""
 _HINTS_FOR_MISSING = {
     "source": "say who sends it: an endpoint, or {topic: NAME} for ROS; or say 'ignore: why'",
     "transport": "or say 'ignore: why'",
@@ -43,6 +50,7 @@ _HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table wi
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """The tree with misspelt keys put right and everything that has a finding marked broken."""
     tree: Node = root
+    tree = _with_deep_keys(tree, findings)
     found = schema_errors(tree, SCHEMA)
     while unknown := [error for error in found if error.keyword == "additionalProperties"]:
         repairs = {}
@@ -59,6 +67,41 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     findings.extend(finding(error, tree) for error in found if error not in said and not _is_broken(tree, error.path))
     tree = rewritten(tree, {error.path: _as_broken for error in found})
     return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
+
+
+def _with_deep_keys(tree: Node, findings: list[Diagnostic]) -> Node:
+    """The tree without keys of routes and the like that stand beside these for want of indentation.
+
+    Each is reported, and what it belongs to marked broken.
+    """
+    wrong = {error.path[:2] for error in schema_errors(tree, SCHEMA)}
+    for part, (kind, article) in _NAMED_PARTS.items():
+        node = node_at(tree, (part,)) if part in mapping(tree).entries else None
+        if not isinstance(node, MappingNode):
+            continue
+        entries: dict[str, Entry] = {}
+        for name, entry in node.entries.items():
+            before = _above(entry, entries)
+            if before is None or (part, name) not in wrong or name not in keys_of(table_schema()["definitions"][kind]):
+                entries[name] = entry
+                continue
+            message, hint = f"'{name}' is a key of {article} {kind}", f"indent it further than '{before}'"
+            findings.append(Diagnostic(entry.key.span, Code.UNKNOWN_KEY, message, hint))
+            entries[before] = replace(entries[before], value=_as_broken(entries[before].value))
+        if len(entries) < len(node.entries):
+            tree = rewritten(tree, {(part,): functools.partial(_with_entries, entries=entries)})
+    return tree
+
+
+def _with_entries(node: Node, entries: Mapping[str, Entry]) -> Node:
+    return replace(mapping(node), entries=dict(entries))
+
+
+def _above(entry: Entry, entries: Mapping[str, Entry]) -> str | None:
+    """The name of the last of `entries` that stands above an entry, in the same file."""
+    span = entry.key.span
+    above = {other.key.span.line: name for name, other in entries.items() if other.key.span.file == span.file}
+    return above[max(lines)] if (lines := [line for line in above if line < span.line]) else None
 
 
 def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
@@ -111,12 +154,18 @@ def unknown_keys(
     Keys after one of the paths in `empty` are not reported: they belong below it, and lack indentation.
     """
     said = set()
-    for name, entry in mapping(node_at(tree, path)).entries.items():
+    entries = mapping(node_at(tree, path)).entries
+    before: tuple[str, Entry] | None = None
+    for name, entry in entries.items():
         if (*path, name) in empty:
             return
         if name in known or entry.key.broken:
+            before = name, entry
             continue
-        hint = hints.for_key(name, entry.value, path, known)
+        written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
+        free = [key for key in known if key not in written] or known
+        said_otherwise = hints.behind(name, entry, before) or hints.in_other_words(name, known)
+        hint = said_otherwise or hints.for_key(name, entry.value, path, free)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
         said.add(hints.in_other_words(name, known) or None)
@@ -216,6 +265,13 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
     hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part or not error.path else ""
     if not error.path and missing in _BELONG_TOGETHER:
         hint = _HINT_FOR_WHOLE
+    if (
+        (number := error.path[-1:])
+        and isinstance(number[0], int)
+        and number[0] > 0
+        and missing in ("topic", "endpoint")
+    ):
+        hint = "if its keys belong to the item above, remove the '-'"
     if is_whole_part and key:
         siblings = mapping(node_at(tree, error.path[:-1])).entries
         extended = [name for name, entry in siblings.items() if entry.key.span.file != key.span.file]

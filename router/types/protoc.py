@@ -31,6 +31,7 @@ _NUMBER_TAKEN = re.compile(
 )
 _SENTENCE_END = re.compile(r"\. +(?=[A-Z])")
 _TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined(?: in file "[^"]+")?')
+_NO_LABEL = re.compile(r'Expected "required", "optional", or "repeated"')
 _NOT_DEFINED = re.compile(r'^"(?P<name>[\w.]+)" is not defined\.')
 _NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
 _NOT_A_TYPE = re.compile(r'^"(?P<name>[\w.]+)" is not a type')
@@ -59,7 +60,23 @@ def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnos
         # What else protoc says about the same place is advice, or the same again.
         advice = [other.message.rstrip(".") for other in more if other.message != first.message]
         findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
-    return findings
+    return list(_once(findings))
+
+
+def _once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
+    """One finding for each mistake of a file; further lines with the same one are listed in it."""
+    alike: dict[tuple[str, str, str], list[Diagnostic]] = {}
+    for finding in findings:
+        alike.setdefault((finding.span.file, finding.message, finding.hint), []).append(finding)
+    for first, *more in alike.values():
+        lines = [str(other.span.line) for other in more]
+        listed = ", ".join(lines[:_MOST_LINES]) + ", ..." * (len(lines) > _MOST_LINES)
+        where = f" (and {len(lines)} more, in {'line' if len(lines) == 1 else 'lines'} {listed})" if lines else ""
+        yield replace(first, message=first.message + where)
+
+
+_MOST_LINES = 3
+"""Of those that a finding lists."""
 
 
 def _without_consequences(complaints: Sequence[Complaint], names: Container[str]) -> Iterator[Complaint]:
@@ -96,6 +113,9 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     if undefined := _NOT_DEFINED.match(complaint.message) or _NOT_IMPORTED.match(complaint.message):
         hint = _type_hint(undefined["name"], complaint.file, files)
         return Diagnostic(span, Code.BAD_PROTO, f'"{undefined["name"]}" is not defined', hint)
+    if _NO_LABEL.match(complaint.message):
+        hint = 'write `optional` before the type, or say `syntax = "proto3";` if that is what the file is'
+        return Diagnostic(span, Code.BAD_PROTO, complaint.message.rstrip("."), hint)
     what, *advice = _SENTENCE_END.split(complaint.message, maxsplit=1)
     return Diagnostic(span, _code(complaint, text), what.rstrip("."), "".join(advice).rstrip("."))
 

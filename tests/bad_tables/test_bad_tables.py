@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
 from router.cli import BAD_TABLE, OK, main
-from router.errors import Code
-from tests.bad_tables.corpus import HERE, PAGES, good, sections, unpack, validate
+from router.compiler import check_table
+from router.errors import Code, Diagnostic, SourceSpan
+from tests.bad_tables.corpus import HERE, PAGES, BadTable, good, sections, unpack, validate
 
 TABLES = {page.stem: list(sections(page)) for page in PAGES}
 GOOD_PROTO = """
@@ -41,6 +44,66 @@ def test_a_bad_table_is_named_after_the_code_that_it_shows() -> None:
         for table in tables:
             assert table.name == table.code or table.name.startswith(f"{table.code}-")
             assert f"[{table.code}]" in table.said
+
+
+_OFFERED = re.compile(r"did you mean '(?P<meant>[^']+)'|write `(?P<written>[^`]+)`(?: for `(?P<instead>[^`]+)`)?")
+_PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|\b[abcx]\b|\.\.\.|\$\{|^\W+$")
+
+
+def _offers(table: BadTable, findings: Sequence[Diagnostic]) -> Iterator[tuple[Diagnostic, str, str]]:
+    """The findings of a table whose hint has what to write, with that text and, if that is said, what it replaces."""
+    for finding in findings:
+        found = _OFFERED.search(finding.hint)
+        if found is None or finding.span.file != f"bad_tables/{table.name}.yaml":
+            continue
+        text = found["meant"] or found["written"]
+        if found["meant"] or not _PLACEHOLDER.search(text):
+            yield finding, text, found["instead"] or ""
+
+
+def _applied(line: str, span: SourceSpan, text: str, instead: str) -> Iterator[str]:
+    """The line with the text in place of what is marked; or of a like text, the rest of the line, or all of it."""
+    start, end = span.column - 1, span.end_column - 1
+    before, marked, behind = line[:start], line[start:end], line[end:]
+    alike = re.compile(r"[\s,:=]*".join(map(re.escape, re.findall(r"\w+|[^\w\s,:=]", text))))
+    indent = re.match(r"[ -]*", line)
+    if instead:
+        yield line.replace(instead, text, 1)
+    quote = marked[:1] if marked[:1] in ("'", '"') else '"'
+    yield from (f"{before}{each}{behind}" for each in (text, f"{quote}{text}{quote}"))
+    yield alike.sub(lambda _: text, line, count=1)
+    yield before + text
+    yield (indent[0] if indent else "") + text
+
+
+def _remains(finding: Diagnostic, table: Path) -> bool:
+    """Whether a finding of a table, or another one at the same place, is there."""
+    span = finding.span
+    after = check_table(table).diagnostics
+    same = [each for each in after if (each.code, each.message) == (finding.code, finding.message)]
+    here = [each.span for each in after if each.span.line == span.line]
+    return any(abs(each.span.line - span.line) <= 1 for each in same) or any(
+        each.column <= span.column < each.end_column for each in here
+    )
+
+
+@pytest.mark.parametrize("code", TABLES)
+def test_what_a_hint_offers_ends_the_finding(code: str, unpacked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(unpacked)
+    useless = []
+    for table in TABLES[code]:
+        file = Path("bad_tables", f"{table.name}.yaml")
+        lines = table.table.decode(errors="replace").split("\n")
+        for finding, text, instead in _offers(table, check_table(file).diagnostics):
+            number = finding.span.line
+            for made in _applied(lines[number - 1], finding.span, text, instead):
+                file.write_text("\n".join((*lines[: number - 1], made, *lines[number:])), encoding="utf-8")
+                if not _remains(finding, file):
+                    break
+            else:
+                useless.append(str(finding))
+        file.write_bytes(table.table)
+    assert useless == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, Function, Parameter
-from router.compiler.expressions.kinds import FloatKind, is_list
+from router.compiler.expressions.kinds import FloatKind, fields_hint, is_list
 from router.compiler.expressions.lists import as_kind, as_value, elementwise
 from router.compiler.expressions.scope import ExpressionError, Scope
 from router.compiler.expressions.syntax import Parsed
@@ -21,6 +21,7 @@ def called_name(node: ast.Call, text: Parsed) -> str:
     if not isinstance(node.func, ast.Name):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
         known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
+        known = "write has(x)" if name == HAS else known
         hint = known or did_you_mean("", FUNCTIONS)
         raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
     if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
@@ -103,4 +104,5 @@ def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:
         if not isinstance(argument.kind, parameter.accepts):
             message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
             hint = _OF_FLOATS.get(function.name, "") if isinstance(argument.kind, FloatKind) else ""
+            hint = hint or fields_hint(argument.kind)
             raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message, hint)

@@ -17,9 +17,11 @@ from router.compiler.expressions.names import (
     constant_at,
     constant_path,
     field_path,
+    is_null,
     is_source,
     member_of,
     named,
+    no_null,
     presence,
     want_senders,
     whole_message,
@@ -66,7 +68,7 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
     if len(choices.values) > MOST_CHOICES:
         raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
     subject = check(choices.subject, scope)
-    keys: list[Node] = [_key(name, subject, scope) for name, _ in choices.values]
+    keys: list[Node] = [_key(name, subject, choices, scope) for name, _ in choices.values]
     _want_different(choices, keys)
     values = [check(value, scope, expected) for _, value in choices.values]
     if choices.otherwise is not None:
@@ -81,14 +83,16 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
     return replace(made, span=span)
 
 
-def _key(name: Located[str], subject: Node, scope: Scope) -> Node:
+def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> Node:
     """The value that a key of a map stands for: a name of the subject's enum, or a constant."""
     if isinstance(subject.kind, EnumKind):
         values = dict(subject.kind.enum.values)
         if name.value in values:
             return Constant(subject.kind, name.span, values[name.value])
         message = f"'{subject.kind.enum.name}' has no value '{name.value}'"
-        raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, values))
+        taken = {other.value for other, _ in choices.values}
+        free = {value: number for value, number in values.items() if value not in taken}
+        raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, free))
     if isinstance(subject.kind, StringKind):
         key = Constant(StringKind(), name.span, name.value)
         want_senders([subject, key], scope)
@@ -103,7 +107,7 @@ def _key(name: Located[str], subject: Node, scope: Scope) -> Node:
 
 
 def _key_hint(name: str, values: Mapping[str, int]) -> str:
-    """What to write for a key that is no name of an enum with these values."""
+    """What to write for a key that is no name of an enum of which the map lacks these values."""
     short = name.replace("::", ".").rpartition(".")[2]
     named = [short] if short in values else [value for value, number in values.items() if str(number) == name]
     if named:
@@ -182,6 +186,9 @@ class _Checker:
                 return self._binary(operators.want_binary(node.op, span), node, span)
             case ast.BoolOp():
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
+            case ast.Compare() if (other := self._beside_null(node)) is not None:
+                is_equal = isinstance(node.ops[0], (ast.Eq, ast.Is))
+                raise no_null(self.check(other), ast.unparse(other), span, is_equal=is_equal)
             case ast.Compare():
                 operands = [self.check(operand) for operand in (node.left, *node.comparators)]
                 want_senders(operands, self.scope)
@@ -195,6 +202,14 @@ class _Checker:
                 return self._call(node, span, expected)
             case _:
                 raise forbidden(node, span)
+
+    def _beside_null(self, node: ast.Compare) -> ast.expr | None:
+        """The `x` of `x == null`, `None != x` and `x is None`; None for other comparisons."""
+        if len(node.ops) > 1 or not isinstance(node.ops[0], (ast.Eq, ast.NotEq, ast.Is, ast.IsNot)):
+            return None
+        left, right = node.left, node.comparators[0]
+        nulls = [is_null(each, self.scope) for each in (left, right)]
+        return None if nulls[0] == nulls[1] else left if nulls[1] else right
 
     def _unary(self, op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
         if isinstance(op, ast.Not):

@@ -161,6 +161,17 @@ def element_of(kind: Kind) -> Kind | None:
     return kind.element if isinstance(kind, ListKind) else None
 
 
+_MOST_FIELDS = 4
+
+
+def fields_hint(kind: Kind) -> str:
+    """A hint for a message where a scalar is needed; empty for other kinds."""
+    if not isinstance(kind, MessageKind):
+        return ""
+    names = [member.name for member in kind.type.fields]
+    return f"name one of its fields: {', '.join(names[:_MOST_FIELDS])}{', ...' * (len(names) > _MOST_FIELDS)}"
+
+
 def is_list(kind: Kind) -> bool:
     """Whether a value of this kind has elements; text has none."""
     return isinstance(kind, (ListKind, BytesKind))

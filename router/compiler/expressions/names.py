@@ -8,7 +8,16 @@ from dataclasses import replace
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE
-from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, ListKind, MessageKind, StringKind, TimeKind
+from router.compiler.expressions.kinds import (
+    BoolKind,
+    EnumKind,
+    FloatKind,
+    Kind,
+    ListKind,
+    MessageKind,
+    StringKind,
+    TimeKind,
+)
 from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
 from router.compiler.expressions.syntax import Parsed, dotted
@@ -23,8 +32,9 @@ from router.compiler.expressions.tree import (
     Variable,
     constant_of,
 )
-from router.errors import Code, SourceSpan, did_you_mean, nearest
+from router.errors import Code, SourceSpan, did_you_mean, nearest, one_of
 from router.types.model import Enum, MessageType, String, Type
+from router.types.paths import leads, ways
 
 
 def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
@@ -46,29 +56,65 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> N
 
 
 def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> ExpressionError:
+    if text in scope.absent:
+        return ExpressionError(span, Code.UNKNOWN_FIELD, *scope.absent[text])
     if text in FUNCTIONS or text == HAS:
         return ExpressionError(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
     if scope.holders(text):
         return ExpressionError(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
+    message = f"{scope.message} has no field '{text}'"
     values = dict(expected.values) if isinstance(expected, Enum) else {}
     known = [*scope.field_names(), *scope.given, *values]
     if text.lower() in NOT_FINITE:
         known = [text.lower()]
+    if not scope.given:
+        return _no_constant(text, span, _of_an_enum(text, scope, expected), expected)
+    if isinstance(expected, String):
+        close = one_of(_ways(scope, (text,))) or (f"did you mean '{near}'?" if (near := nearest(text, known)) else "")
+        hint = f"{close} as text it is {{text: {text}}}".strip()
+        return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
     hint = (
-        _of_an_enum(text, scope)
+        _of_an_enum(text, scope, expected)
         or spellings.NAMES.get(text.lower())
         or (f"an endpoint's name is text: '{text}'" if text in scope.sources else "")
+        or _presence(text, scope)
+        or (one_of(_ways(scope, (text,))) if not nearest(text, known, _MISSPELT) else "")
         or did_you_mean(text, known)
-        or "only constants can stand here"
     )
-    if isinstance(expected, String):
-        close = nearest(text, known)
-        hint = (f"did you mean the field '{close}'? " if close else "") + f"as text it is {{text: {text}}}"
-    return ExpressionError(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
+    return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
 
 
-def _of_an_enum(text: str, scope: Scope) -> str:
+_MISSPELT = 0.9
+"""How near a name is to one of the message's own fields if it can only be that."""
+
+
+def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
+    """Where `names` can be read that are no path from the message itself."""
+    own = [prefix + ".".join(names) for prefix, message in scope.messages() if prefix and leads(message, names)]
+    return own or [
+        prefix + way for prefix, message in scope.messages() for way in ways(message, names, with_lists=True)
+    ]
+
+
+def _presence(text: str, scope: Scope) -> str:
+    """A hint for `has_air`, as protobuf in C and C++ names it."""
+    member = scope.message.field(text.removeprefix("has_"))
+    return f"did you mean 'has({member.name})'?" if member and member.has_presence else ""
+
+
+def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) -> ExpressionError:
+    """For a name in a message of constants."""
+    example = f"{expected}.{expected.values[0][0]}" if isinstance(expected, Enum) else "0"
+    message = f"'{text}' is no constant"
+    return ExpressionError(
+        span, Code.UNKNOWN_FIELD, message, hint or f"a deadman sends constants, such as {example}, and reads no message"
+    )
+
+
+def _of_an_enum(text: str, scope: Scope, expected: Type | None = None) -> str:
     """A hint for a value without its enum or ROS type; enums of the message's own fields come first."""
+    if isinstance(expected, Enum) and text.isupper() and (near := nearest(text, dict(expected.values))):
+        return f"did you mean '{near}'?"
     homes = [enum for enum in scope.enums if text in dict(enum.values)]
     types = [member.type for member in scope.message.fields]
     own = [home for home in homes if home in types] or homes
@@ -121,6 +167,23 @@ def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
     return scope.whole_message(text.span(holder)) if is_meant else None
 
 
+def is_null(node: ast.expr, scope: Scope) -> bool:
+    """Whether it is `None`, or `null` or the like and no field of that name."""
+    if isinstance(node, ast.Constant):
+        return node.value is None
+    return isinstance(node, ast.Name) and node.id.lower() in spellings.NULLS and node.id not in scope.field_names()
+
+
+def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -> ExpressionError:
+    """For a comparison of `written` with null."""
+    hint = f"'{written}' is always there"
+    if isinstance(compared, Read) and compared.field.has_presence:
+        hint = f"write `{'not ' * is_equal}has({written})`"
+    elif not isinstance(compared.kind, MessageKind):
+        hint += ": one that is left out has its default"
+    return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, "expressions have no null", hint)
+
+
 _OF_OTHERS = {
     ListKind: "only messages have fields: name an element, as in x[0].y",
     TimeKind: "seconds(x) makes a number of a time",
@@ -131,14 +194,37 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """`holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
-        hint = _OF_OTHERS.get(type(holder.kind), "only messages have fields")
+        hint = _of_elements(holder.kind, node) or _OF_OTHERS.get(type(holder.kind), "only messages have fields")
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:
-        hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         message = f"{holder.kind.type} has no field '{node.attr}'"
+        if found := _further(holder.kind.type, node, text):
+            raise ExpressionError(text.span(text.outermost(node)), Code.UNKNOWN_FIELD, message, one_of(found))
+        hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
     return _readable(field_of(holder, member, span))
+
+
+def _of_elements(kind: Kind, node: ast.Attribute) -> str:
+    """A hint for `list.name` where the list's elements have a field of that name."""
+    element = kind.element if isinstance(kind, ListKind) else None
+    if not isinstance(element, MessageKind) or element.type.field(node.attr) is None:
+        return ""
+    return f"its elements have one: did you mean '{ast.unparse(node.value)}[0].{node.attr}'?"
+
+
+def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str]:
+    """What `a.b.c` may mean where the message `a` has no `b`: `a.x.b.c`, or `a.c`."""
+    before = ast.unparse(node.value)
+    *_, names = ast.unparse(text.outermost(node)).partition(f"{before}.")
+    wanted = names.split(".")
+    if nearest(node.attr, [known.name for known in holder.fields], _MISSPELT):
+        return []
+    found = ways(holder, wanted, with_lists=True)
+    if not found and len(wanted) > 1 and leads(holder, wanted[1:]):
+        found = [".".join(wanted[1:])]
+    return [f"{before}.{way}" for way in found]
 
 
 def _readable(field: Read) -> Read:
@@ -151,9 +237,7 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     holder_name = ".".join(path[:-1])
     holders = scope.holders(holder_name)
     if not holders:
-        message = f"{scope.message} has no field or enum '{holder_name}'"
-        hint = _without_root(path, scope) or did_you_mean(holder_name, scope.holder_names() | set(scope.field_names()))
-        raise ExpressionError(text.span(node.value), Code.UNKNOWN_FIELD, message, hint)
+        raise _unknown_path(path, node, text, scope)
     found = [(holder, constants[node.attr]) for holder in holders if node.attr in (constants := _constants(holder))]
     if not found:
         known = {value for holder in holders for value in _constants(holder)}
@@ -170,11 +254,34 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     return replace(literal, kind=EnumKind(holder)) if isinstance(holder, Enum) else literal
 
 
-def _without_root(path: tuple[str, ...], scope: Scope) -> str:
-    """A hint for `msg.accel_x` and `math.pi`, which are written here without the first name."""
-    if path[1] in scope.field_names():
-        return f"write {'.'.join(path[1:])}: a name is a field of the message"
-    return spellings.NAMES.get(path[-1].lower(), "")
+def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> ExpressionError:
+    """For `a.b.c` if nothing is named `a`."""
+    whole, holder_name = text.span(node), ".".join(path[:-1])
+    if path[0] in scope.absent:
+        return ExpressionError(whole, Code.UNKNOWN_FIELD, *scope.absent[path[0]])
+    if not scope.given and not path[0][0].isupper():
+        return _no_constant(".".join(path), whole, _of_an_enum(path[-1], scope), None)
+    message = f"{scope.message} has no field or enum '{holder_name}'"
+    fields, enums = scope.field_names(), scope.holder_names()
+    if not nearest(path[0], fields, _MISSPELT) and (found := _ways(scope, path) or _without_root(path, scope)):
+        return ExpressionError(whole, Code.UNKNOWN_FIELD, message, one_of(found))
+    if found := ways(scope.message, path[:1]):
+        first = replace(whole, end_column=whole.column + len(path[0]))
+        return ExpressionError(first, Code.UNKNOWN_FIELD, message, one_of(found))
+    hint = spellings.NAMES.get(path[-1].lower(), "")
+    if not hint and (near := nearest(path[0], fields)) and not nearest(holder_name, enums):
+        first = replace(whole, end_column=whole.column + len(path[0]))
+        return ExpressionError(first, Code.UNKNOWN_FIELD, message, f"did you mean '{near}'?")
+    known = enums if path[0][0].isupper() else {*fields, *enums} if nearest(holder_name, enums) else fields
+    return ExpressionError(text.span(node.value), Code.UNKNOWN_FIELD, message, hint or did_you_mean(holder_name, known))
+
+
+def _without_root(path: tuple[str, ...], scope: Scope) -> list[str]:
+    """What `msg.accel_x` may mean, which is written here without the first name."""
+    for rest in (path[start:] for start in range(1, len(path))):
+        if found := [".".join(rest)] if leads(scope.message, rest) else _ways(scope, rest):
+            return found
+    return []
 
 
 def _constants(holder: Enum | MessageType) -> Mapping[str, object]:

@@ -26,6 +26,7 @@ from router.compiler.expressions.kinds import (
     TimeKind,
     as_int,
     element_of,
+    fields_hint,
     float_bits,
     is_list,
     join,
@@ -44,6 +45,7 @@ from router.compiler.expressions.tree import (
     Logic,
     Node,
     Operator,
+    Read,
     Relation,
     Unary,
     constant_of,
@@ -219,7 +221,7 @@ def _want_number(operand: Node) -> None:
     if not isinstance(operand.kind, Number):
         hint = {BoolKind: "int() makes a number of a bool", StringKind: "str(x), or text(x, 2), makes text of a number"}
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
-                      hint.get(type(operand.kind), ""))  # fmt: skip
+                      hint.get(type(operand.kind), "") or fields_hint(operand.kind))  # fmt: skip
 
 
 # truth
@@ -313,8 +315,19 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
     return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 
 
+def presence_hint(operand: Node) -> str:
+    """A hint for a message in place of a bool; empty for anything else, or if it is always there."""
+    if not isinstance(operand, Read) or not isinstance(operand.kind, MessageKind) or not operand.field.has_presence:
+        return ""
+    names, holder = [operand.field.name], operand.holder
+    while isinstance(holder, Read):
+        names.insert(0, holder.field.name)
+        holder = holder.holder
+    return f"write `has({'.'.join(names)})`"
+
+
 def want_bool(operand: Node, word: str) -> None:
     if not isinstance(operand.kind, BoolKind):
         hint = _OF_LISTS if is_list(operand.kind) else ""
-        hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else hint
+        hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else hint or presence_hint(operand)
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"'{word}' takes a bool, not {operand.kind}", hint)

@@ -23,7 +23,7 @@ class Scope:
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
     variables beside the message's fields; they win over fields of the same name. `given` are those of
     MESSAGE, SOURCE and RECEIVED_AT that can be named. `sources` are the values that SOURCE can have, empty if they are
-    not known.
+    not known. `absent` are names that a missing key of the route would define, each with what is wrong and what to do.
     """
 
     message: MessageType
@@ -32,6 +32,7 @@ class Scope:
     names: Mapping[str, Node] = field(default_factory=dict)
     given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
     sources: Collection[str] = ()
+    absent: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     _elements: Iterator[int] = field(default_factory=lambda: count(1))
 
     def element_variable(self) -> str:
@@ -57,6 +58,11 @@ class Scope:
         own = [enum for enum in named if enum.name == f"{self.message.name}.{text}"]
         exact = [enum for enum in named if enum.name == text]
         return list(own or exact or named) + [ros for ros in self.ros_types if ros.short_name == text]
+
+    def messages(self) -> list[tuple[str, MessageType]]:
+        """The messages whose fields can be read, each with what stands before a field's name."""
+        kinds = [(f"{name}.", node.kind) for name, node in self.names.items()]
+        return [("", self.message), *((prefix, kind.type) for prefix, kind in kinds if isinstance(kind, MessageKind))]
 
     def whole_message(self, span: SourceSpan) -> Variable:
         return Variable(MessageKind(self.message), span, MESSAGE)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
+from typing import NamedTuple
 
 CONDITIONAL = "write `b if a else c`"
 LEFT_OUT = (
@@ -19,7 +21,8 @@ BITS = "there are no operations on bits; `{}` is for bools"
 FLOAT = "write float64(x), or float32(x)"
 
 _SYNTAX = (
-    (r"\?\?|\?\.", LEFT_OUT),
+    (r"\?\?", "write `x if has(x) else y` for `x ?? y`"),
+    (r"\?\.", LEFT_OUT),
     (r"\?", f"{CONDITIONAL} for `a ? b : c`"),
     (r"&&", "write `and` for `&&`"),
     (r"\|\|", "write `or` for `||`"),
@@ -50,10 +53,46 @@ _SYNTAX = (
 )
 """What to search in an expression that Python cannot parse, in this order."""
 
+_UNIT = re.compile(
+    r"(?P<value>[\w.]*)(?<=[\w)\]])\s*(?P<unit>%|\u2030|\u00b0[CF]?|(?<![A-Za-z_])(?:k?m/h|m/s(?:\^?2|\u00b2)?|rad/s|deg/s|[kMG]?Hz|rpm|[mcdk]?m|[mu\u00b5n]?s|min|h"
+    r"|degrees|degree|deg|rad|(?:milli|centi|kilo)?met(?:er|re)s?|seconds?|minutes?|hours?|volts?|amperes?|percent|hertz|[mk]?V|m?A|k?W|Nm|N|k?g|h?k?Pa|m?bar|lx|[um\u00b5]?T|[kM]i?B|ppm))"
+    r"(?=\s*(?:$|[-+*/),\]<>=]|(?:if|else|and|or|in)\b))"
+)
+_WITHOUT_VALUE = re.compile(
+    r"(?P<sign>[-+*/%<>=!&|^]+(?=\s*(?:$|[),\]]|(?:and|or|if|else)\b))|\b(?:and|or|not|in|is|if|else)$)"
+)
+
+
+class Slip(NamedTuple):
+    """What makes an expression none, from where to where, and what to do."""
+
+    place: tuple[int, int]
+    what: str
+    hint: str
+
+
+def slip(text: str, names: Collection[str]) -> Slip | None:
+    """A unit, or an operator that lacks an operand, in what cannot be parsed; else None. `names` are no units."""
+    bare = _QUOTED.sub(lambda quoted: "_" * len(quoted[0]), text)
+    for found in _UNIT.finditer(bare):
+        unit = found["unit"]
+        if unit not in names:
+            value = found["value"] or "x"
+            hint = "remove it, and write the value in the field's own unit"
+            hint = f"write radians({value})" if unit in _DEGREES else hint
+            hint = f"write {value} / 100 for a share" if unit == "%" else hint
+            return Slip(found.span("unit"), f"'{unit}' is a unit, and expressions have none", hint)
+    if sign := _WITHOUT_VALUE.search(bare):
+        return Slip(sign.span("sign"), f"a value is missing after '{sign['sign']}'", "")
+    return None
+
+
+_DEGREES = ("degrees", "degree", "deg", "\u00b0")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 
+NULLS = ("null", "nil", "none", "undefined", "nullptr")
 NAMES = {
-    **dict.fromkeys(("null", "nil", "undefined"), LEFT_OUT),
+    **dict.fromkeys(NULLS, LEFT_OUT),
     **dict.fromkeys(("pi", "m_pi"), "write 3.141592653589793; radians(x) and degrees(x) turn angles"),
     **dict.fromkeys(("now", "time", "stamp", "timestamp"), ARRIVAL),
     **dict.fromkeys(("infinity", "infinityf"), "write inf"),
@@ -80,6 +119,7 @@ FUNCTIONS = {
     "constrain": "write clamp(x, low, high)",
     **dict.fromkeys(("rad", "deg2rad", "to_radians", "degtorad"), "write radians(x)"),
     **dict.fromkeys(("deg", "rad2deg", "to_degrees", "radtodeg"), "write degrees(x)"),
+    **dict.fromkeys(("hasfield", "has_field", "exists", "defined", "isset", "is_set", "is_present"), "write has(x)"),
     "to_string": "write str(x), or text(x, 2) for decimals",
     **dict.fromkeys(("avg", "mean", "average"), "write sum(x) / len(x)"),
     **dict.fromkeys(("any", "all"), "write `value in x`, or compare min(x) or max(x)"),

@@ -47,9 +47,11 @@ class Parsed:
                 return _with_words(ast.parse(text, mode="eval").body)
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
-            message = f"not an expression: {reason}"
             hint = self._of_word(text) or spellings.of_syntax(self._expression.text)
-            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint) from None
+            if found := spellings.slip(text, self._names):
+                span, reason = self._expression.place.part(*(self._indent + at for at in found.place)), found.what
+                hint = found.hint
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise ExpressionError(
                 self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}"
@@ -76,6 +78,13 @@ class Parsed:
         """The span of the last name of `a.b.c`."""
         end = self._characters(node.end_col_offset or 0)
         return self._expression.place.part(end - len(node.attr), end)
+
+    def outermost(self, node: ast.Attribute) -> ast.Attribute:
+        """`a.b.c.d` for the `a.b` in it."""
+        holders = {id(each.value): each for each in ast.walk(self.tree) if isinstance(each, ast.Attribute)}
+        while outer := holders.get(id(node)):
+            node = outer
+        return node
 
     def _characters(self, offset: int) -> int:
         """The offset in characters for one in UTF-8 bytes, which ast counts."""

@@ -1,0 +1,59 @@
+"""Paths to fields of messages in messages: what a name means that is written without the names before it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from router.errors import nearest
+from router.types.model import List, MessageType
+
+DEEPEST = 2
+"""Messages between the one that a path begins in and the one that has its first name."""
+_ALIKE = 0.8
+"""How near a misspelt name further down is to be suggested."""
+
+
+def leads(message: MessageType, names: Sequence[str]) -> bool:
+    """Whether `names` is a path from the message to a field."""
+    *way, last = names
+    holder = message
+    for name in way:
+        member = holder.field(name)
+        if member is None or not isinstance(member.type, MessageType):
+            return False
+        holder = member.type
+    return holder.field(last) is not None
+
+
+def ways(message: MessageType, names: Sequence[str], *, with_lists: bool = False) -> list[str]:
+    """The paths, shortest first, that end in `names`; else those that end in a name that is near a single one.
+
+    `with_lists` they may go through the first element of a list, as in `samples[0].value`.
+    """
+    below = list(_below(message, with_lists=with_lists))
+    wanted = ".".join(names)
+    if exact := [prefix + wanted for prefix, holder in below if leads(holder, names)]:
+        return exact
+    if len(names) > 1:
+        return []
+    near = nearest(wanted, [member.name for _, holder in below for member in holder.fields], _ALIKE)
+    return [f"{prefix}{near}" for prefix, holder in below if near and holder.field(near)]
+
+
+def _below(message: MessageType, *, with_lists: bool) -> Iterator[tuple[str, MessageType]]:
+    """The messages in a message, each with the path to its fields; those in lists come last."""
+    level: list[tuple[str, MessageType]] = [("", message)]
+    behind: list[tuple[str, MessageType]] = []
+    for _ in range(DEEPEST):
+        inner: list[tuple[str, MessageType]] = []
+        for prefix, holder in level:
+            for member in holder.fields:
+                if isinstance(member.type, MessageType) and not member.is_group:
+                    inner.append((f"{prefix}{member.name}.", member.type))
+                elif with_lists and isinstance(member.type, List):
+                    element = member.type.element
+                    if isinstance(element, MessageType) and not element.is_map_entry:
+                        behind.append((f"{prefix}{member.name}[0].", element))
+        yield from inner
+        level = inner
+    yield from behind
