@@ -149,7 +149,7 @@ class _Builder:
         self.findings: list[Diagnostic] = []
         self._whole = set[tuple[str, ...]]()
         self._taken = set[tuple[str, ...]]()
-        self._reported = set[SourceSpan]()
+        self._reported = set[tuple[tuple[str, ...], SourceSpan]]()
 
     # entries by field
 
@@ -187,9 +187,9 @@ class _Builder:
     def _unknown(self, entry: FieldEntry, depth: int, holder: MessageType) -> None:
         """Report that `holder` has no field of the name at `depth`, once for a key that stands above several others."""
         name, span = entry.path[depth], entry.path_spans[depth]
-        if span in self._reported:
+        if (entry.path[: depth + 1], span) in self._reported:
             return
-        self._reported.add(span)
+        self._reported.add((entry.path[: depth + 1], span))
         free = [member.name for member in holder.fields if (*entry.path[:depth], member.name) not in self._taken]
         first, last = _of_one_key(entry.path_spans, depth)
         hint = did_you_mean(name, free or [member.name for member in holder.fields])

@@ -150,7 +150,7 @@ def test_text_stands_for_itself(word: str) -> None:
 def test_a_bare_word_is_an_error_that_says_both_readings() -> None:
     [finding] = build(field_map(word="nam"), TARGET, scope_of(SOURCE), SPAN).findings
     assert finding.code is Code.UNKNOWN_FIELD
-    assert "did you mean the field 'name'?" in finding.hint
+    assert "did you mean 'name'?" in finding.hint
     assert "{text: nam}" in finding.hint
 
 

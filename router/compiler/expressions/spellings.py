@@ -54,12 +54,12 @@ _SYNTAX = (
 """What to search in an expression that Python cannot parse, in this order."""
 
 _UNIT = re.compile(
-    r"(?P<value>[\w.]*)(?<=[\w)\]])\s*(?P<unit>%|\u2030|\u00b0[CF]?|(?<![A-Za-z_])(?:k?m/h|m/s(?:\^?2|\u00b2)?|rad/s|deg/s|[kMG]?Hz|rpm|[mcdk]?m|[mu\u00b5n]?s|min|h"
+    r"(?<=[\w)\]])\s*(?P<unit>%|\u2030|\u00b0[CF]?|(?<![A-Za-z_])(?:k?m/h|m/s(?:\^?2|\u00b2)?|rad/s|deg/s|[kMG]?Hz|rpm|[mcdk]?m|[mu\u00b5n]?s|min|h"
     r"|degrees|degree|deg|rad|(?:milli|centi|kilo)?met(?:er|re)s?|seconds?|minutes?|hours?|volts?|amperes?|percent|hertz|[mk]?V|m?A|k?W|Nm|N|k?g|h?k?Pa|m?bar|lx|[um\u00b5]?T|[kM]i?B|ppm))"
     r"(?=\s*(?:$|[-+*/),\]<>=]|(?:if|else|and|or|in)\b))"
 )
 _WITHOUT_VALUE = re.compile(
-    r"(?P<sign>[-+*/%<>=!&|^]+(?=\s*(?:$|[),\]]|(?:and|or|if|else)\b))|\b(?:and|or|not|in|is|if|else)$)"
+    r"(?P<sign>(?<![-+*/%<>=!&|^])[-+*/%<>=!&|^]+(?=\s*(?:$|[),\]]|(?:and|or|if|else)\b))|\b(?:and|or|not|in|is|if|else)$)"
 )
 
 
@@ -77,7 +77,7 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
     for found in _UNIT.finditer(bare):
         unit = found["unit"]
         if unit not in names:
-            value = found["value"] or "x"
+            value = _word_before(bare[: found.start()]) or "x"
             hint = "remove it, and write the value in the field's own unit"
             hint = f"write radians({value})" if unit in _DEGREES else hint
             hint = f"write {value} / 100 for a share" if unit == "%" else hint
@@ -85,6 +85,12 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
     if sign := _WITHOUT_VALUE.search(bare):
         return Slip(sign.span("sign"), f"a value is missing after '{sign['sign']}'", "")
     return None
+
+
+def _word_before(text: str) -> str:
+    """The name or number at the end of a text; read backwards, so that the time is linear."""
+    word = re.match(r"[\w.]*", text[::-1])
+    return word[0][::-1] if word else ""
 
 
 _DEGREES = ("degrees", "degree", "deg", "\u00b0")
