@@ -9,11 +9,8 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-
-import yaml
 
 from router.app import Router, tune_interpreter
 from router.app.process import supervised
@@ -21,9 +18,10 @@ from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, good_table, table_path
 from router.compiler.program import Program
-from router.errors import StartError, UsageError
+from router.errors import UsageError
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log, logger
+from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
 from router.table.model import Gateway, Transport
 from router.tools.udp import reachable
 
@@ -38,8 +36,6 @@ _EXAMPLES = (
     "router run routes/sim.yaml",
     "router run --ros-args -p routes_path:=routes/legacy.yaml -p listen_port:=5001",
 )
-
-_ROUTES_PATH = "routes_path"
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -57,8 +53,9 @@ def run(args: argparse.Namespace) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
-    environ = {**os.environ, **table_variables(parameters)}
-    program = good_table(_table(args, parameters.get(_ROUTES_PATH)), environ)[1]  # a reload can free the rest
+    environ = Variables(os.environ, table_variables(parameters))
+    program = good_table(_table(args, parameters.get(ROUTES_PATH)), environ)[1]  # a reload can free the rest
+    _warn_of(without_effect(args.ros_args, program, environ.asked))
     route(program, args.ros_args, environ)
     return OK
 
@@ -69,7 +66,7 @@ def _table(args: argparse.Namespace, parameter: str | None) -> Path:
         return table_path(args)
     typed: Path | None = args.subject or args.table
     if typed is not None and table_path(args).resolve() != Path(parameter).resolve():
-        raise UsageError(f"TABLE is {typed}, {_ROUTES_PATH} is {parameter}", "name one table")
+        raise UsageError(f"TABLE is {typed}, {ROUTES_PATH} is {parameter}", "name one table")
     return typed or Path(parameter)
 
 
@@ -128,37 +125,6 @@ def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
                 return
 
 
-def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
-    """Parse `["-p", "listen_port:=5001"]` to `{"listen_port": "5001"}`, also `--params-file`, which `ros2 launch` uses.
-
-    The last value wins, as in ROS. Node names of parameters are ignored. Raises StartError.
-    """
-    parameters: dict[str, str] = {}
-    for option, word in pairwise(ros_args):
-        name, assigned, value = word.partition(":=")
-        if option in ("-p", "--param") and assigned:
-            parameters[name.rpartition(":")[2]] = value.strip("'\"")
-        elif option == "--params-file":
-            parameters.update((name, str(value)) for name, value in _parameters(_read_yaml(Path(word))))
-    return parameters
-
-
-def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
-    """The table's variables that ROS parameters set: `listen_port` is `${LISTEN_PORT}`."""
-    return {name.upper(): value for name, value in parameters.items() if name != _ROUTES_PATH}
-
-
-def _read_yaml(path: Path) -> object:
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise StartError(f"the parameter file {path} cannot be read: {error}") from error
-
-
-def _parameters(tree: object) -> Iterator[tuple[str, object]]:
-    """Yield the parameters of all nodes, in any depth of namespaces."""
-    for key, value in tree.items() if isinstance(tree, dict) else ():
-        if key == "ros__parameters" and isinstance(value, dict):
-            yield from ((str(name), member) for name, member in value.items())
-        else:
-            yield from _parameters(value)
+def _warn_of(unread: Iterable[tuple[str, str]]) -> None:
+    for argument, remedy in unread:
+        logger.warning("a ROS argument has no effect", argument=argument, remedy=remedy)

@@ -249,6 +249,8 @@ REMEDIES: Mapping[str, str] = {
     "unknown_case": "The sender's protos are newer than the router's: update them.",
     "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
     "truncated": "They are longer than the router takes.",
+    "no_payload": "They are envelopes whose sender sets no payload: `router tap --only rejected` shows who sends them.",
+    "empty": "They have no bytes: `router tap --only rejected` shows who sends them.",
 }
 """By the reason of a loss."""
 

@@ -128,6 +128,16 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
     end(process)
 
 
+def test_a_misspelt_ros_parameter_is_named_at_the_start(table: Path) -> None:
+    process = start(MODULE, "run", table, "--ros-args", "-p", "listen_prot:=9")
+    assert process.stderr
+    said = json.loads(next(line for line in process.stderr if "listen_prot" in line))
+    assert (said["level"], said["argument"]) == ("warning", "-p listen_prot")
+    assert said["remedy"] == "did you mean 'listen_port'?"
+    wait_for_start(process)
+    end(process)
+
+
 DEADMAN = "    deadman: {timeout: 500ms, send: {ph_info: {}}, to: [basestation]}\n"
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from router.cli import BAD_TABLE, BAD_USAGE, main
-from router.cli.run import ros_parameters, table_variables
 from router.errors import StartError
+from router.ros.arguments import ros_parameters, table_variables
 
 Run = Callable[..., tuple[int, str]]
 BROKEN = "version: 1\nnobody: knows\n"

@@ -338,6 +338,11 @@ def test_every_kind_has_words_of_labels_of_its_metric(kind: Kind) -> None:
     assert Problem.of(json.loads(json.dumps(problem.json()))) == problem
 
 
+def test_each_reason_to_reject_a_datagram_has_a_remedy() -> None:
+    meant = {*metrics.INTENDED_REASONS, "unhandled"}
+    assert {*metrics.REJECT_REASONS} - meant <= REMEDIES.keys()
+
+
 def test_remedies_are_of_reasons_that_there_are() -> None:
     assert REMEDIES.keys() <= {*metrics.DROP_REASONS, *metrics.REJECT_REASONS, *metrics.GATEWAY_REJECT_REASONS}
 
