@@ -66,6 +66,12 @@ def key(metric: str, **labels: str) -> str:
     return f"{metric}{{{','.join(f'{name}={json.dumps(labels[name])}' for name in sorted(labels))}}}"
 
 
+def samples_in(text: str) -> dict[str, float]:
+    """The samples of /metrics, without the prefix `router_` and the label `command`, which follows from others."""
+    lines = (_COMMAND.sub("", line).rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
+    return {name[len("router_") :]: float(value) for name, _, value in lines}
+
+
 def wait_until(condition: Callable[[], bool], what: str = "it") -> None:
     deadline = monotonic() + PATIENCE
     while not condition():
@@ -186,14 +192,10 @@ class Site:
         )
 
     def samples(self) -> dict[str, float]:
-        """Everything that the router tells of itself, without the prefix `router_`.
-
-        Without the label `command`, which follows from the others.
-        """
+        """Everything that the router tells of itself."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics}/metrics", timeout=PATIENCE) as answer:
             text = answer.read().decode()
-        lines = (_COMMAND.sub("", line).rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
-        return {name[len("router_") :]: float(value) for name, _, value in lines}
+        return samples_in(text)
 
     def changes(self, before: Counter[str]) -> Counter[str]:
         """What was counted since `before`, without what stayed as it was."""

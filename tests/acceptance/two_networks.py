@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.ros_peer import PATIENCE
-from tests.acceptance.site import ROOT, RouterProcess, key
+from tests.acceptance.site import ROOT, RouterProcess, key, samples_in
 from tests.namespaces import Computer, cable, computers
 
 BASESTATION, BOARD = ("10.78.2.10", 9000), ("10.78.1.222", 8)
@@ -48,8 +48,7 @@ class Rover:
             with urllib.request.urlopen("http://127.0.0.1:9108/metrics", timeout=PATIENCE) as answer:
                 return str(answer.read().decode())
 
-        lines = (line.rpartition(" ") for line in self.rover.inside(ask).splitlines() if line.startswith("router_"))
-        return {name[len("router_") :]: float(value) for name, _, value in lines}
+        return samples_in(self.rover.inside(ask))
 
     def board_gets(self) -> list[bytes]:
         """What reached the board and was not looked at yet, but for what deadmen say to it."""
