@@ -67,7 +67,7 @@ GROUPS = {
         "send": "send envelopes with payloads of your choice",
     },
     "Protocol": {
-        "new": "add a message: proto, lock, ROS message, route and test",
+        "new": "add a message to a checkout of the rover, in all its files",
         "schema": "lock the field numbers of the protobuf messages",
     },
 }

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from router.tools.new_message import NewMessage, Site
     from router.tools.new_message_files import Written
 
-_DESCRIPTION = """Add a message that a board sends: its .proto file, its number in the envelope and in the lock, the ROS
-message, a route from the board to ROS and the basestation, and a test of it. Files keep their comments and their
-layout. What cannot be is refused, and then nothing is written."""
+_DESCRIPTION = """Add a message of a board to a checkout of the rover: its .proto file, its number in
+the envelope and in the lock, the ROS message in schemas/comms, a route from the board to ROS and the basestation, and a
+test of it. Files keep their comments and their layout. What cannot be is refused, and then nothing is written. A table
+of your own, elsewhere, needs no such command: write message and route, then run 'router schema lock'."""
 _FIELDS = """such as `dose_rate:float state:SensorState`, or, with its unit, a single 'dose_rate:float # uSv/h'; types
 are bool, float, double, int32, int64, uint32, uint64, and enums and messages of the protos"""
 
