@@ -163,9 +163,9 @@ def unknown_keys(
             before = name, entry
             continue
         written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
-        free = [key for key in known if key not in written] or known
+        free = [key for key in known if key not in written]
         said_otherwise = hints.behind(name, entry, before) or hints.in_other_words(name, known)
-        hint = said_otherwise or hints.for_key(name, entry.value, path, free)
+        hint = said_otherwise or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
         said.add(hints.in_other_words(name, known) or None)
