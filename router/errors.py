@@ -280,12 +280,14 @@ def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | No
         start, ends = "", folded
     found = {candidate: _likeness(candidate, wanted) for candidate in ends}
     best = max(found.values(), default=0.0)
-    if best >= closeness:
+    if best >= closeness or (start and closeness < 1 and best > _HALF):
         return ends[min(each for each, likeness in found.items() if likeness == best)]
     longer = [candidate for candidate in ends if len(wanted) >= _SHORTEST and candidate.startswith(wanted)]
     return ends[longer[0]] if len(longer) == 1 and closeness < 1 else None
 
 
+_HALF = 0.5
+"""Likeness from which on the ends of names with a common start are near: in `MODE_OM` one of two letters is right."""
 _SHORTEST = 3
 """Letters with which a name begins that stand for all of it."""
 

@@ -7,6 +7,7 @@ import json
 import socket
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Any
 
 from google.protobuf.json_format import MessageToDict
@@ -54,7 +55,8 @@ class Condition:
             except (ExpressionError, TooLargeError) as error:
                 findings[case.name] = error.diagnostic
         if not self._conditions:
-            likely = min(findings.values(), key=lambda each: not each.hint.startswith("did you mean"))
+            # The hint that is most like what was written.
+            likely = max(findings.values(), key=lambda each: SequenceMatcher(a=each.hint, b=text).ratio())
             raise UsageError(f"--where: {likely.message}", likely.hint)
 
     @property

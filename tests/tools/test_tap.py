@@ -101,7 +101,7 @@ def test_cases_without_the_field_are_left_out() -> None:
     [
         ("satelites < 4", "--where: SensorBoardGPSInfo has no field 'satelites'; did you mean 'satellites'?"),
         ("satellites", "--where: it is int32, not a bool; compare something, as in speed > 0"),
-        ("satellites <", "--where: not an expression: invalid syntax"),
+        ("satellites <", "--where: not an expression: a value is missing after '<'"),
         ("__import__('os')", "--where: "),
     ],
 )
