@@ -294,7 +294,7 @@ def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
     assert page.evaluate("document.querySelectorAll('.silent, .troubled').length") == 0
     running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
     until_said(page, "arm_board is silent", "warn")
-    assert others(page).startswith("□ manual_drive is halted: no commands for 27 min, and basestation is silent")
+    assert others(page).startswith("□manual_drive is halted: no commands for 27 min, and basestation is silent")
 
 
 def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: FakeHealth, page: Page) -> None:
