@@ -27,14 +27,15 @@ from router.compiler.expressions.kinds import (
     kind_of,
 )
 from router.compiler.expressions.tree import (
+    MESSAGE,
     Binary,
     Each,
     Listed,
     Node,
+    Read,
     Unary,
     Variable,
     constant_of,
-    path_of,
 )
 from router.compiler.mapping import build
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -53,6 +54,16 @@ from tests.compiler.generated_types import values
 from tests.compiler.machine import FAILURES
 from tests.compiler.reading import TIMES
 from tests.oracles.reference_expressions import evaluate
+
+
+def path_of(node: Node) -> tuple[str, ...] | None:
+    """The path of a field of the source message, or of the message itself; None for everything else."""
+    names: list[str] = []
+    while isinstance(node, Read):
+        names.append(node.field.name)
+        node = node.holder
+    return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
+
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
 INNER = MessageType("Inner", (Field("value", Int(16, True)), Field("ratio", Float(64))))

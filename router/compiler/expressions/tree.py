@@ -15,9 +15,6 @@ from router.compiler.expressions.kinds import IntKind, Kind, ListKind
 from router.errors import SourceSpan
 from router.types.model import Field
 
-Path = tuple[str, ...]
-"""The names that lead from the source message to a field of it; the empty path is the message."""
-
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 """Variables that every expression can name beside the fields; a field of the same name wins."""
 
@@ -223,15 +220,6 @@ def constant_bytes(octets: Call) -> bytes | None:
 def whole(number: int, span: SourceSpan) -> Constant:
     """An integer."""
     return Constant(IntKind(number, number), span, number)
-
-
-def path_of(node: Node) -> Path | None:
-    """The path of a field of the source message, or of the message itself; None for everything else."""
-    names: list[str] = []
-    while isinstance(node, Read):
-        names.append(node.field.name)
-        node = node.holder
-    return tuple(reversed(names)) if isinstance(node, Variable) and node.name == MESSAGE else None
 
 
 def parts_of(node: Node) -> Iterator[Node]:
