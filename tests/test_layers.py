@@ -10,30 +10,32 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors assets clock log threads"
-LANGUAGE = "declared errors assets table types compiler"
+GROUND = "declared errors inputs assets clock log threads"
+LANGUAGE = "declared errors inputs assets table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
+    "inputs": "declared",
     "assets": "",
     "clock": "",
     "log": "clock errors",
     "threads": "clock log",
-    "table": "errors assets",
-    "types": "declared errors assets",
+    "table": "errors inputs assets",
+    "types": "declared errors inputs assets",
     "values": "errors types",
-    "compiler": "declared errors assets table types",
+    "compiler": "declared errors inputs assets table types",
     "datagrams": "declared errors table types",
     "net": f"{GROUND} {LANGUAGE} datagrams",
     "carrier": f"{GROUND} {LANGUAGE} datagrams net",
+    "kept": f"{GROUND} {LANGUAGE} datagrams net carrier",
     "ros": f"{GROUND} {LANGUAGE}",
     "gateway": f"{GROUND} {LANGUAGE} datagrams net carrier ros",
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
     "rehearsal": f"{LANGUAGE} values datagrams carrier recording",
     "tools": f"{GROUND} {LANGUAGE} values datagrams net carrier ros gateway recording observe rehearsal",
-    "app": f"{GROUND} {LANGUAGE} values datagrams net carrier ros gateway recording observe",
-    "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools carrier app",
+    "app": f"{GROUND} {LANGUAGE} values datagrams net carrier kept ros gateway recording observe",
+    "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools carrier kept app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
