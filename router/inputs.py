@@ -1,22 +1,35 @@
 """What a compile reads: files, folders, links and variables. While a recording is open, each is noted with its value.
 
-A kept program is used if all of its inputs still have these values (`changed`). A start does so before it imports
-anything large, so this module imports only small ones.
+Whatever a compile reads, it reads by the functions here. A kept program is used if all of its inputs still have the
+same values (`changed`). A start looks at them before it imports anything large, so this module imports small ones.
 """
 
 from __future__ import annotations
 
 import os
+import stat
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import TypeAlias
 
     Plain: TypeAlias = tuple[tuple[str, str, object], ...]
-    """(kind, name, value) of each input, sorted."""
+    """(kind, name, value) of each input, sorted. A value that cannot be had is the number of the error."""
+    Listing: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
+    """The folders and the other files in a folder, sorted."""
+
+_PACKAGE = os.path.dirname(os.path.abspath(__file__))
+_SCHEMAS = os.path.join(os.path.dirname(_PACKAGE), "schemas")
+"""In a checkout; read once, like the code. In an installation it is within the package."""
+_ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
+_OF_ROS = ("AMENT_", "RMW_", "ROS_")
+_UNSTEADY = "changed while it was read"
 
 
 class Inputs:
@@ -24,30 +37,247 @@ class Inputs:
 
     def __init__(self) -> None:
         self._values: dict[tuple[str, str], object] = {}
+        try:
+            self._folder = os.getcwd()
+        except FileNotFoundError:  # it was deleted; no relative path leads anywhere
+            self._folder = ""
 
     def plain(self) -> Plain:
-        """All inputs, as values that `marshal` takes. Equal for compiles that read the same."""
-        return tuple((kind, name, value) for (kind, name), value in sorted(self._values.items()))
+        """All inputs, as values that `marshal` takes. Equal for compiles that have read the same."""
+        return tuple((kind, name, value) for (kind, name), value in sorted(self._values.items(), key=_key))
+
+    def note(self, kind: str, name: str, value: object) -> None:
+        """Note a value. An input that had another one earlier in the recording gets one that is never found again."""
+        if kind in _OF_FILES:
+            name = os.path.join(self._folder, name)
+        before = self._values.setdefault((kind, name), value)
+        if before != value:
+            self._values[kind, name] = _UNSTEADY
+
+    def add(self, other: Inputs) -> None:
+        """Note everything that is in `other`."""
+        for (kind, name), value in other._values.items():
+            self.note(kind, name, value)
+
+    def read_again(self) -> bool:
+        """Read everything again. Return whether all is the same; only then it is noted in the open recording."""
+        if any(_PROBES[kind](name) != value for (kind, name), value in self._values.items()):
+            return False
+        if (outer := _open.get()) is not None:
+            outer.add(self)
+        return True
 
 
-_current: ContextVar[Inputs | None] = ContextVar("inputs", default=None)
+def _key(item: tuple[tuple[str, str], object]) -> tuple[str, str]:
+    return item[0]
+
+
+_open: ContextVar[Inputs | None] = ContextVar("inputs", default=None)
 
 
 @contextmanager
-def recording() -> Iterator[Inputs]:
-    """Note what this thread reads, and what it is run by: this installation, this Python, variables of ROS."""
-    inputs = Inputs()
-    token = _current.set(inputs)
+def noted() -> Iterator[Inputs]:
+    """Note what this thread reads, also in the recording around this one."""
+    outer, inner = _open.get(), Inputs()
+    token = _open.set(inner)
     try:
-        yield inputs
+        yield inner
     finally:
-        _current.reset(token)
+        _open.reset(token)
+        if outer is not None:
+            outer.add(inner)
+
+
+@contextmanager
+def recording(before: Inputs | None = None) -> Iterator[Inputs]:
+    """Note what this thread reads, what was read `before`, and what runs it: the installation and variables of ROS."""
+    with noted() as inputs:
+        for kind, names in (("installation", _installation()), ("variables", _OF_ROS)):
+            for name in names:
+                inputs.note(kind, name, _PROBES[kind](name))
+        if before is not None:
+            inputs.add(before)
+        yield inputs
 
 
 def changed(plain: Plain) -> str:
     """Which input has another value now, in words; "" if none has."""
+    for kind, name, value in plain:
+        if _PROBES[kind](name) != value:
+            return _WORDS[kind].format(name)
     return ""
 
 
-ENVIRONMENT: Mapping[str, str] = os.environ
-"""The environment; notes which variables are read."""
+def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
+    """The content of a file, or its first bytes. Raises OSError, and ValueError for what can be no path."""
+    name = os.fspath(path)
+    try:
+        with open(name, "rb") as stream:
+            content = stream.read(most)
+    except OSError as error:
+        _note("file", name, error.errno)
+        raise
+    _note("file", name, content)
+    return content
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The text of a file with ends of lines as in Python. Raises OSError, and UnicodeDecodeError if it is not UTF-8."""
+    return read_bytes(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def is_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is an ordinary file. Raises OSError where that cannot be seen."""
+    return _noted_kind(path) == "file"
+
+
+def is_dir(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a folder. Raises OSError where that cannot be seen."""
+    return _noted_kind(path) == "folder"
+
+
+def exists(path: str | os.PathLike[str]) -> bool:
+    """Whether there is anything. Raises OSError where that cannot be seen."""
+    return _noted_kind(path) != ""
+
+
+def _noted_kind(path: str | os.PathLike[str]) -> str:
+    name = os.fspath(path)
+    kind = _kind(name)
+    _note("kind", name, kind)
+    if isinstance(kind, int):
+        raise OSError(kind, os.strerror(kind), name)
+    return kind
+
+
+def listing(path: str | os.PathLike[str]) -> Listing:
+    """The folders in a folder, and all else in it, without hidden ones. Nothing where it cannot be read."""
+    name = os.fspath(path)
+    found = _listing(name)
+    _note("folder", name, found)
+    return ((), ()) if isinstance(found, int) else found
+
+
+def real_path(path: str | os.PathLike[str]) -> str:
+    """The absolute path without links, whether it exists or not."""
+    name = os.fspath(path)
+    real = os.path.realpath(name)
+    _note("link", name, real)
+    return real
+
+
+class _Environment(Mapping[str, str]):
+    """The variables of the process; notes which of them are read."""
+
+    def __getitem__(self, name: str) -> str:
+        value = os.environ.get(name)
+        _note("variable", name, value)
+        if value is None:
+            raise KeyError(name)
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        names = tuple(sorted(os.environ))
+        _note("names", "", names)
+        return iter(names)
+
+    def __len__(self) -> int:
+        return len(os.environ)
+
+
+ENVIRONMENT = _Environment()
+
+
+def _note(kind: str, name: str, value: object) -> None:
+    inputs = _open.get()
+    if inputs is not None:
+        inputs.note(kind, name, value)
+
+
+def _content(path: str) -> bytes | int | None:
+    """None for what is no ordinary file, which may give its content only once, or never."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError as error:
+        return error.errno
+    with open(descriptor, "rb", buffering=0) as stream:
+        return stream.read() if stat.S_ISREG(os.fstat(descriptor).st_mode) else None
+
+
+def _kind(path: str) -> str | int:
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        return "" if error.errno in _ABSENT else error.errno or 0
+    except ValueError:  # no file system takes such a path
+        return ""
+    return "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "other"
+
+
+def _listing(path: str) -> Listing | int:
+    try:
+        with os.scandir(path) as entries:
+            found = sorted((entry.name, entry.is_dir()) for entry in entries if not entry.name.startswith("."))
+    except OSError as error:
+        return error.errno or 0
+    folders, others = (tuple(name for name, is_folder in found if is_folder is wanted) for wanted in (True, False))
+    return folders, others
+
+
+def _starting_with(prefix: str) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((name, value) for name, value in os.environ.items() if name.startswith(prefix)))
+
+
+@cache
+def _installation() -> Mapping[str, object]:
+    """What this process runs: looked at once, since its modules are imported once, at the start."""
+    from router.declared import CHECKSUM
+
+    packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
+    return {
+        "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path)),
+        "the router's C library": CHECKSUM,
+        "the router's code": tuple(sorted(_stamps(_PACKAGE))) + tuple(sorted(_stamps(_SCHEMAS, ".json"))),
+        "the installed packages": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
+    }
+
+
+def _stamps(folder: str, ending: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
+    """The files below a folder, each with what changes when it is written."""
+    try:
+        entries = [*os.scandir(folder)]
+    except OSError:
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            if entry.name != "__pycache__":
+                yield from _stamps(entry.path, ending)
+        elif entry.name.endswith(ending):
+            yield entry.path, _stamp(entry.stat(follow_symlinks=False))
+
+
+def _stamp(status: os.stat_result) -> tuple[int, ...]:
+    return status.st_mtime_ns, status.st_ctime_ns, status.st_size
+
+
+_OF_FILES = frozenset({"file", "kind", "folder", "link"})
+_PROBES: Mapping[str, Callable[[str], object]] = {
+    "file": _content,
+    "kind": _kind,
+    "folder": _listing,
+    "link": os.path.realpath,
+    "variable": os.environ.get,
+    "variables": _starting_with,
+    "names": lambda _: tuple(sorted(os.environ)),
+    "installation": lambda name: _installation().get(name),
+}
+_WORDS: Mapping[str, str] = {
+    "file": "the file {}",
+    "kind": "the file {}",
+    "folder": "the files in the folder {}",
+    "link": "where the path {} leads",
+    "variable": "the variable {}",
+    "variables": "the variables {}*",
+    "names": "the variables that there are",
+    "installation": "{}",
+}

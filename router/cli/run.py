@@ -6,12 +6,12 @@ The ROS parameter `routes_path` may name the table as well.
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from router import inputs
 from router.app import Router, tune_interpreter
 from router.app.process import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
-    environ = Variables(os.environ, table_variables(parameters))
+    environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
     program = good_table(_table(args, parameters.get(ROUTES_PATH)), environ)[1]  # a reload can free the rest
     _warn_of(without_effect(args.ros_args, program, environ.asked))
     route(program, args.ros_args, environ)
@@ -65,7 +65,7 @@ def _table(args: argparse.Namespace, parameter: str | None) -> Path:
     if not parameter:
         return table_path(args)
     typed: Path | None = args.subject or args.table
-    if typed is not None and table_path(args).resolve() != Path(parameter).resolve():
+    if typed is not None and inputs.real_path(table_path(args)) != inputs.real_path(parameter):
         raise UsageError(f"TABLE is {typed}, {ROUTES_PATH} is {parameter}", "name one table")
     return typed or Path(parameter)
 

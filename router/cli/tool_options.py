@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
 import signal
 import sys
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from router import inputs
 from router.assets import asset
 from router.cli import DEFAULT_TABLE, with_help
 from router.errors import TableError, UsageError
@@ -44,7 +44,7 @@ def table_path(args: argparse.Namespace) -> Path:
     """The table that a verb is about. Raises UsageError where none is named and the default one is not there."""
     if (named := named_table(args)) is not None:
         return named
-    if not DEFAULT_TABLE.exists():
+    if not inputs.exists(DEFAULT_TABLE):
         how = f"name a table by -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
         raise UsageError(f"there is no {DEFAULT_TABLE} here", how)
     return DEFAULT_TABLE
@@ -54,9 +54,9 @@ def named_table(args: argparse.Namespace) -> Path | None:
     """The table that the command line or the environment names. Raises UsageError for two on the command line."""
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
-    if subject is not None and option is not None and subject.resolve() != option.resolve():
+    if subject is not None and option is not None and inputs.real_path(subject) != inputs.real_path(option):
         raise UsageError(f"the table is {subject} or, by --table, {option}", "name one")
-    of_environment = os.environ.get(TABLE_VARIABLE)
+    of_environment = inputs.ENVIRONMENT.get(TABLE_VARIABLE)
     return subject or option or (Path(of_environment) if of_environment else None)
 
 

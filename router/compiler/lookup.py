@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from router import inputs
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.expressions.operators import presence_hint
@@ -19,7 +20,6 @@ from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSetting
 from router.types.board_limits import BoardLimits
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
-from router.types.proto_files import read_folder
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, load_protos, lock_path
 from router.types.ros import RosInterfaces, definition, ros_interfaces
 
@@ -27,7 +27,7 @@ from router.types.ros import RosInterfaces, definition, ros_interfaces
 class Definitions:
     """Protos and ROS interfaces, read once for several tables.
 
-    `known` are protos that were read before; they are used as long as the files of their folder are unchanged.
+    `known` are protos that were read before; they are used as long as all that was read for them is unchanged.
     """
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
@@ -45,12 +45,13 @@ class Definitions:
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
         known = self._known
-        root, lock = settings.protos.value.resolve(), lock_path(settings.protos, settings.lock)
-        if known is None or (known.root, known.lock) != (root, lock):
+        root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock)
+        exclude = [each.value for each in settings.exclude]
+        if known is None or (known.root, known.lock, known.exclude) != (root, lock, exclude):
             return None
         if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
             return None
-        return known if known.sha256 == read_folder(known.root, settings.protos.span, settings.exclude).sha256 else None
+        return known if known.inputs.read_again() else None
 
     @cached_property
     def interfaces(self) -> RosInterfaces:
@@ -218,7 +219,7 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     namesakes = sorted(full for full in known if full.rpartition("/")[2] == short)
     siblings = [full for full in known if full.partition("/")[0] == package]
     source = Path("schemas", package, "msg", f"{short}.msg")
-    if source.is_file():  # in an installation, what is built and sourced counts
+    if inputs.is_file(source):  # in an installation, what is built and sourced counts
         return f"it is in {source.parent}, but not built: build and source {package}"
     if siblings or len(parts) == 1:
         general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+from collections import ChainMap
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 import yaml
 
+from router import inputs
 from router.compiler.program import Program
 from router.compiler.topics import resolved
 from router.errors import StartError, nearest
@@ -53,11 +55,11 @@ def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
     return {name.upper(): value for name, value in parameters.items() if name != ROUTES_PATH}
 
 
-class Variables(dict[str, str]):
-    """Values for a table, and the names that it has `asked` for."""
+class Variables(ChainMap[str, str]):
+    """Values for a table, each from the first of `values` that has it, and the names that it has `asked` for."""
 
     def __init__(self, *values: Mapping[str, str]) -> None:
-        super().__init__({name: value for each in values for name, value in each.items()})
+        super().__init__(*values)  # type: ignore[arg-type]  # nothing is written
         self.asked: set[str] = set()
 
     def get(self, name: str, default: str | None = None) -> str | None:  # type: ignore[override]  # texts only
@@ -152,7 +154,7 @@ def _parameters(ros_args: Sequence[str]) -> Iterator[Parameter]:
 
 def _read_yaml(path: Path) -> object:
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(inputs.read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise StartError(f"the parameter file {path} cannot be read: {error}") from error
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from router import inputs
 from router.errors import Diagnostic, Severity, TableError, plural
 from router.table.addresses import outside_findings
 from router.table.build import build_table
@@ -21,13 +21,13 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     """The table at `path` and what is wrong with it, in the order of the file.
 
     The table is None only when nothing usable could be built (unreadable, bad YAML, no envelope); else
-    it holds what is valid, and `broken` names what was left out. `environ` None means os.environ.
+    it holds what is valid, and `broken` names what was left out. `environ` None means the environment.
     """
     sources: list[Source] = []
     findings: list[Diagnostic] = []
     table = None
     try:
-        root = load_chain(path, os.environ if environ is None else environ, sources, findings)
+        root = load_chain(path, inputs.ENVIRONMENT if environ is None else environ, sources, findings)
         shaped = written_out(check_shape(root, findings))
         table = build_table(shaped, sources, findings)
         findings.extend(cut_findings(shaped, sources))

@@ -15,6 +15,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
+from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
 from router.table.addresses import LOCAL, REMOTE, Address, parse_local
@@ -482,9 +483,9 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
     written = located(node)
     path = beside(written.value, written.span)
     try:
-        if path.exists() and not path.is_file():
+        if inputs.exists(path) and not inputs.is_file(path):
             raise OSError(0, "it is no ordinary file")
-        return ZenohConfig(written.span, path.read_text(encoding="utf-8"), path)
+        return ZenohConfig(written.span, inputs.read_text(path), path)
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
         what = f"'{written.value}' cannot be read: {why}"

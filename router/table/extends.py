@@ -9,11 +9,11 @@ node keeps the span of the file where it was written.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from router import inputs
 from router.errors import Code, Diagnostic, TableError, did_you_mean_file, shown_path
 from router.table.compose import compose
 from router.table.hints import as_variable
@@ -48,7 +48,7 @@ def load_chain(
     seen: list[str] = []
     reference: ScalarNode | None = None
     while True:
-        seen.append(os.path.realpath(path))
+        seen.append(inputs.real_path(path))
         source = read_source(path) if reference is None else _read_base(path, reference)
         sources.append(source)
         layers.append(_root_mapping(compose(source, environ, findings)))
@@ -129,13 +129,13 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
-        looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
+        looked = f"looked for {shown_path(Path(inputs.real_path(path)))}"
         hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or looked
         raise TableError.of(reference.span, Code.BAD_EXTENDS, what, hint) from error
 
 
 def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:
-    if (real := os.path.realpath(path)) in seen:
+    if (real := inputs.real_path(path)) in seen:
         names = " -> ".join(shown_path(Path(step)) for step in (*seen[seen.index(real) :], real))
         what = f"'{reference.text}' extends itself: {names}"
         raise TableError.of(reference.span, Code.BAD_EXTENDS, what)

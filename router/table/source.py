@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from router import inputs
 from router.assets import asset, is_installed
 from router.errors import Code, SourceSpan, TableError, nearest, nearest_path, shown_path
 
@@ -72,13 +73,12 @@ def foreign_blank(text: str) -> str | None:
 def _read(path: Path, file: str) -> bytes:
     hint = ""
     try:
-        if path.is_dir():
+        if inputs.is_dir(path):
             what = "this is a folder, not a route table"
-        elif path.exists() and not path.is_file():
+        elif inputs.exists(path) and not inputs.is_file(path):
             what = "this is no ordinary file"
         else:
-            with path.open("rb") as stream:
-                data = stream.read(MAX_BYTES + 1)
+            data = inputs.read_bytes(path, MAX_BYTES + 1)
             if len(data) <= MAX_BYTES:
                 return data
             what = f"the file is larger than {MAX_BYTES >> 20} MiB"

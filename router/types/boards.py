@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
+from router import inputs
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
 from router.types.descriptors import container, enum_of, message_of
 from router.types.wire import encoding_of, varint
@@ -117,7 +118,7 @@ def _names(proto: FileDescriptorProto) -> Iterator[str]:
 def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
     """An `.options` file and what is wrong with it."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = inputs.read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         return OptionsFile(), [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")]
     lines = []

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from router import inputs
 from router.errors import Code, SourceSpan, TableError, shown_path
 
 LOCK_NAME = "envelope.lock.json"
@@ -59,7 +60,7 @@ def read_lock(path: Path) -> Lock | None:
     """None where there is no such file. Raises TableError for a broken one."""
     span = SourceSpan(shown_path(path))
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
+        content = json.loads(inputs.read_text(path), object_pairs_hook=_without_duplicates)
         return _parsed(content)
     except FileNotFoundError:
         return None

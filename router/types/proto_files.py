@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
+from router import inputs
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
 from router.types.lock_file import Lock
 
 PROTO = ".proto"
 OPTIONS = ".options"
 
-_HIDDEN = re.compile(r"(^|/)\.")
 _FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
 _SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", re.MULTILINE | re.DOTALL)
 
@@ -53,14 +53,14 @@ class Folder:
 
 def _meant(root: Path, blame: SourceSpan) -> str:
     """What to write for a folder that is not there, in the table at `blame`."""
-    path = root.resolve()
-    if path.is_file():
+    path = Path(inputs.real_path(root))
+    if inputs.is_file(path):
         return "that is a file: name its folder"
     beside_table = path.parent.parent / path.name  # of a table in routes/
-    near = next((each for each in (nearest_path(path), beside_table) if each is not None and each.is_dir()), None)
+    near = next((each for each in (nearest_path(path), beside_table) if each is not None and inputs.is_dir(each)), None)
     if near is None:
         return "a path is relative to the table that it stands in"
-    return f"did you mean '{Path(os.path.relpath(near, Path(blame.file).resolve().parent)).as_posix()}'?"
+    return f"did you mean '{Path(os.path.relpath(near, Path(inputs.real_path(blame.file)).parent)).as_posix()}'?"
 
 
 def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] = ()) -> Folder:
@@ -69,13 +69,9 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
     What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder,
     and for what `exclude` names in vain.
     """
-    if not root.is_dir():
-        raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", _meant(root, blame))
-    found = {
-        name: path
-        for path in walk(root)
-        if path.suffix in (PROTO, OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
-    }
+    if not inputs.is_dir(root):
+        raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {inputs.real_path(root)}", _meant(root, blame))
+    found = {path.relative_to(root).as_posix(): path for path in walk(root) if path.suffix in (PROTO, OPTIONS)}
     if not any(name.endswith(PROTO) for name in found):
         raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")
     excluded = _excluded(root, found, exclude)
@@ -88,7 +84,7 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
             hint = "take letters, digits, '_', '-' and '.'"
             faults[name] = [Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint)]
         try:
-            files[name] = path.read_bytes()
+            files[name] = inputs.read_bytes(path)
         except OSError as error:
             message = f"cannot be read: {error.strerror}"
             faults[name] = [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]
@@ -127,12 +123,16 @@ def proto_of(name: str) -> str:
 
 
 def walk(root: Path) -> Iterator[Path]:
-    """All files and folders below a folder, through links to other folders as well, each folder once."""
+    """All files and folders below a folder, but hidden ones, through links to other folders as well, each once."""
     seen = set()
-    for folder, inner, files in os.walk(root, followlinks=True):
-        seen.add(os.path.realpath(folder))
-        inner[:] = [name for name in inner if os.path.realpath(Path(folder, name)) not in seen]
-        yield from (Path(folder, name) for name in (*inner, *files))
+    waiting = [root]
+    while waiting:
+        folder = waiting.pop()
+        seen.add(inputs.real_path(folder))
+        names, files = inputs.listing(folder)
+        inner = [each for name in names if inputs.real_path(each := folder / name) not in seen]
+        yield from (*inner, *(folder / name for name in files))
+        waiting += reversed(inner)
 
 
 def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
@@ -289,7 +289,7 @@ def _folder_above(folder: Folder, file: str) -> Path | None:
     if not imports or any(name in folder.files or name in folder.faults for name in imports):
         return None
     above = folder.root.parents[:_FURTHER_UP]
-    return next((each for each in above if all((each / name).is_file() for name in imports)), None)
+    return next((each for each in above if all(inputs.is_file(each / name) for name in imports)), None)
 
 
 def _too_deep(folder: Folder, protos: Located[Path], right: Path, file: str) -> Diagnostic:
@@ -297,5 +297,5 @@ def _too_deep(folder: Folder, protos: Located[Path], right: Path, file: str) -> 
     count = {1: "one folder", 2: "two folders"}.get(steps, f"{steps} folders")
     message = f"`protos` is {count} too deep: {file} imports '{_imports(folder.files[file])[0]}'"
     table = Path(protos.span.file)
-    shown = os.path.relpath(right, table.absolute().parent) if table.is_file() else shown_path(right)
+    shown = os.path.relpath(right, table.absolute().parent) if inputs.is_file(table) else shown_path(right)
     return Diagnostic(protos.span, Code.BAD_VALUE, message, f"take {shown}, to which imports are relative")

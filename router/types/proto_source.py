@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto, SourceCodeInfo
 
+from router import inputs
 from router.errors import SourceSpan, shown_path
 
 _TAB_WIDTH = 8
@@ -28,7 +29,7 @@ class ProtoText:
 
     @cached_property
     def _lines(self) -> list[bytes]:
-        return self.path.read_bytes().split(b"\n")
+        return inputs.read_bytes(self.path).split(b"\n")
 
     def span(self, location: Sequence[int]) -> SourceSpan:
         """A location of protoc's source info: line, column, end column, or with the end's line as third."""

@@ -6,7 +6,7 @@ list of its entry messages and a group a message; extensions are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
+from router import inputs
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, plural, shown_path
 from router.types.boards import (
     NO_OPTIONS,
@@ -45,8 +46,8 @@ class ProtoSchema:
 
     What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes of all
     `.proto` and `.options` files of the folder; `files` has the names of the compiled ones. `envelope` is the full name
-    of the message that was asked for, `lock` the path of the lock file, `warnings` what is wrong with other files and
-    with `.options` files.
+    of the message that was asked for, `lock` the path of the lock file, `exclude` what was not to be read, `warnings`
+    what is wrong with other files and with `.options` files. `inputs` is all that was read for it.
     """
 
     def __init__(
@@ -61,7 +62,9 @@ class ProtoSchema:
         self.root = folder.root
         self.envelope = envelope
         self.lock = lock
-        self.files = tuple(file.name for file in compiled.file if (folder.root / file.name).is_file())
+        self.exclude: Sequence[str] = ()
+        self.inputs = inputs.Inputs()
+        self.files = tuple(file.name for file in compiled.file if inputs.is_file(folder.root / file.name))
         self.sha256 = folder.sha256
         self.sources = _sources(folder, compiled)
         self.warnings = tuple(warnings)
@@ -160,7 +163,22 @@ def load_protos(
     nothing is wrong with them. Raises
     TableError with every finding. What is wrong with the folder itself is blamed on the place that names it.
     """
-    root = protos.value.resolve()
+    with inputs.noted() as read:
+        schema = _load(protos, message, lock, exclude, with_others=with_others)
+    schema.exclude = [each.value for each in exclude]
+    schema.inputs = read
+    return schema
+
+
+def _load(
+    protos: Located[Path],
+    message: Located[str],
+    lock: Located[Path] | None,
+    exclude: Sequence[Located[str]],
+    *,
+    with_others: bool,
+) -> ProtoSchema:
+    root = Path(inputs.real_path(protos.value))
     folder = read_folder(root, protos.span, exclude)
     path = lock_path(protos, lock)
     locked = _readable_lock(path)
@@ -176,6 +194,7 @@ def load_protos(
     if with_others and valid:
         compiled = compile_protos(folder, [*names, *valid])
     files = {each.name: each for each in compiled.file}
+    _note_hidden(folder, files)
     findings = _same_name_findings(folder, compiled)
     options = {}
     for name in folder.files:
@@ -192,6 +211,13 @@ def load_protos(
     return ProtoSchema(folder, envelope, path, compiled, options, warnings)
 
 
+def _note_hidden(folder: Folder, compiled: Collection[str]) -> None:
+    """Files that only protoc has read, as others import them, are read here to be noted."""
+    for name in compiled:
+        if name not in folder.files and inputs.is_file(folder.root / name):
+            inputs.read_bytes(folder.root / name)
+
+
 def without_protos() -> tuple[ProtoSchema, Envelope]:
     """What a table refers to that has no envelope: no declarations, and an envelope without payload cases."""
     schema = ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
@@ -200,7 +226,7 @@ def without_protos() -> tuple[ProtoSchema, Envelope]:
 
 def lock_path(protos: Located[Path], lock: Located[Path] | None) -> Path:
     """The lock file of these protos: beside them unless `lock` says where."""
-    return (lock.value if lock is not None else protos.value / LOCK_NAME).resolve()
+    return Path(inputs.real_path(lock.value if lock is not None else protos.value / LOCK_NAME))
 
 
 def _readable_lock(path: Path) -> Lock | None:
@@ -255,7 +281,7 @@ def _excluded_finding(name: str, envelope: Located[str], folder: Folder) -> Diag
 
 def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     names = [file.name for file in compiled.file]
-    paths = {name: path if (path := folder.root / name).is_file() else WELL_KNOWN / name for name in names}
+    paths = {name: path if inputs.is_file(path := folder.root / name) else WELL_KNOWN / name for name in names}
     return ProtoSources(compiled.file, paths)
 
 
@@ -263,7 +289,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Dia
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
-        if not (folder.root / file.name).is_file():
+        if not inputs.is_file(folder.root / file.name):
             continue
         for message in file.message_type:
             full = f"{file.package}.{message.name}" if file.package else message.name

@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from router import inputs
 from router.assets import asset, is_installed
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, shown_path
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
@@ -51,14 +52,17 @@ class MsgFiles:
             return None
         for folder in self._folders:
             path = folder / parts["package"] / "msg" / f"{parts['name']}.msg"
-            if path.is_file():
+            if inputs.is_file(path):
                 return _read(path, parts["package"])
         return None
 
     def names(self) -> Iterator[str]:
         for folder in self._folders:
-            for path in folder.glob("*/msg/*.msg"):
-                yield f"{path.parent.parent.name}/msg/{path.stem}"
+            for package in inputs.listing(folder)[0]:
+                for file in inputs.listing(folder / package / "msg")[1]:
+                    name, _, ending = file.rpartition(".")
+                    if ending == "msg":
+                        yield f"{package}/msg/{name}"
 
 
 def msg_files() -> MsgFiles:
@@ -67,7 +71,7 @@ def msg_files() -> MsgFiles:
     Ours come first in a checkout, where they are edited and then built, and last in an installation, where a team's own
     copy of them is what it edits and builds.
     """
-    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    prefixes = [*filter(None, inputs.ENVIRONMENT.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     shares = [Path(prefix, "share") for prefix in prefixes]
     ours = asset("schemas")
     return MsgFiles([*shares, ours] if is_installed(ours) else [ours, *shares])
@@ -75,7 +79,7 @@ def msg_files() -> MsgFiles:
 
 def _read(path: Path, package: str) -> FoundDefinition:
     try:
-        return FoundDefinition(shown_path(path), parse_msg(package, path.read_text(encoding="utf-8")))
+        return FoundDefinition(shown_path(path), parse_msg(package, inputs.read_text(path)))
     except MsgError as error:
         span = SourceSpan(shown_path(path), error.line, error.column, error.end_column)
         raise TableError.of(span, Code.BAD_FILE, error.message) from None
