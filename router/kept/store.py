@@ -1,31 +1,201 @@
-"""The files of kept programs: found by command line and directory, written atomically, of their owner alone.
+"""The files of kept programs: found by command line, folder and Python, written atomically, for their owner alone.
 
-Imports only small modules, as `router run` uses it before it imports anything large.
+A file is a header, plain values as `marshal` writes them, and an image. Nothing in a file of this user that is whole is
+distrusted further.
 """
 
 from __future__ import annotations
+
+import errno
+import marshal
+import mmap
+import os
+import stat
+import struct
+import sys
+import time
+import zlib
+from contextlib import suppress
+
+from router import inputs
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from router.inputs import Plain
 
+_MOST = 4
+"""Files that are kept."""
+_ENDING = ".program"
+_UNFINISHED = ".new"
+_STALE = 60.0
+"""Seconds after which an unfinished file is one that nobody writes any longer."""
+
+_MAGIC = b"rover router kept program\n"
+_FORMAT = 1
+_HEAD = struct.Struct(f"<{len(_MAGIC)}sIIQQ")
+"""The magic, the format, Python's version, the sizes of values and image. The checksum of all the rest follows."""
+_CHECKSUM = struct.Struct("<I")
+
 
 class Kept:
-    """A file that is whole and whose inputs are unchanged.
+    """What is in a file that is whole and whose inputs are unchanged.
 
-    `parts` are plain values, as `marshal` takes them. `image` is writable and begins at a page.
+    `parts` are plain values. `image` is memory of this process alone, writable, and begins at a page.
     """
 
-    def __init__(self, inputs: Plain, parts: object, image: memoryview) -> None:
-        self.inputs = inputs
+    def __init__(self, read: Plain, parts: object, image: mmap.mmap) -> None:
+        self.inputs = read
         self.parts = parts
         self.image = image
 
 
+class _UnusableError(Exception):
+    """The text says why a file is not used."""
+
+
 def find() -> tuple[Kept | None, str]:
-    """What is kept for this command line, directory and executable, or why it cannot be used; "" if nothing is kept."""
-    return None, ""
+    """What is kept for this command line, folder and Python; else why it is not used, or "" if nothing is kept."""
+    try:
+        kept = _read(_path())
+        if change := inputs.changed(kept.inputs):
+            return None, f"{change} has changed"
+    except FileNotFoundError:
+        return None, ""
+    except _UnusableError as error:
+        return None, str(error)
+    except Exception as error:  # noqa: BLE001 - whatever it is, the router starts without the file
+        return None, f"it cannot be read: {error!r}"
+    return kept, ""
 
 
-def write(inputs: Plain, parts: object, image: bytes) -> None:
-    """Keep a program for this command line, directory and executable. Raises OSError."""
+def write(read: Plain, parts: object, image: bytes) -> None:
+    """Keep a program for this command line, folder and Python. Raises OSError, and the file is as it was before."""
+    path = _path()
+    folder = os.path.dirname(path)
+    os.makedirs(folder, mode=0o700, exist_ok=True)
+    if os.stat(folder).st_uid != os.geteuid():
+        raise PermissionError(errno.EPERM, "the folder belongs to another user", folder)
+    os.chmod(folder, 0o700)
+    _remove_unfinished(folder)
+    values = marshal.dumps((_identity(), read, parts))  # type: ignore[arg-type]  # which are plain
+    head = _HEAD.pack(_MAGIC, _FORMAT, sys.hexversion, len(values), len(image))
+    unfinished = f"{path}.{os.getpid()}-{time.monotonic_ns()}{_UNFINISHED}"
+    descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        with open(descriptor, "wb") as stream:
+            stream.writelines((head, _CHECKSUM.pack(_crc(head, values, image)), values, image))
+            stream.flush()
+            os.fsync(descriptor)
+        os.rename(unfinished, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(unfinished)
+        raise
+    _remove_oldest(folder, path)
+
+
+def _path() -> str:
+    """The file for this command line, folder and Python. Raises OSError where there is no place for it."""
+    return os.path.join(_folder(), f"{zlib.crc32(marshal.dumps(_identity())):08x}{_ENDING}")
+
+
+def _folder() -> str:
+    """The service's state directory, or the user's cache."""
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if os.path.isabs(state):
+        return os.path.join(state, "kept")
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(cache):
+        cache = os.path.join(os.path.expanduser("~"), ".cache")
+    if not os.path.isabs(cache):
+        raise FileNotFoundError(errno.ENOENT, "neither STATE_DIRECTORY, XDG_CACHE_HOME nor HOME is set")
+    return os.path.join(cache, "rover-router")
+
+
+def _identity() -> tuple[tuple[str, ...], str, str]:
+    return tuple(sys.argv), os.getcwd(), sys.executable
+
+
+def _crc(*parts: bytes | bytearray | memoryview) -> int:
+    crc = 0
+    for part in parts:
+        crc = zlib.crc32(part, crc)
+    return crc
+
+
+def _read(path: str) -> Kept:
+    """Read a whole file: one that is mapped, and truncated later, would end the process. Raises _UnusableError too."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _UnusableError("it is a link") from None
+        raise
+    with open(descriptor, "rb", buffering=0) as stream:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise _UnusableError("it is no ordinary file")
+        _check_owner(status, "it")
+        _check_owner(os.stat(os.path.dirname(path)), "its folder")
+        head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
+        values_size, image_size = _sizes(head, status.st_size)
+        values = bytearray(values_size)
+        image = mmap.mmap(-1, max(image_size, 1), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        with memoryview(image) as whole, whole[:image_size] as view:
+            is_whole = stream.readinto(values) == values_size and stream.readinto(view) == image_size
+            is_whole = is_whole and checksum == _CHECKSUM.pack(_crc(head, values, view))
+    if not is_whole:
+        raise _UnusableError("it is damaged")
+    identity, read, parts = marshal.loads(values)  # noqa: S302 - this user's Python wrote it
+    if identity != _identity():
+        raise _UnusableError("it is of another command line, folder or Python")
+    return Kept(read, parts, image)
+
+
+def _check_owner(status: os.stat_result, what: str) -> None:
+    if status.st_uid != os.geteuid():
+        raise _UnusableError(f"{what} belongs to another user")
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise _UnusableError(f"others may write to {what}")
+
+
+def _sizes(head: bytes, size: int) -> tuple[int, int]:
+    """The sizes of values and image in a file of this size. Raises _UnusableError."""
+    if not head.startswith(_MAGIC[: len(head)]):
+        raise _UnusableError("it is no kept program")
+    if len(head) < _HEAD.size:
+        raise _UnusableError("it is truncated")
+    _, form, version, values, image = _HEAD.unpack(head)
+    if form != _FORMAT:
+        raise _UnusableError("it has another format")
+    if version != sys.hexversion:
+        raise _UnusableError("another version of Python has written it")
+    if size != (whole := _HEAD.size + _CHECKSUM.size + values + image):
+        raise _UnusableError("it is truncated" if size < whole else "it is damaged")
+    return values, image
+
+
+def _remove_unfinished(folder: str) -> None:
+    """Remove what processes have left that ended while they wrote."""
+    now = time.time()
+    for written, path in _files(folder, _UNFINISHED):
+        if abs(now - written) > _STALE:
+            with suppress(OSError):
+                os.unlink(path)
+
+
+def _remove_oldest(folder: str, newest: str) -> None:
+    others = sorted((each for each in _files(folder, _ENDING) if each[1] != newest), reverse=True)
+    for _, path in others[_MOST - 1 :]:
+        with suppress(OSError):
+            os.unlink(path)
+
+
+def _files(folder: str, ending: str) -> list[tuple[float, str]]:
+    """When each file was written, and its path."""
+    found = []
+    for entry in os.scandir(folder):
+        if entry.name.endswith(ending):
+            with suppress(OSError):
+                found.append((entry.stat(follow_symlinks=False).st_mtime, entry.path))
+    return found

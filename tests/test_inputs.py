@@ -1,0 +1,324 @@
+"""What a compile reads is noted, all of it, and any other value of it is found again."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from router import inputs
+from router.cli import main
+from router.cli.tool_options import named_table, table_path
+from router.compiler import check_table
+from router.compiler.lookup import Definitions
+from router.compiler.program import Program
+from router.ros.arguments import Variables, ros_parameters, table_variables
+
+if TYPE_CHECKING:
+    from router.inputs import Plain
+
+ROUTER = Path(inputs.__file__).parent
+
+PROTO = """syntax = "proto3";
+message Envelope { oneof payload { Reading reading = 1; } }
+message Reading { string name = 1; int32 value = 2; }
+"""
+BASE = """version: 1
+envelope: {protos: ../protos, message: Envelope, oneof: payload}
+listen: {wifi: {address: "127.0.0.1:${PORT:-5000}", framing: exact}}
+"""
+TABLE = """extends: base.yaml
+endpoints:
+  board: {address: 127.0.0.2:8, kind: board}
+  station: {address: 127.0.0.3:9, kind: basestation}
+routes:
+  reading: {source: board, destinations: station, topic: {topic: reading, type: our_msgs/msg/Reading}}
+"""
+NO_TABLE = argparse.Namespace(table=None, subject=None)
+"""A command line that names none."""
+
+MSG = "string name\nint32 value\n"
+
+
+def put(path: str, text: str) -> None:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with a table, protos, options, and the prefixes of two workspaces, one of them empty."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/over{os.pathsep}{tmp_path}/under")
+    monkeypatch.delenv("PORT", raising=False)
+    put("routes/base.yaml", BASE)
+    put("routes/rover.yaml", TABLE)
+    put("protos/envelope.proto", PROTO)
+    put("protos/envelope.options", "Reading.name max_size:16\n")
+    put("protos/.git/HEAD", "ref: refs/heads/main\n")
+    put("under/share/our_msgs/msg/Reading.msg", MSG)
+    return tmp_path
+
+
+def compiled(known: Program | None = None) -> tuple[Program, Plain]:
+    with inputs.recording() as read:
+        definitions = Definitions(known.protos if known else None)
+        checked = check_table(Path("routes/rover.yaml"), None, definitions)
+        program = checked.program
+    assert program is not None, "\n".join(map(str, checked.diagnostics))
+    return program, read.plain()
+
+
+def changed_in_new_process(plain: Plain) -> str:
+    """What a start finds, which looks at the installation anew."""
+    inputs._installation.cache_clear()
+    return inputs.changed(plain)
+
+
+def pipe_instead() -> None:
+    Path("routes/base.yaml").unlink()
+    os.mkfifo("routes/base.yaml")
+
+
+def link_elsewhere() -> None:
+    Path("protos").rename("others")
+    Path("protos").symlink_to("others")
+
+
+EDITS: dict[str, tuple[Callable[[], object], str]] = {
+    "the table": (lambda: put("routes/rover.yaml", f"{TABLE}\n# a comment\n"), "routes/rover.yaml"),
+    "a table that is extended": (lambda: put("routes/base.yaml", BASE.replace("5000", "5001")), "routes/base.yaml"),
+    "a comment in a proto": (lambda: put("protos/envelope.proto", f"// a comment\n{PROTO}"), "envelope.proto"),
+    "a new proto": (lambda: put("protos/new.proto", 'syntax = "proto3";\n'), "protos"),
+    "a new proto in a new folder": (lambda: put("protos/inner/new.proto", 'syntax = "proto3";\n'), "protos"),
+    "a proto that is gone": (lambda: Path("protos/envelope.proto").unlink(), "envelope.proto"),
+    "options": (lambda: put("protos/envelope.options", "Reading.name max_size:17\n"), "envelope.options"),
+    "options that are gone": (lambda: Path("protos/envelope.options").unlink(), "envelope.options"),
+    "a lock that appears": (lambda: put("protos/envelope.lock.json", "{}"), "envelope.lock.json"),
+    "a definition": (lambda: put("under/share/our_msgs/msg/Reading.msg", f"# more\n{MSG}"), "Reading.msg"),
+    "a definition before another": (lambda: put("over/share/our_msgs/msg/Reading.msg", MSG), "over/share"),
+    "a link to the same files": (link_elsewhere, "protos"),
+    "a variable": (lambda: os.environ.update(PORT="5001"), "PORT"),
+    "a variable that is empty": (lambda: os.environ.update(PORT=""), "PORT"),
+    "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "AMENT_"),
+    "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "ROS_"),
+    "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "RMW_"),
+    "a pipe in place of a file": (
+        pipe_instead,
+        "base.yaml",
+    ),
+}
+
+
+@pytest.fixture
+def variables() -> Iterator[None]:
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.mark.parametrize("edit", EDITS)
+@pytest.mark.usefixtures("place", "variables")
+def test_each_edit_between_two_starts_is_found(edit: str) -> None:
+    _, plain = compiled()
+    assert changed_in_new_process(plain) == ""
+    make, named = EDITS[edit]
+    make()
+    assert named in changed_in_new_process(plain)
+
+
+@pytest.mark.usefixtures("place")
+def test_what_is_not_read_may_change() -> None:
+    _, plain = compiled()
+    os.utime("routes/rover.yaml")
+    put("protos/.git/HEAD", "ref: refs/heads/other\n")
+    put("protos/.envelope.proto.swp", "an editor's")
+    put("routes/other.yaml", "version: 1\n")
+    put("under/share/our_msgs/msg/Other.msg", MSG)
+    assert changed_in_new_process(plain) == ""
+
+
+@pytest.mark.usefixtures("place")
+def test_a_hidden_proto_that_another_imports_is_noted_although_protoc_alone_reads_it() -> None:
+    put("protos/.hidden/reading.proto", 'syntax = "proto3";\nmessage Other { int32 value = 1; }\n')
+    put("protos/envelope.proto", PROTO.replace(";\n", ';\nimport public ".hidden/reading.proto";\n', 1))
+    _, plain = compiled()
+    put("protos/.hidden/reading.proto", 'syntax = "proto3";\nmessage Other { int64 value = 1; }\n')
+    assert ".hidden/reading.proto" in inputs.changed(plain)
+
+
+@pytest.mark.usefixtures("place")
+def test_a_reload_that_takes_over_the_protos_notes_the_same_inputs_as_a_start() -> None:
+    program, plain = compiled()
+    again, after = compiled(program)
+    assert again.protos is program.protos
+    assert after == plain
+
+
+@pytest.mark.usefixtures("place")
+def test_a_reload_compiles_the_protos_again_once_their_lock_has_changed() -> None:
+    program, _ = compiled()
+    assert main(["schema", "lock", "-t", "routes/rover.yaml"]) == 0
+    again, after = compiled(program)
+    assert again.protos is not program.protos
+    assert after == compiled()[1]
+
+
+@pytest.mark.usefixtures("place", "variables")
+def test_the_table_of_the_command_line_and_the_ros_parameters_are_inputs(place: Path) -> None:
+    put("params.yaml", "/**: {ros__parameters: {port: 5005}}")
+    with inputs.recording() as asked:
+        variables = Variables(table_variables(ros_parameters(["--params-file", "params.yaml"])), inputs.ENVIRONMENT)
+        assert table_path(NO_TABLE) == Path("routes/rover.yaml")
+    assert [variables.get(name) for name in ("PORT", "NOWHERE")] == ["5005", None]
+    names = {name for _, name, _ in asked.plain()}
+    assert {f"{place}/params.yaml", f"{place}/routes/rover.yaml", "ROUTER_TABLE"} <= names
+    assert "PORT" not in names, "a ROS parameter has set it"
+    put("params.yaml", "/**: {ros__parameters: {port: 5006}}")
+    assert "params.yaml" in inputs.changed(asked.plain())
+    put("params.yaml", "/**: {ros__parameters: {port: 5005}}")
+    os.environ["ROUTER_TABLE"] = "routes/base.yaml"
+    assert "ROUTER_TABLE" in inputs.changed(asked.plain())
+    assert named_table(NO_TABLE) == Path("routes/base.yaml")
+
+
+@pytest.mark.usefixtures("place")
+def test_a_recording_goes_on_from_an_earlier_one_and_has_what_is_noted_within() -> None:
+    with inputs.recording() as before:
+        inputs.read_text("routes/base.yaml")
+    with inputs.recording(before) as read:
+        with inputs.noted() as inner:
+            inputs.is_file("routes/rover.yaml")
+        inputs.ENVIRONMENT.get("PORT")
+    inputs.is_file("protos")
+    ours = [(kind, Path(name).name) for kind, name, _ in read.plain() if kind in {"file", "kind", "variable"}]
+    assert ours == [("file", "base.yaml"), ("kind", "rover.yaml"), ("variable", "PORT")]
+    assert [kind for kind, _, _ in inner.plain()] == ["kind"]
+
+
+@pytest.mark.usefixtures("place")
+def test_what_changed_while_it_was_read_is_never_the_same_again() -> None:
+    with inputs.recording() as read:
+        inputs.read_text("routes/base.yaml")
+        put("routes/base.yaml", "version: 2\n")
+        inputs.read_text("routes/base.yaml")
+    assert "base.yaml" in inputs.changed(read.plain())
+    put("routes/base.yaml", BASE)
+    assert "base.yaml" in inputs.changed(read.plain())
+
+
+@pytest.mark.usefixtures("place")
+def test_a_pipe_is_neither_waited_for_nor_read_before_the_compile() -> None:
+    with inputs.recording() as read:
+        inputs.read_text("routes/base.yaml")
+    reading, writing = os.pipe()
+    os.write(writing, BASE.encode())
+    plain = tuple((kind, f"/dev/fd/{reading}" if kind == "file" else name, value) for kind, name, value in read.plain())
+    assert f"/dev/fd/{reading}" in inputs.changed(plain)
+    assert os.read(reading, 1000) == BASE.encode()
+    os.close(reading)
+    os.close(writing)
+
+
+@pytest.mark.parametrize("edit", ["written", "new", "gone"])
+def test_code_of_the_router_that_changed_is_found_by_the_next_process(
+    edit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "router"
+    put(f"{package}/cli/run.py", "pass")
+    put(f"{package}/__init__.py", "pass")
+    monkeypatch.setattr(inputs, "_PACKAGE", str(package))
+    inputs._installation.cache_clear()
+    with inputs.recording() as read:
+        pass
+    put(f"{package}/cli/__pycache__/run.pyc", "compiled")
+    assert changed_in_new_process(read.plain()) == ""
+    if edit == "gone":
+        (package / "cli/run.py").unlink()
+    else:
+        put(f"{package}/cli/{'run' if edit == 'written' else 'new'}.py", "pass")
+    assert inputs.changed(read.plain()) == "", "this process runs the code that it has imported"
+    assert changed_in_new_process(read.plain()) == "the router's code"
+    monkeypatch.undo()
+    inputs._installation.cache_clear()
+
+
+_WATCHED = """
+import json, os, sys
+opened = []
+def hook(event, arguments):
+    if event in {"open", "os.listdir", "os.scandir"} and isinstance(arguments[0], (str, os.PathLike)):
+        opened.append(os.path.abspath(arguments[0]))
+from pathlib import Path
+from router import inputs
+from router.compiler import check_table
+with inputs.recording() as read:
+    sys.addaudithook(hook)
+    checked = check_table(Path("routes/rover.yaml"))
+    checked.program
+found = list(opened)
+print(json.dumps([found, [name for _, name, _ in read.plain()], list(map(str, checked.diagnostics))]))
+"""
+
+
+def test_no_file_of_a_table_is_opened_that_is_not_noted(place: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scratch = tmp_path_factory.mktemp("scratch")
+    answer = subprocess.run(
+        [sys.executable, "-c", _WATCHED],
+        env={**os.environ, "TMPDIR": str(scratch)},
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    opened, names, findings = json.loads(answer.stdout)
+    below = {path for path in opened if path.startswith(f"{place}/")}
+    assert not [finding for finding in findings if "error" in finding]
+    assert {f"{place}/routes/rover.yaml", f"{place}/protos/envelope.proto", f"{place}/protos"} <= below
+    ignored = (
+        str(scratch),
+        f"{place}/everything",  # that is in the scratch folder, which is removed
+        sys.prefix,
+        sys.base_prefix,
+        str(ROUTER),
+        "/proc",
+        str(ROUTER.parent / "schemas" / "route"),
+    )
+    assert {path for path in opened if not path.startswith(ignored)} <= set(names)
+
+
+_READING = {
+    *("read_text", "read_bytes", "open", "is_file", "is_dir", "exists", "iterdir", "glob", "rglob", "stat", "lstat"),
+    *("resolve", "readlink", "samefile", "is_symlink", "environ", "getenv", "listdir", "scandir", "realpath", "walk"),
+    *("isfile", "isdir", "islink", "lexists", "access", "expanduser", "home", "from_file", "getmtime", "getsize"),
+}
+_ALLOWED = {
+    "table/schema.py": ["read_text"],  # part of the code, and read once
+    "types/protoc.py": ["read_bytes"],  # what protoc has written
+    "compiler/zenoh_config.py": ["from_file"],  # table/build.py has read it
+}
+
+
+def test_the_language_reads_nothing_past_the_inputs() -> None:
+    found: dict[str, list[str]] = {}
+    for package in ("table", "types", "compiler"):
+        for path in sorted((ROUTER / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if name := _read_by(node):
+                    found.setdefault(path.relative_to(ROUTER).as_posix(), []).append(name)
+    assert found == _ALLOWED
+
+
+def _read_by(node: ast.AST) -> str:
+    """The attribute of another module or object, or the built-in function, by which a node reads."""
+    if isinstance(node, ast.Attribute) and node.attr in _READING:
+        is_ours = isinstance(node.value, ast.Name) and node.value.id in {"inputs", "ast"}
+        return "" if is_ours else node.attr
+    return "open" if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "open" else ""
