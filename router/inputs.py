@@ -198,10 +198,15 @@ def _content(path: str) -> bytes | int | None:
     """None for what is no ordinary file, which may give its content only once, or never."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                return None
+            with open(descriptor, "rb", buffering=0, closefd=False) as stream:
+                return stream.read()
+        finally:
+            os.close(descriptor)
     except OSError as error:
         return error.errno
-    with open(descriptor, "rb", buffering=0) as stream:
-        return stream.read() if stat.S_ISREG(os.fstat(descriptor).st_mode) else None
 
 
 def _kind(path: str) -> str | int:

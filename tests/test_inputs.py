@@ -88,6 +88,11 @@ def pipe_instead() -> None:
     os.mkfifo("routes/base.yaml")
 
 
+def folder_instead() -> None:
+    Path("routes/base.yaml").unlink()
+    Path("routes/base.yaml").mkdir()
+
+
 def link_elsewhere() -> None:
     Path("protos").rename("others")
     Path("protos").symlink_to("others")
@@ -111,6 +116,7 @@ EDITS: dict[str, tuple[Callable[[], object], str]] = {
     "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "AMENT_"),
     "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "ROS_"),
     "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "RMW_"),
+    "a folder in place of a file": (folder_instead, "base.yaml"),
     "a pipe in place of a file": (
         pipe_instead,
         "base.yaml",

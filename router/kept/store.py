@@ -131,14 +131,22 @@ def _read(path: str) -> Kept:
         if error.errno == errno.ELOOP:
             raise _UnusableError("it is a link") from None
         raise
-    with open(descriptor, "rb", buffering=0) as stream:
+    try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise _UnusableError("it is no ordinary file")
         _check_owner(status, "it")
         _check_owner(os.stat(os.path.dirname(path)), "its folder")
+        return _parsed(descriptor, status.st_size)
+    finally:
+        os.close(descriptor)
+
+
+def _parsed(descriptor: int, size: int) -> Kept:
+    """What is in an open file. Raises _UnusableError."""
+    with open(descriptor, "rb", buffering=0, closefd=False) as stream:
         head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
-        values_size, image_size = _sizes(head, status.st_size)
+        values_size, image_size = _sizes(head, size)
         values = bytearray(values_size)
         image = mmap.mmap(-1, max(image_size, 1), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with memoryview(image) as whole, whole[:image_size] as view:
