@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     """The folders and the other files in a folder, sorted."""
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
-_SCHEMAS = os.path.join(os.path.dirname(_PACKAGE), "schemas")
-"""In a checkout; read once, like the code. In an installation it is within the package."""
+_ASSETS = "_assets"
+_SCHEMAS = [os.path.join(place, "schemas") for place in (os.path.join(_PACKAGE, _ASSETS), os.path.dirname(_PACKAGE))]
+"""In an installation or a checkout; those of tables are read once, like the code."""
 _ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
+_CODE = (".py", ".so", ".json", ".html", ".xml")
 _OF_ROS = ("AMENT_", "RMW_", "ROS_")
 _UNSTEADY = "changed while it was read"
 
@@ -242,22 +244,22 @@ def _installation() -> Mapping[str, object]:
     return {
         "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path)),
         "the router's C library": CHECKSUM,
-        "the router's code": tuple(sorted(_stamps(_PACKAGE))) + tuple(sorted(_stamps(_SCHEMAS, ".json"))),
+        "the router's code": tuple(sorted(each for place in (_PACKAGE, *_SCHEMAS) for each in _stamps(place))),
         "the installed packages": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
     }
 
 
-def _stamps(folder: str, ending: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
-    """The files below a folder, each with what changes when it is written."""
+def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """The files of code below a folder, each with what changes when it is written."""
     try:
         entries = [*os.scandir(folder)]
     except OSError:
         return
     for entry in entries:
         if entry.is_dir(follow_symlinks=False):
-            if entry.name != "__pycache__":
-                yield from _stamps(entry.path, ending)
-        elif entry.name.endswith(ending):
+            if entry.name not in ("__pycache__", _ASSETS):
+                yield from _stamps(entry.path)
+        elif entry.name.endswith(_CODE):
             yield entry.path, _stamp(entry.stat(follow_symlinks=False))
 
 

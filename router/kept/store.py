@@ -69,7 +69,12 @@ def find() -> tuple[Kept | None, str]:
 
 
 def write(read: Plain, parts: object, image: bytes) -> None:
-    """Keep a program for this command line, folder and Python. Raises OSError, and the file is as it was before."""
+    """Keep a program for this command line, folder and Python.
+
+    Raises OSError, also if an input has changed since it was read; then what was kept before is still there.
+    """
+    if change := inputs.changed(read):
+        raise OSError(f"{change} has changed meanwhile")
     path = _path()
     folder = os.path.dirname(path)
     os.makedirs(folder, mode=0o700, exist_ok=True)

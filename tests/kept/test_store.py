@@ -211,11 +211,29 @@ def test_one_of_another_python_or_format_is_not_used(monkeypatch: pytest.MonkeyP
     assert refused() == "it has another format"
 
 
-def test_whole_files_with_other_content_are_refused_with_a_reason() -> None:
-    """They can only come of a bug; even that keeps no router from starting."""
-    for strange in (1, None, (("no such kind", "name", None),), (("file", 5, None),)):
+@pytest.mark.parametrize("strange", [1, None, (("no such kind", "name", None),), (("file", 5, None),)])
+def test_a_whole_file_with_other_content_is_refused_with_a_reason(
+    strange: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It can only come of a bug; even that keeps no router from starting."""
+    with monkeypatch.context() as unchecked:
+        unchecked.setattr(inputs, "changed", lambda _: "")
         store.write(strange, PARTS, IMAGE)  # type: ignore[arg-type]
-        assert "cannot be read" in refused()
+    assert "cannot be read" in refused()
+
+
+def test_a_program_whose_inputs_changed_since_they_were_read_is_not_kept(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep("before")
+    with monkeypatch.context() as changed:
+        changed.setenv(UNCHANGED[0][1], "5000")
+        with pytest.raises(OSError, match="has changed meanwhile"):
+            keep("after")
+    kept, _ = store.find()
+    assert kept is not None
+    assert kept.parts == "before"
+    only(cache)
 
 
 def test_at_most_four_are_kept_and_the_oldest_go(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
