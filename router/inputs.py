@@ -10,7 +10,7 @@ import os
 import stat
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
 
@@ -94,9 +94,8 @@ def noted() -> Iterator[Inputs]:
 def recording(before: Inputs | None = None) -> Iterator[Inputs]:
     """Note what this thread reads, what was read `before`, and what runs it: the installation and variables of ROS."""
     with noted() as inputs:
-        for kind, names in (("installation", _installation()), ("variables", _OF_ROS)):
-            for name in names:
-                inputs.note(kind, name, _PROBES[kind](name))
+        for name, value in _process().items():
+            inputs.note("process", name, value)
         if before is not None:
             inputs.add(before)
         yield inputs
@@ -231,13 +230,9 @@ def _listing(path: str) -> Listing | int:
     return folders, others
 
 
-def _starting_with(prefix: str) -> tuple[tuple[str, str], ...]:
-    return tuple(sorted((name, value) for name, value in os.environ.items() if name.startswith(prefix)))
-
-
 @cache
-def _installation() -> Mapping[str, object]:
-    """What this process runs: looked at once, since its modules are imported once, at the start."""
+def _process() -> Mapping[str, object]:
+    """What this process runs, as it was when it started: it imports its modules once."""
     from router.declared import CHECKSUM
 
     packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -245,6 +240,7 @@ def _installation() -> Mapping[str, object]:
         "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path)),
         "the router's C library": CHECKSUM,
         "the router's code": tuple(sorted(each for place in (_PACKAGE, *_SCHEMAS) for each in _stamps(place))),
+        "the variables of ROS": tuple(sorted(each for each in os.environ.items() if each[0].startswith(_OF_ROS))),
         "the installed packages": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
     }
 
@@ -260,7 +256,8 @@ def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
             if entry.name not in ("__pycache__", _ASSETS):
                 yield from _stamps(entry.path)
         elif entry.name.endswith(_CODE):
-            yield entry.path, _stamp(entry.stat(follow_symlinks=False))
+            with suppress(FileNotFoundError):  # it has just been removed
+                yield entry.path, _stamp(entry.stat(follow_symlinks=False))
 
 
 def _stamp(status: os.stat_result) -> tuple[int, ...]:
@@ -274,9 +271,8 @@ _PROBES: Mapping[str, Callable[[str], object]] = {
     "folder": _listing,
     "link": os.path.realpath,
     "variable": os.environ.get,
-    "variables": _starting_with,
     "names": lambda _: tuple(sorted(os.environ)),
-    "installation": lambda name: _installation().get(name),
+    "process": lambda name: _process().get(name),
 }
 _WORDS: Mapping[str, str] = {
     "file": "the file {}",
@@ -284,7 +280,6 @@ _WORDS: Mapping[str, str] = {
     "folder": "the files in the folder {}",
     "link": "where the path {} leads",
     "variable": "the variable {}",
-    "variables": "the variables {}*",
     "names": "the variables that there are",
-    "installation": "{}",
+    "process": "{}",
 }

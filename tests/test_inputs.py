@@ -54,8 +54,9 @@ def put(path: str, text: str) -> None:
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The working directory, with a table, protos, options, and the prefixes of two workspaces, one of them empty."""
+    inputs._process.cache_clear()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/over{os.pathsep}{tmp_path}/under")
     monkeypatch.delenv("PORT", raising=False)
@@ -65,7 +66,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     put("protos/envelope.options", "Reading.name max_size:16\n")
     put("protos/.git/HEAD", "ref: refs/heads/main\n")
     put("under/share/our_msgs/msg/Reading.msg", MSG)
-    return tmp_path
+    yield tmp_path
+    inputs._process.cache_clear()
 
 
 def compiled(known: Program | None = None) -> tuple[Program, Plain]:
@@ -79,7 +81,7 @@ def compiled(known: Program | None = None) -> tuple[Program, Plain]:
 
 def changed_in_new_process(plain: Plain) -> str:
     """What a start finds, which looks at the installation anew."""
-    inputs._installation.cache_clear()
+    inputs._process.cache_clear()
     return inputs.changed(plain)
 
 
@@ -113,9 +115,9 @@ EDITS: dict[str, tuple[Callable[[], object], str]] = {
     "a link to the same files": (link_elsewhere, "protos"),
     "a variable": (lambda: os.environ.update(PORT="5001"), "PORT"),
     "a variable that is empty": (lambda: os.environ.update(PORT=""), "PORT"),
-    "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "AMENT_"),
-    "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "ROS_"),
-    "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "RMW_"),
+    "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "the variables of ROS"),
+    "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "the variables of ROS"),
+    "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "the variables of ROS"),
     "a folder in place of a file": (folder_instead, "base.yaml"),
     "a pipe in place of a file": (
         pipe_instead,
@@ -243,7 +245,7 @@ def test_code_of_the_router_that_changed_is_found_by_the_next_process(
     put(f"{package}/cli/run.py", "pass")
     put(f"{package}/__init__.py", "pass")
     monkeypatch.setattr(inputs, "_PACKAGE", str(package))
-    inputs._installation.cache_clear()
+    inputs._process.cache_clear()
     with inputs.recording() as read:
         pass
     put(f"{package}/cli/__pycache__/run.pyc", "compiled")
@@ -255,7 +257,7 @@ def test_code_of_the_router_that_changed_is_found_by_the_next_process(
     assert inputs.changed(read.plain()) == "", "this process runs the code that it has imported"
     assert changed_in_new_process(read.plain()) == "the router's code"
     monkeypatch.undo()
-    inputs._installation.cache_clear()
+    inputs._process.cache_clear()
 
 
 _WATCHED = """
