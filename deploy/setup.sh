@@ -163,6 +163,11 @@ build_comms() (
   rm -r "$build"
 )
 
+# The service may not write to the checkout, and would compile all of it with each start.
+compile_router() {
+  "$python" -m compileall -q router
+}
+
 is_usable() {  # the environment: made here, its interpreter still there, and the one asked for
   local identity='import sys; print(sys.base_prefix, sys.version)'
   is_made environment "$environment" && "$python" -c '' 2>/dev/null || return 1
@@ -190,6 +195,7 @@ carrier=library  # which has the checksum of its sources in it
 comms=$({ find schemas/comms deploy/interfaces.cmake -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
 
 if is_usable && is_made packages "$packages" && is_made carrier "$carrier" && is_made comms "$comms"; then
+  compile_router
   echo "setup: .venv is up to date"
   exit
 fi
@@ -203,3 +209,4 @@ fi
 step packages "$packages" "packages${ros:+, with ROS from $ros}" install_packages
 step carrier "$carrier" "carrier" build_carrier
 step comms "$comms" "ROS interfaces of schemas/comms" build_comms
+compile_router

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import errno
 import io
-import logging
 import os
 import select
 import sys
 import threading
 from collections.abc import Callable, Hashable
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TextIO
-
-import structlog
 
 from router.clock import monotonic_ns
 
-logger: structlog.typing.FilteringBoundLogger = structlog.get_logger("router")
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from types import ModuleType
+    from typing import Any, TextIO
+
+    from structlog.typing import FilteringBoundLogger, Processor
 
 Emit = Callable[..., None]
 """Called as `emit(event, **values)`, like a method of a structlog logger."""
@@ -40,12 +40,15 @@ def is_shortage(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error) == NO_THREAD)
 
 
-class Fault(NamedTuple):
+class Fault:
     """What to log of an exception that nobody expected. `error` has the traceback."""
 
-    emit: Emit
-    event: str
-    error: BaseException | None
+    __slots__ = ("emit", "error", "event")
+
+    def __init__(self, emit: Emit, event: str, error: BaseException | None) -> None:
+        self.emit = emit
+        self.event = event
+        self.error = error
 
     def log(self) -> None:
         self.emit(self.event, exc_info=self.error)
@@ -59,10 +62,53 @@ def fault(error: BaseException, what: str, within: str = "the router itself") ->
     return Fault(logger.critical, f"a fault in {within} {what}; please report it", error)
 
 
+class LazyLogger:
+    """structlog's logger of this name, which is imported and set up with the first line."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._configure: Callable[[ModuleType], None] | None = None
+        self._logger: FilteringBoundLogger | None = None
+
+    def configure(self, configure: Callable[[ModuleType], None]) -> None:
+        """Have `configure` set up structlog, which it gets, before the next line."""
+        self._configure, self._logger = configure, None
+
+    def __getattr__(self, method: str) -> Any:
+        if self._logger is None:
+            structlog = _import_structlog()
+            if self._configure is not None:
+                self._configure(structlog)
+            self._logger = structlog.get_logger(self._name)
+        return getattr(self._logger, method)
+
+
+logger: FilteringBoundLogger = LazyLogger("router")
+
+
+def _import_structlog() -> ModuleType:
+    """Without rich, which it would import for tracebacks that are not used here: more than half of the time."""
+    is_left_out = "rich" not in sys.modules
+    if is_left_out:
+        sys.modules["rich"] = None  # type: ignore[assignment]
+    try:
+        import structlog
+    finally:
+        if is_left_out:
+            del sys.modules["rich"]
+    return structlog
+
+
 def configure_log(level: str = "info", *, coloured: bool = False) -> None:
-    """Set up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
+    """Set up the log for the whole process. `level` is one of LEVELS; colours are for terminals only."""
+    logger.configure(lambda structlog: _configure(structlog, level, coloured=coloured))  # type: ignore[attr-defined]
+
+
+def _configure(structlog: Any, level: str, *, coloured: bool) -> None:
+    import logging
+
     on_terminal = sys.stderr.isatty()
-    rendering: list[structlog.typing.Processor] = (
+    rendering: list[Processor] = (
         # A plain traceback, without frames and locals.
         [
             structlog.dev.ConsoleRenderer(
@@ -79,7 +125,7 @@ def configure_log(level: str = "info", *, coloured: bool = False) -> None:
             *rendering,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(_NonBlockingStream(sys.stderr)),  # type: ignore[arg-type]
+        logger_factory=structlog.PrintLoggerFactory(_NonBlockingStream(sys.stderr)),
         cache_logger_on_first_use=True,
     )
 
@@ -120,18 +166,19 @@ def _is_file(stream: TextIO) -> bool:
     return True
 
 
-@dataclass(slots=True)
 class _Flood:
     """Events of one kind: the time of the last line, and the number of events since."""
 
-    emit: Emit
-    event: str
-    values: dict[str, Any]
-    last_line_ns: int
-    pending: int = 0
+    __slots__ = ("emit", "event", "last_line_ns", "pending", "values")
+
+    def __init__(self, emit: Emit, event: str, values: dict[str, Any], last_line_ns: int, pending: int) -> None:
+        self.emit = emit
+        self.event = event
+        self.values = values
+        self.last_line_ns = last_line_ns
+        self.pending = pending
 
 
-@dataclass(slots=True)
 class FloodLog:
     """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their number.
 
@@ -139,9 +186,10 @@ class FloodLog:
     a summary.
     """
 
-    clock_ns: Callable[[], int] = monotonic_ns
-    _floods: dict[Hashable, _Flood] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    def __init__(self, clock_ns: Callable[[], int] = monotonic_ns) -> None:
+        self._clock_ns = clock_ns
+        self._floods: dict[Hashable, _Flood] = {}
+        self._lock = threading.Lock()
 
     def note(
         self,
@@ -153,7 +201,7 @@ class FloodLog:
         **values: Any,
     ) -> None:
         """Log or count `times` events of the kind `key`. The first line has the traceback of `exc_info`."""
-        now = self.clock_ns()
+        now = self._clock_ns()
         with self._lock:
             flood = self._floods.get(key)
             if flood is None and len(self._floods) >= MOST_KEYS:
@@ -170,7 +218,7 @@ class FloodLog:
 
     def flush(self, *, final: bool = False) -> None:
         """Write the summaries that are due, or with `final` all that are pending."""
-        now = self.clock_ns()
+        now = self._clock_ns()
         with self._lock:
             for flood in self._floods.values():
                 if flood.pending and (final or now - flood.last_line_ns >= SUMMARY_INTERVAL_NS):

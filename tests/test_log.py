@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -80,30 +82,48 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.fixture
+def fresh_log(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(log, "logger", log.LazyLogger("router"))
+    yield
+    structlog.reset_defaults()
+
+
+@pytest.mark.usefixtures("fresh_log")
 @pytest.mark.parametrize("coloured", [True, False])
 def test_on_a_terminal_a_line_is_for_reading(coloured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     log.configure_log(coloured=coloured)
-    try:
-        structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here")
-    finally:
-        structlog.reset_defaults()
+    log.logger.warning("datagram rejected", reason="empty", detail="from here")
     line = terminal.getvalue()
     assert ("\x1b[" in line) is coloured
     if not coloured:
         assert line.split()[1:] == ["[warning", "]", "datagram", "rejected", "reason=empty", "detail='from", "here'"]
 
 
+@pytest.mark.usefixtures("fresh_log")
 def test_a_reader_that_stands_still_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
     with os.fdopen(reading), os.fdopen(writing, "w") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
         log.configure_log()
-        try:
-            for _ in range(2000):  # several times what a pipe holds
-                structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here" * 20)
-        finally:
-            structlog.reset_defaults()
+        for _ in range(2000):  # several times what a pipe holds
+            log.logger.warning("datagram rejected", reason="empty", detail="from here" * 20)
         written = os.read(reading, 1 << 20)
     assert 0 < written.count(b"\n") < 2000
     assert written.endswith(b"}\n")
+
+
+def test_structlog_is_loaded_with_the_first_line_and_without_what_renders_tracebacks() -> None:
+    script = """
+import sys
+from router.log import FloodLog, configure_log, logger
+configure_log("error")
+print("structlog" in sys.modules)
+logger.error("a line")
+print("structlog" in sys.modules, *{"rich", "rich.console"} & {*sys.modules})
+import rich
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True"]
+    assert '"event": "a line"' in done.stderr

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 
 from router.clock import monotonic_ns
 from router.log import logger
-from router.net.udp import inherited
+from router.net.udp import unclaimed
 
 _CHECKS = 4
 """How often progress is checked within the watchdog's time."""
@@ -35,7 +35,7 @@ def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[N
     progress; a socket of -1 ends that. If the router is stuck, the service manager ends it with SIGABRT, and the log
     shows where each thread stood.
     """
-    for address in inherited().unclaimed():
+    for address in unclaimed():
         logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
         notify("READY=1")

@@ -13,7 +13,8 @@ from router.compiler.network import LOOPBACK, WILDCARD, sent_from
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.udp import Listener, absence, usual_source, why_unreachable
+from router.net.sockets import ListeningSocket
+from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 
@@ -22,14 +23,14 @@ from router.table.addresses import Address, BadAddressError
 class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
-    `moves` are the sockets by which senders that stay are to send, with the listener whose port each has. `opened`
-    closes the sockets opened for it; `left`, once it is applied, those that it does not use.
+    `moves` are the sockets by which senders that stay are to send, with that of the listener whose port each has.
+    `opened` closes the sockets opened for it; `left`, once it is applied, those that it does not use.
     """
 
     program: Program
     listeners: dict[str, Listener]
     senders: dict[str, NativeSender]
-    moves: list[tuple[NativeSender, Listener | None, socket.socket]]
+    moves: list[tuple[NativeSender, ListeningSocket | None, socket.socket]]
     opened: ExitStack
     left: ExitStack = field(default_factory=ExitStack)
 
@@ -138,19 +139,21 @@ class Sockets:
                 listeners[plan.name] = listener
             senders: dict[str, NativeSender] = {}
             moves = []
-            every = [*self._bound.values(), *listeners.values()]
+            every = [each.opened for each in (*self._bound.values(), *listeners.values())]
             for to in program.senders:
                 source = _source(sent_from(program.table, to), listeners)
+                beside = source.opened if source is not None else None
                 destination, sender = self._senders.get(to.name, (None, None))
                 is_new = sender is None or destination != _destination(to)
                 _check_reachable(to, is_new)
                 if sender is None or is_new:
-                    sender = NativeSender(self._library, to, source, every)
+                    opened = open_sending(to, source, every)
+                    sender = NativeSender(self._library, to.address.value, opened, beside)
                     opening.callback(sender.close)
-                elif not sender.is_placed(source, every):
-                    opened = sender.open_socket(source, every)
+                elif not sender.is_placed(beside, every):
+                    opened = open_sending(to, source, every)
                     opening.callback(opened.close)
-                    moves.append((sender, source, opened))
+                    moves.append((sender, beside, opened))
                 _check_source(to, sender)
                 senders[to.name] = sender
             return SocketChange(program, listeners, senders, moves, opening.pop_all())
@@ -158,7 +161,7 @@ class Sockets:
     def _sending_ports(self) -> set[int]:
         """The ports of listeners that senders are bound to as well."""
         senders = [sender for _, sender in self._senders.values()]
-        return {sender.source.address.port for sender in senders if sender.source is not None and sender.is_bound}
+        return {sender.source.address[1] for sender in senders if sender.source is not None and sender.is_bound}
 
     def left(self, change: SocketChange) -> list[Listener]:
         """The listeners that the change does not use."""

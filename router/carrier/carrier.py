@@ -8,7 +8,6 @@ import os
 from router import declared as c
 from router.carrier.ring import Ring
 from router.carrier.threads import NativeThread
-from router.errors import StartError
 
 
 class Carrier(NativeThread):
@@ -43,6 +42,8 @@ class Carrier(NativeThread):
     def start(self, change: c.Change, *used: object) -> None:
         """Start the threads with a program, which needs what is `used` as well. Raises StartError."""
         if error := self._library.carrier_start(self._address, ctypes.byref(change)):
+            from router.errors import StartError
+
             raise StartError(f"the carrier's threads cannot be started: {os.strerror(error)}")
         self._running = change, used
 

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import indent
 from types import ModuleType
 
 _HEAD = '''"""What the headers of the carrier declare: made of them by router/carrier/headers.py with each build."""
@@ -20,14 +21,23 @@ import ctypes
 from collections.abc import Mapping
 from ctypes import POINTER
 from enum import IntEnum
+
+TYPE_CHECKING = False
 '''
+
+_LAZY = """
+def __getattr__(name: str) -> type[IntEnum]:
+    \"""Make an enum when it is used first: all of them take longer than the rest of this module.\"""
+    if name not in _ENUMS:
+        raise AttributeError(f"the headers declare no {name}")
+    return globals().setdefault(name, IntEnum(name, _ENUMS[name], module=__name__))
+"""
 
 _LIMITS = {f"{sign}INT{bits}_MAX": (1 << bits - (not sign)) - 1 for sign in ("", "U") for bits in (8, 16, 32, 64)}
 _PLAIN = {
     **{f"{sign}int{bits}_t": f"ctypes.c_{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
     **{name: f"ctypes.c_{name}" for name in ("bool", "char", "int", "size_t", "float", "double")},
 }
-_NUMBER = re.compile(r"-?\d+")
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _DIRECTIVE = re.compile(r"^#(?:.*\\\n)*.*$", re.MULTILINE)
 _DEFINED = re.compile(r"^#define (\w+) (\w+)\s*$", re.MULTILINE)
@@ -53,19 +63,18 @@ class _Member:
 
 @dataclass(slots=True)
 class _Declared:
-    constants: list[tuple[str, str]] = field(default_factory=list)
-    """By name, what each one is in Python."""
-    enums: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
-    """By tag, the enumerators and what each one is in Python."""
+    constants: dict[str, int] = field(default_factory=dict)
+    enums: dict[str, dict[str, int]] = field(default_factory=dict)
+    """By tag, the enumerators without the prefix that they have in common."""
     structures: dict[str, list[_Member]] = field(default_factory=dict)
     functions: dict[str, tuple[str, str]] = field(default_factory=dict)
-    python: dict[str, str] = field(default_factory=dict)
-    """By their names in C, what enumerators and limits are in Python."""
+    values: dict[str, int] = field(default_factory=dict)
+    """Enumerators and limits by their names in C."""
 
 
 def declarations(folder: Path, checksum: str) -> str:
     """The text of the module. Raises HeaderError."""
-    declared = _Declared(python={name: str(value) for name, value in _LIMITS.items()})
+    declared = _Declared(values=dict(_LIMITS))
     for statement in _statements(folder, declared):
         _declare(statement, declared)
     return "\n".join([_HEAD, f'CHECKSUM = "{checksum}"', *_text(declared), ""])
@@ -114,9 +123,8 @@ def _statements(folder: Path, declared: _Declared) -> Iterator[str]:
         for included in _INCLUDED.findall(text):
             yield from read(included)
         for constant, value in _DEFINED.findall(text):
-            if value in declared.python:
-                declared.python[constant] = constant
-                declared.constants.append((constant, declared.python[value]))
+            if value in declared.values:
+                declared.constants[constant] = declared.values[constant] = declared.values[value]
         yield from _split(_DIRECTIVE.sub("", text))
 
     for path in sorted(folder.glob("*.h")):
@@ -167,22 +175,12 @@ def _declare_enum(tag: str, body: str, declared: _Declared) -> None:
     prefix = names[0].partition("_")[0] + "_"
     if sum(name.startswith(prefix) for name in names) < max(2, len(names) - 1):
         prefix = ""
-    if tag:
-        declared.enums[tag] = []
-    base, since = "0", 0
-    for at, (name, value) in enumerate(enumerators):
-        if value:
-            base, since = re.sub(r"[A-Z]\w+", lambda found: declared.python[found[0]], value), at
-        python = f"({base}) + {at - since}" if at > since else base
-        if _NUMBER.fullmatch(base):
-            python = str(int(base) + at - since)
-        if tag:
-            short = name.removeprefix(prefix)
-            declared.enums[tag].append((short, python))
-            declared.python[name] = f"{_class(tag)}.{short}"
-        else:
-            declared.constants.append((name, python))
-            declared.python[name] = name
+    short = declared.enums.setdefault(tag, {}) if tag else declared.constants
+    value = -1
+    for name, text in enumerators:
+        value = eval(text, None, declared.values) if text else value + 1  # noqa: S307 - C of our own
+        declared.values[name] = value
+        short[name.removeprefix(prefix) if tag else name] = value
 
 
 def _members(body: str) -> list[_Member] | None:
@@ -248,11 +246,9 @@ def _text(declared: _Declared) -> Iterator[str]:
     classes = {_class(tag) for tag in known}
     if both := classes & {_class(tag) for tag in declared.enums}:
         raise HeaderError(f"both a struct and an enum: {', '.join(sorted(both))}")
-    for tag, enumerators in declared.enums.items():
-        yield f'\n\nclass {_class(tag)}(IntEnum):\n    """`enum {tag}`."""\n'
-        yield from (f"    {name} = {value}" for name, value in enumerators)
-    yield "\n"
-    yield from (f"{name} = {value}" for name, value in declared.constants)
+    if declared.enums:
+        yield from _enums(declared.enums)
+    yield from (f"{name} = {value}" for name, value in declared.constants.items())
     for tag in known:
         yield f'\n\nclass {_class(tag)}(ctypes.Structure):\n    """`struct {tag}`."""'
     yield "\n"
@@ -270,8 +266,18 @@ def _text(declared: _Declared) -> Iterator[str]:
     yield from (f'    "{tag}": {_class(tag)},' for tag in known)
     yield "}\n"
     yield "ENUMERATORS: Mapping[str, int] = {"
-    yield from (f'    "{name}": {python},' for name, python in declared.python.items() if name not in _LIMITS)
+    yield from (f'    "{name}": {value},' for name, value in declared.values.items() if name not in _LIMITS)
     yield "}"
+
+
+def _enums(enums: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
+    yield "\nif TYPE_CHECKING:"
+    for tag, enumerators in enums.items():
+        yield f"\n    class {_class(tag)}(IntEnum):"
+        yield from (f"        {name} = {value}" for name, value in enumerators.items())
+    yield "\nelse:\n    _ENUMS = {"
+    yield from (f'        "{_class(tag)}": {enumerators},' for tag, enumerators in enums.items())
+    yield f"    }}\n{indent(_LAZY, '    ')}"
 
 
 def _known(structures: Mapping[str, list[_Member]]) -> Iterator[tuple[str, list[_Member]]]:

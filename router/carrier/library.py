@@ -1,18 +1,28 @@
 """Finds and loads the carrier's library, which `build.py` makes, and declares its functions.
 
 A library of other sources than those beside it is refused: its structures may differ from those in `router.declared`.
+A wheel has no sources.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
+from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 from router import declared
-from router.assets import asset, is_installed
-from router.carrier.build import LIBRARY, checksum
-from router.errors import StartError
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from router.errors import StartError
+
+_CARRIER = os.path.dirname(__file__)  # noqa: PTH120 - pathlib takes 5 ms to import
+NATIVE = f"{_CARRIER}/native"
+LIBRARY = f"{NATIVE}/libcarrier.so"
+"""The file that `build.py` makes."""
 
 
 @cache
@@ -21,17 +31,19 @@ def library() -> ctypes.CDLL:
     return load()
 
 
-def load(path: Path = LIBRARY) -> ctypes.CDLL:
+def load(path: str | Path = LIBRARY) -> ctypes.CDLL:
     """Load the library, without which nothing runs, and declare its functions. Raises StartError."""
-    if not path.exists():
-        raise StartError(f"{path} was not built, and nothing runs without it", _remedy())
+    try:
+        built = os.stat(path).st_mtime_ns  # noqa: PTH116 - as above
+    except FileNotFoundError:
+        raise _refused(f"{path} was not built, and nothing runs without it") from None
     try:
         library = ctypes.CDLL(str(path))
         made_of = _text(library.carrier_checksum)
     except (OSError, AttributeError) as error:  # of another architecture, or no such library at all
-        raise StartError(f"{path} cannot be loaded: {error}", _remedy()) from None
-    if not made_of == declared.CHECKSUM == checksum():
-        raise StartError(f"{path} was built from other sources", _remedy())
+        raise _refused(f"{path} cannot be loaded: {error}") from None
+    if made_of != declared.CHECKSUM or (any(changed >= built for changed in _changes()) and made_of != _checksum()):
+        raise _refused(f"{path} was built from other sources")
     for name, (returned, taken) in declared.FUNCTIONS.items():
         function = getattr(library, name)
         function.restype, function.argtypes = returned, taken
@@ -43,7 +55,24 @@ def _text(function: ctypes._NamedFuncPointer) -> str:
     return str(function().decode())
 
 
-def _remedy() -> str:
+def _changes() -> Iterator[int]:
+    """When each source was changed last: to read them all takes longer than the rest of a start."""
+    for folder, endings in (NATIVE, (".c", ".h")), (_CARRIER, ("build.py", "headers.py")):
+        with os.scandir(folder) as files:
+            yield from (file.stat().st_mtime_ns for file in files if file.name.endswith(endings))
+
+
+def _checksum() -> str:
+    from router.carrier.build import checksum
+
+    return checksum()
+
+
+def _refused(what: str) -> StartError:
+    from router.assets import asset, is_installed
+    from router.errors import StartError
+
+    hint = "run 'make setup'"
     if is_installed(asset("schemas")):
-        return "install the router again where there is a C compiler"
-    return "run 'make setup'"
+        hint = "install the router again where there is a C compiler"
+    return StartError(what, hint)

@@ -1,4 +1,4 @@
-"""Senders of the carrier: the sockets are those of `net.udp`, the sending is native."""
+"""Senders of the carrier: the sockets are those of `net.sockets`, the sending is native."""
 
 from __future__ import annotations
 
@@ -6,35 +6,54 @@ import ctypes
 import socket
 from collections.abc import Collection
 
-from router.net.udp import Listener, Sender
-from router.table.model import Endpoint
+from router.net.sockets import ListeningSocket, address_beside, is_beside, leaves_from
 
 
-class NativeSender(Sender):
-    """See `Sender`. `address` is that of its `struct sender`."""
+class NativeSender:
+    """Sends to one address by a socket that `net.sockets.open_sending` has opened for `source`, and closes it.
+
+    `address` is that of its `struct sender`.
+    """
 
     def __init__(
         self,
         library: ctypes.CDLL,
-        endpoint: Endpoint,
-        source: Listener | None = None,
-        listeners: Collection[Listener] = (),
+        destination: tuple[str, int],
+        opened: socket.socket,
+        source: ListeningSocket | None = None,
     ) -> None:
-        """Raises OSError, and MemoryError."""
-        self.address = 0
+        """Raises MemoryError."""
         self._library = library
-        super().__init__(endpoint, source, listeners)
-        host, port = endpoint.address.value
+        self.socket = opened
+        self.source = source
+        host, port = destination
         number = int.from_bytes(socket.inet_aton(host), "big")
-        self.address = int(library.sender_open(self.socket.fileno(), self._listening, number, port) or 0)
+        self.address = int(library.sender_open(opened.fileno(), self._listening, number, port) or 0)
         if not self.address:
-            super().close()
+            opened.close()
             raise MemoryError("a sender of the carrier cannot be opened")
 
-    def move(self, source: Listener | None, opened: socket.socket) -> socket.socket:
-        left = super().move(source, opened)
+    def move(self, source: ListeningSocket | None, opened: socket.socket) -> socket.socket:
+        """Send by `opened` from now on. Return the earlier socket, for the caller to close when no thread uses it."""
+        left, self.socket, self.source = self.socket, opened, source
         self._library.sender_move(self.address, opened.fileno(), self._listening)
         return left
+
+    def is_placed(self, source: ListeningSocket | None, listening: Collection[ListeningSocket]) -> bool:
+        """Whether it sends from where one that is opened now would."""
+        if self.source is not source or source is None or not self.is_bound:
+            return self.source is source
+        return self.leaves_from == address_beside(source, listening)[0]
+
+    @property
+    def leaves_from(self) -> str:
+        """The address that the socket is bound to; 0.0.0.0 if the kernel chooses one for each datagram."""
+        return leaves_from(self.socket)
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether it sends from the port of its listener."""
+        return is_beside(self.socket)
 
     @property
     def _listening(self) -> int:
@@ -44,7 +63,7 @@ class NativeSender(Sender):
     def close(self) -> None:
         """Close the socket. Sending afterwards raises OSError."""
         self._library.sender_end(self.address)
-        super().close()
+        self.socket.close()
 
     def __del__(self) -> None:
         if self.address:

@@ -11,10 +11,13 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 
 from router.clock import wall_ns
 from router.log import logger
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from pathlib import Path
 
 # Linux constants that the socket module does not name.
 SO_ATTACH_FILTER = 26
@@ -86,7 +89,7 @@ def drops(opened: socket.socket) -> int:
         words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
         return int(words[_MEMINFO_DROPS])
     inode = str(os.fstat(opened.fileno()).st_ino)
-    return next((int(row[-1]) for row in _rows(Path("/proc/net/udp")) if row[_INODE] == inode), 0)
+    return next((int(row[-1]) for row in _rows("udp") if row[_INODE] == inode), 0)
 
 
 def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
@@ -181,22 +184,27 @@ def _described(process: Path | None) -> str:
 
 
 def _process(protocol: str, port: int) -> Path | None:
+    from pathlib import Path
+
     wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
     processes = Path("/proc").glob("[0-9]*")
     return next((each for each in processes if not wanted.isdisjoint(_open_files(each))), None)
 
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:
-    for table in (Path("/proc/net", protocol), Path("/proc/net", f"{protocol}6")):
-        for row in _rows(table) if table.exists() else ():
+    for table in protocol, f"{protocol}6":
+        for row in _rows(table):
             local, state, inode = row[1], row[3], row[_INODE]
             if state == _BOUND[protocol] and int(local.rpartition(":")[2], 16) == port:
                 yield inode
 
 
-def _rows(table: Path) -> Iterator[list[str]]:
-    """Those of a table in /proc/net, each as its columns."""
-    return (line.split() for line in table.read_text().splitlines()[1:])
+def _rows(table: str) -> Iterator[list[str]]:
+    """Those of a table in /proc/net, each as its columns. The kernel may have none for IPv6."""
+    from pathlib import Path
+
+    with suppress(FileNotFoundError):
+        yield from (line.split() for line in Path("/proc/net", table).read_text().splitlines()[1:])
 
 
 def _open_files(process: Path) -> Iterator[str]:

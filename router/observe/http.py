@@ -176,7 +176,8 @@ class _Server:
         connection.close()
 
     def _lost(self, error: Exception) -> None:
-        self._log.note(type(error).__name__, *fault(error, "lost an answer over HTTP"))
+        found = fault(error, "lost an answer over HTTP")
+        self._log.note(type(error).__name__, found.emit, found.event, found.error)
         self._log.flush()
 
 

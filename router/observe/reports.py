@@ -88,7 +88,8 @@ class Reporter:
         return why_not_sent(error, address)
 
     def failed(self, error: Exception) -> None:
-        self._floods.note(("bug", type(error)), *fault(error, "lost a message"))
+        found = fault(error, "lost a message")
+        self._floods.note(("bug", type(error)), found.emit, found.event, found.error)
 
     def deadman_changed(self, route: str, active: bool, plan: DeadmanPlan | None) -> None:
         """Log that the deadman of a route has tripped or was released; `plan` is that of the running table."""

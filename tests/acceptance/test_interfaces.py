@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from router.net.udp import Inherited
+from router.net.sockets import Inherited
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import ROOT, wait_until
 from tests.acceptance.two_networks import (
@@ -169,10 +169,10 @@ def test_a_socket_that_was_handed_over_is_not_taken_when_its_interface_has_gone(
 
     with site.rover.inside(bound) as held:
         ours = Inherited([held.dup()])
-        with ours.take("0.0.0.0:5000 on radio0") or pytest.fail("it is there"):
+        with ours.take(("0.0.0.0", 5000), "radio0") or pytest.fail("it is there"):
             pass
         site.rover.ip("link", "del", "radio0")
-        assert ours.take("0.0.0.0:5000 on radio0") is None
+        assert ours.take(("0.0.0.0", 5000), "radio0") is None
 
 
 @pytest.mark.slow

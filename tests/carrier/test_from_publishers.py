@@ -29,6 +29,7 @@ from router.carrier.ros_routes import native_from_ros
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
 from router.compiler.program import Program
+from router.net.udp import open_sending
 from router.ros.node import close_node, open_node
 from router.ros.qos import qos_profile
 from router.ros.receiving import RESET, TAKE, RawSubscription
@@ -87,7 +88,7 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         board.settimeout(20)
         made = program(tmp_path, ROUTES, HEAD.replace("PORT", str(board.getsockname()[1])))
         names = Names()
-        senders = {endpoint.name: NativeSender(library, endpoint) for endpoint in made.senders}
+        senders = {to.name: NativeSender(library, to.address.value, open_sending(to)) for to in made.senders}
         for sender in senders.values():
             stack.callback(sender.close)
         counters = (ctypes.c_int64 * (1 << 12))()

@@ -109,6 +109,15 @@ def test_constants_enums_structures_and_functions_are_those_of_the_headers(heade
     assert (outside.next[0].one, outside.integer, outside.text) == (7, 0x3FF0_0000_0000_0000, b"text")
 
 
+def test_an_enum_is_made_when_it_is_used_and_once(headers: Path) -> None:
+    module = made(headers)
+    assert "Kind" not in vars(module)
+    assert module.Kind is module.Kind
+    assert "Kind" in vars(module)
+    with pytest.raises(AttributeError, match="the headers declare no Kinds"):
+        _ = module.Kinds
+
+
 def test_the_compiler_finds_what_was_not_read_as_it_reads_it(headers: Path) -> None:
     module = made(headers)
     text = checks(headers, module)

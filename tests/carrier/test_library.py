@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -18,10 +20,38 @@ def test_without_a_library_nothing_runs(tmp_path: Path) -> None:
         load(tmp_path / "libcarrier.so")
 
 
-def test_a_library_of_other_sources_is_refused(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library, "checksum", lambda: "0" * 64)
+SOURCES = ["native/route.c", "native/wire.h", "build.py", "headers.py"]
+
+
+@pytest.fixture
+def installed(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A library built after the sources beside it were changed last."""
+    made = Path(shutil.copy(built, tmp_path))
+    (tmp_path / "native").mkdir()
+    for source in SOURCES:
+        (tmp_path / source).touch()
+        os.utime(tmp_path / source, ns=(0, made.stat().st_mtime_ns - 1))
+    monkeypatch.setattr(library, "_CARRIER", str(tmp_path))
+    monkeypatch.setattr(library, "NATIVE", str(tmp_path / "native"))
+    return made
+
+
+@pytest.mark.parametrize("changed", SOURCES)
+def test_a_library_of_other_sources_is_refused(installed: Path, changed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "checksum", lambda: "0" * 64)
+    load(installed)  # no source was changed since: none is read
+    os.utime(installed.parent / changed, ns=(0, installed.stat().st_mtime_ns))
     with pytest.raises(StartError, match="was built from other sources; run 'make setup'"):
-        load(built)
+        load(installed)
+
+
+def test_sources_that_are_younger_and_the_same_are_no_others(installed: Path) -> None:
+    (installed.parent / "native" / "route.c").touch()
+    load(installed)
+
+
+def test_what_builds_the_library_and_what_loads_it_name_the_same_file() -> None:
+    assert Path(library.LIBRARY) == build.LIBRARY
 
 
 def test_what_is_no_library_is_refused(tmp_path: Path) -> None:

@@ -7,20 +7,20 @@ import errno
 import os
 import select
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.carrier.sender import NativeSender
-from router.net import udp
+from router.net import sockets
 from router.net.kernel import IP_FREEBIND
-from router.net.udp import Inherited, Listener
+from router.net.sockets import Inherited
+from router.net.udp import Listener, open_sending
 from router.table.addresses import Address
-from router.table.model import EndpointKind
+from router.table.model import Endpoint, EndpointKind
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint, plan
 
@@ -46,7 +46,11 @@ class Sending(NativeSender):
 
 @pytest.fixture(scope="session")
 def make(library: ctypes.CDLL) -> Make:
-    return partial(Sending, library)
+    def make(to: Endpoint, source: Listener | None = None, listeners: Sequence[Listener] = ()) -> Sending:
+        opened = open_sending(to, source, [each.opened for each in listeners])
+        return Sending(library, to.address.value, opened, source.opened if source else None)
+
+    return make
 
 
 @pytest.fixture
@@ -160,7 +164,7 @@ def test_it_shares_the_port_of_an_inherited_listener_also_while_the_address_is_n
     held.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
     held.bind(("10.78.1.3", 5000))
     ours = Inherited([held.dup()])
-    monkeypatch.setattr(udp, "inherited", lambda: ours)
+    monkeypatch.setattr(sockets, "inherited", lambda: ours)
     listener = stack.enter_context(closing(rover.inside(lambda: Listener(plan(host="10.78.1.3", port=5000)))))
     assert (listener.is_inherited, listener.is_waiting) == (True, False)
     assert rover.inside(listener.lacks_network)
@@ -283,8 +287,10 @@ def test_a_sender_moves_to_another_port_and_back(
     stack: ExitStack, sender: Sending, board: socket.socket, listener: Listener
 ) -> None:
     other = stack.enter_context(closing(Listener(plan("other"))))
+    to = endpoint("board", Address(*board.getsockname()))
     for source in (other, None, listener):
-        sender.move(source, sender.open_socket(source, [listener, other])).close()
+        opened = open_sending(to, source, [listener.opened, other.opened])
+        sender.move(source.opened if source else None, opened).close()
         sender.send(b"drive")
         _, where_from = board.recvfrom(100)
         assert where_from[1] == (source.address if source else sender.socket.getsockname())[1]

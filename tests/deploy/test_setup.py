@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
@@ -176,6 +177,16 @@ def test_second_run_calls_nothing_and_changes_nothing(checkout: Checkout) -> Non
     before = checkout.files()
     assert checkout.set_up() == ["setup: .venv is up to date"]
     assert checkout.files() == before
+
+
+def test_modules_are_compiled_for_a_service_that_may_not_write(checkout: Checkout) -> None:
+    module = checkout.root / "router" / "carrier" / "build.py"
+    compiled = Path(cache_from_source(str(module)))
+    checkout.set_up(ROS=str(checkout.ros))
+    before = compiled.stat().st_mtime_ns
+    module.write_text(module.read_text() + "\n")
+    checkout.set_up()
+    assert compiled.stat().st_mtime_ns > before
 
 
 def test_interfaces_are_built_again_after_a_change_of_how(checkout: Checkout) -> None:

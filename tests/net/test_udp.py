@@ -14,9 +14,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.errors import Located, SourceSpan, StartError
-from router.net import udp
+from router.net import sockets, udp
 from router.net.kernel import SO_TIMESTAMPNS
-from router.net.udp import Inherited, Listener, absence, why_unreachable
+from router.net.sockets import Inherited
+from router.net.udp import Listener, absence, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
 from router.table.model import EndpointKind, Framing
@@ -77,9 +78,10 @@ class _Stranded(socket.socket):
 
 def test_a_listener_whose_address_has_gone_ends_too(stack: ExitStack) -> None:
     listener = listen(stack)
-    listener.socket = stack.enter_context(_Stranded(fileno=listener.socket.detach()))
+    opened = listener.opened
+    opened.socket = stack.enter_context(_Stranded(fileno=opened.socket.detach()))
     listener.end_input()
-    assert listener.socket.recvfrom(LIMIT) == (b"", None)
+    assert opened.socket.recvfrom(LIMIT) == (b"", None)
 
 
 def test_datagrams_that_the_kernel_drops_are_known(stack: ExitStack, peer: socket.socket) -> None:
@@ -163,7 +165,7 @@ def plan_of(held: socket.socket) -> model.Listener:
 @pytest.fixture
 def listener(held: socket.socket, stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> Listener:
     ours = Inherited([held.dup()])
-    monkeypatch.setattr(udp, "inherited", lambda: ours)
+    monkeypatch.setattr(sockets, "inherited", lambda: ours)
     return stack.enter_context(closing(Listener(plan_of(held))))
 
 
@@ -175,33 +177,16 @@ def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listene
     assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
 
 
-def test_a_socket_is_taken_for_its_interface_only(stack: ExitStack) -> None:
-    bound = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
-    bound.bind(("127.0.0.1", 0))
-    address = Address(*bound.getsockname())
-    ours = Inherited([bound.dup()])
-    assert ours.take(str(address)) is None
-    assert ours.take(f"{address} on eth0") is None
-    assert ours.unclaimed() == [f"{address} on lo"]
-    stack.enter_context(ours.take(f"{address} on lo") or pytest.fail("it is there"))
-    assert ours.unclaimed() == []
-
-
 def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
-    stream = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-    stream.bind(("127.0.0.1", 0))
-    address = Address(*held.getsockname())
-    ours = Inherited([held.dup(), stream.dup()])
-    assert len(ours.unclaimed()) == 2
-    stack.enter_context(ours.take(str(address)) or pytest.fail("it is there"))
-    [left] = ours.unclaimed()
-    assert left.endswith("which is no IPv4 UDP socket")
-    assert ours.take(str(address._replace(port=1))) is None
-    assert ours.take(f"{address} on lo") is None
-
-
-def test_what_is_meant_for_another_process_is_left_alone() -> None:
-    environment = {"LISTEN_PID": "1", "LISTEN_FDS": "3", "LISTEN_FDNAMES": "a:b:c"}
-    assert udp._inherited_descriptors(environment) == []
-    assert environment == {}
+    others = [
+        stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM)
+    ]
+    others[0].setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+    for each in others:
+        each.bind(("127.0.0.1", 0))
+    ours = Inherited([held.dup(), *(each.dup() for each in others)])
+    monkeypatch.setattr(sockets, "inherited", lambda: ours)
+    stack.enter_context(closing(Listener(plan_of(held))))
+    beside, stream = udp.unclaimed()
+    assert beside == f"{Address(*others[0].getsockname())} on lo"
+    assert stream.endswith("which is no IPv4 UDP socket")

@@ -1,0 +1,240 @@
+"""UDP sockets, opened with plain values: listeners, inherited ones among them, and those to send from.
+
+What a head start opens before anything else is loaded: no settings, findings or texts, which are those of `net.udp`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Collection, Iterable, Iterator, MutableMapping
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from functools import cache
+
+from router.net.kernel import (
+    IP_FREEBIND,
+    ask_for_receive_buffer,
+    bound_interface,
+    receive_buffer,
+    refuse_input,
+    report_sending_errors,
+    send_arrivals,
+)
+
+BOARD_ROOM = 8192
+"""Bytes to ask for as the send buffer of a board, as the kernel keeps commands while it looks for the hardware address.
+Twice as much is granted, which holds about 20 small datagrams: a burst of 16 passes though none has left yet."""
+
+FIRST_INHERITED = 3
+"""The first descriptor that a service manager hands over; the others follow it."""
+
+
+class Inherited:
+    """UDP sockets that a service manager has bound and handed over, as in sd_listen_fds(3).
+
+    They outlive the process, with the datagrams in them.
+    """
+
+    def __init__(self, sockets: Iterable[socket.socket] = ()) -> None:
+        self._sockets = list(sockets)
+        self._taken: list[socket.socket] = []
+
+    def take(self, address: tuple[str, int], interface: str | None) -> socket.socket | None:
+        """Return a duplicate of the socket that is bound so, or None. It can be taken again."""
+        for held in self._sockets:
+            if _is_bound_to(held, address, interface):
+                self._taken.append(held)
+                held.setblocking(True)
+                return held.dup()
+        return None
+
+    def unclaimed(self) -> list[socket.socket]:
+        """Those that no listener has taken."""
+        return [held for held in self._sockets if held not in self._taken]
+
+
+def _is_bound_to(held: socket.socket, address: tuple[str, int], interface: str | None) -> bool:
+    return is_udp(held) and held.getsockname() == address and bound_interface(held) == (interface or "")
+
+
+def is_udp(held: socket.socket) -> bool:
+    return (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM)
+
+
+@cache
+def inherited() -> Inherited:
+    """The sockets that this process has inherited. Its children inherit none."""
+    return Inherited(socket.socket(fileno=descriptor) for descriptor in _inherited_descriptors(os.environ))
+
+
+def _inherited_descriptors(environment: MutableMapping[str, str]) -> list[int]:
+    """Remove the variables, which are meant for this process only."""
+    pid, count = environment.pop("LISTEN_PID", ""), environment.pop("LISTEN_FDS", "")
+    environment.pop("LISTEN_FDNAMES", None)
+    if pid != str(os.getpid()) or not count.isdecimal():
+        return []
+    descriptors = list(range(FIRST_INHERITED, FIRST_INHERITED + int(count)))
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
+    return descriptors
+
+
+ABSENT = {
+    errno.ENODEV: ("there is no such network interface", "`ip link` lists those that there are"),
+    errno.EADDRNOTAVAIL: ("no network interface of this computer has that address", "0.0.0.0 listens on all of them"),
+    errno.ENETDOWN: ("the network is down", "`ip link` shows which interface is"),
+}
+"""Errors of binding that pass when the network comes up, each with a remedy for one that does not."""
+
+
+def bind(opened: socket.socket, address: tuple[str, int], interface: str | None) -> None:
+    """Raises OSError."""
+    if interface is not None:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
+    opened.bind(address)
+
+
+class ListeningSocket:
+    """A bound socket: the inherited one with this address and interface if there is one, else a new one.
+
+    While its address or interface is not there, as that of a tunnel that comes up later, it `is_waiting`: the socket is
+    not bound and receives nothing, and `address` is the one that it was to have. Any other failure raises OSError.
+    `has_senders`: some that are bound to its port are open. `receive_buffer` is what was granted, in bytes.
+    """
+
+    def __init__(
+        self, address: tuple[str, int], interface: str | None, receive_buffer: int, *, has_senders: bool = False
+    ) -> None:
+        handed_over = inherited().take(address, interface)
+        self.is_inherited = handed_over is not None
+        self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.interface = interface
+        self.address = address
+        self.is_waiting = False
+        try:
+            send_arrivals(self.socket)
+            # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
+            # would steal the port unnoticed.
+            with self.shared() if has_senders else nullcontext():
+                if handed_over is None:
+                    self._try_to_bind()
+            report_sending_errors(self.socket)
+            self.request_receive_buffer(receive_buffer)
+        except OSError:
+            self.socket.close()
+            raise
+
+    def _try_to_bind(self) -> None:
+        try:
+            bind(self.socket, self.address, self.interface)
+        except OSError as error:
+            if error.errno not in ABSENT:
+                raise
+            self.is_waiting = True
+        else:
+            self.address = self.socket.getsockname()
+
+    def request_receive_buffer(self, size: int) -> None:
+        """An inherited socket may have a larger buffer, for what arrives while no process listens."""
+        self.receive_buffer = receive_buffer(self.socket)
+        if not self.is_inherited or self.receive_buffer < size:
+            self.receive_buffer = ask_for_receive_buffer(self.socket, size)
+
+    def has_lost_interface(self) -> bool:
+        """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
+        return self.interface is not None and bound_interface(self.socket) is None
+
+    @contextmanager
+    def shared(self) -> Iterator[None]:
+        """Let sockets with SO_REUSEADDR bind its address and port meanwhile."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            yield
+        finally:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+
+    def end_input(self) -> None:
+        """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
+
+        An inherited socket is left as it is, for the next process: its receiver has to stop by itself.
+
+        A socket that is connected to itself accepts nothing from others, so that a flood cannot keep the receiver busy
+        for ever; shutting it down wakes a receiver that waits.
+        """
+        if self.is_inherited:
+            return
+        host, port = self.address
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # required for a broadcast address
+        # If the interface has lost the address, connecting fails, but nothing comes in and shutting down still wakes.
+        if not self.is_waiting:
+            with suppress(OSError):
+                self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
+        with suppress(OSError):
+            self.socket.shutdown(socket.SHUT_RD)
+
+
+def open_sending(
+    source: ListeningSocket | None, listening: Collection[ListeningSocket] = (), *, is_board: bool = False
+) -> socket.socket:
+    """Open a non-blocking socket for one destination, which it is not connected to. It receives nothing.
+
+    It is bound to address and port of `source`, so that answers reach that listener; without one, or while that one is
+    waiting, the kernel chooses the port. `listening` are all that are open: they must allow it. Raises OSError.
+    """
+    opened = _open_free() if source is None or source.is_waiting else _open_beside(source, listening)
+    if is_board:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BOARD_ROOM)
+    return opened
+
+
+def is_beside(opened: socket.socket) -> bool:
+    """Whether it sends from the port of a listener."""
+    return opened.family == socket.AF_INET6
+
+
+def leaves_from(opened: socket.socket) -> str:
+    """The address that a socket to send from is bound to; 0.0.0.0 if the kernel chooses one for each datagram."""
+    return str(opened.getsockname()[0]).removeprefix("::ffff:")
+
+
+def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]) -> tuple[str, int]:
+    """Where a socket that sends from a listener's port is bound.
+
+    One with an address of its own would get what another listener, at all addresses of another interface, is to
+    receive: Linux looks for such sockets first.
+    """
+    everywhere = "0.0.0.0", source.address[1]
+    return everywhere if any(each.address == everywhere for each in listening) else source.address
+
+
+def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
+    """A socket that reports ICMP errors, and receives nothing."""
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    report_sending_errors(opened)
+    refuse_input(opened)
+    return opened
+
+
+def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]) -> socket.socket:
+    """A socket that sends from a listener's address and port, while the listener alone receives.
+
+    It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
+    one of the datagram's own family.
+    """
+    opened = _open_free(socket.AF_INET6)
+    try:
+        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        host, port = address_beside(source, listening)
+        with ExitStack() as shared:
+            for each in listening:
+                if each.address[1] == port:
+                    shared.enter_context(each.shared())
+            opened.bind((f"::ffff:{host}", port))
+    except OSError:
+        opened.close()
+        raise
+    return opened

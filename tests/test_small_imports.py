@@ -1,0 +1,50 @@
+"""What is imported before a head start's threads run: on the rover's computer a module of medium size takes 3 ms."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+SLOW = {
+    "argparse", "asyncio", "dataclasses", "hashlib", "inspect", "json", "logging", "pathlib", "pickle", "re",
+    "subprocess", "tempfile", "typing", "yaml",
+}  # fmt: skip
+"""Modules of the standard library, which others import as well."""
+
+GROUND = {"router", "router.clock", "router.declared", "router.log"}
+NET = {"router.net", "router.net.kernel", "router.net.sockets"}
+
+
+def imported(script: str) -> set[str]:
+    """The modules that a script imports, without third parties: it finds none, nor what they have loaded at a start."""
+    told = "\nimport sys; print(*sys.modules)"
+    command = [sys.executable, "-S", "-c", script + told]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return {*done.stdout.split()}
+
+
+@pytest.mark.parametrize(
+    ("script", "ours"),
+    [
+        ("import router", {"router"}),
+        ("from router.log import logger, FloodLog; FloodLog()", {"router", "router.clock", "router.log"}),
+        ("import router.net.sockets", {"router", "router.clock", "router.log", *NET}),
+        (
+            "from router.carrier import library, ring, threads, carrier, sender; library.library()",
+            {
+                "router.carrier", "router.carrier.library", "router.carrier.ring", "router.carrier.threads",
+                "router.carrier.carrier", "router.carrier.sender", *GROUND, *NET,
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_head_start_uses_imports_little(script: str, ours: set[str]) -> None:
+    found = imported(script)
+    assert {name for name in found if name.partition(".")[0] == "router"} == ours
+    assert found & SLOW == set()
