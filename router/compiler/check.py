@@ -100,7 +100,7 @@ def check_table(
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
     if not _has_errors(findings):
-        lowered, limits = lower_table(routes, envelope)
+        lowered, limits = lower_table(routes)
         findings += limits
         lowered = None if limits else lowered
     return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)
