@@ -5,7 +5,9 @@ The same check serves `validate`, `explain` and `run`.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +28,18 @@ from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, bo
 from router.types.lock import LockComparison
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Pause garbage collection, which would go through all that is made of a large table again and again, in vain."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,7 @@ class Checked:
         """Compiled when first asked for; None while there are errors."""
         return self.program_in(Counters())
 
+    @uncollected()
     def program_in(self, counters: Counters) -> Program | None:
         """Compile the program, which counts in `counters`; None while there are errors.
 
@@ -62,6 +77,7 @@ class Checked:
         return link(self, counters)
 
 
+@uncollected()
 def check_table(
     path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
 ) -> Checked:
@@ -100,7 +116,7 @@ def check_table(
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
     if not _has_errors(findings):
-        lowered, limits = lower_table(routes, envelope)
+        lowered, limits = lower_table(routes)
         findings += limits
         lowered = None if limits else lowered
     return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)

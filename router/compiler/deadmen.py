@@ -267,9 +267,10 @@ def constant_plan(
     return None if findings else mapping.plan
 
 
-def deadmen_of(table: RouteTable, route: Route, destination: Destination) -> tuple[str, ...]:
+def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[str, ...]:
     """The routes whose deadmen each command to `destination` feeds or disarms: its own route first."""
-    others = [other.name for other in table.routes if takes_over(route, destination.endpoint.value, other)]
+    disarmed = lookup.disarmed.get(route.case.value, ())
+    others = [other.name for other in disarmed if takes_over(route, destination.endpoint.value, other)]
     feeds_own = route.deadman is not None and destination in feeding(route, route.deadman)
     return (route.name, *others) if feeds_own else tuple(others)
 

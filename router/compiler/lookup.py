@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -63,7 +63,7 @@ _ALIKE = 0.8
 NO_NAMES: Mapping[str, Node] = {}
 
 
-@dataclass(slots=True)
+@dataclass
 class Lookup:
     """Looks up the names of one table and collects findings.
 
@@ -80,6 +80,15 @@ class Lookup:
 
     def report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
         self.findings.append(Diagnostic(span, code, message, hint))
+
+    @cached_property
+    def disarmed(self) -> Mapping[str, Sequence[Route]]:
+        """By payload case, the routes that name it in `disarmed_by` of their deadman."""
+        found: dict[str, list[Route]] = {}
+        for route in self.table.routes:
+            for case in {each.value for each in (route.deadman and route.deadman.disarmed_by) or ()}:
+                found.setdefault(case, []).append(route)
+        return found
 
     def case(self, name: Located[str]) -> PayloadCase | None:
         found = self.envelope.cases.get(name.value)

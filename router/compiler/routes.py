@@ -141,7 +141,7 @@ def _destination(
         endpoint=endpoint,
         when=lookup.when(destination.when, scope),
         declared_priority=route.priority,
-        deadmen=deadmen_of(lookup.table, route, destination),
+        deadmen=deadmen_of(lookup, route, destination),
     )
 
 

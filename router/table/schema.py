@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
+from router.table.fitting import Fits, exact_pattern, fitting
 from router.table.nodes import Node, Path, to_data
 
 if TYPE_CHECKING:
@@ -91,6 +92,8 @@ def schema_errors(tree: Node, schema: str) -> list[SchemaError]:
     One error for each value, that of its type before any other; each missing key is one of its own.
     """
     data: Any = to_data(tree)
+    if _fits(schema)(data):
+        return []
     found = [SchemaError.of(error) for error in _validator(schema).iter_errors(data)]
     found.sort(key=lambda error: error.keyword != "type")
     first = {(error.path, error.message if error.is_about_keys else ""): error for error in reversed(found)}
@@ -98,15 +101,24 @@ def schema_errors(tree: Node, schema: str) -> list[SchemaError]:
 
 
 @functools.lru_cache
+def _fits(schema: str) -> Fits:
+    return fitting(_schema(schema))
+
+
+@functools.lru_cache
 def _validator(schema: str) -> Validator:
-    from jsonschema import Draft7Validator, validators  # takes as long to import as everything else of `validate`
+    return validator(_schema(schema))
+
+
+def validator(schema: Mapping[str, Any]) -> Validator:
+    """What knows where data does not fit."""
+    from jsonschema import Draft7Validator, validators  # only for tables with errors: see fitting.py
 
     with_exact_end: type[Validator] = validators.extend(Draft7Validator, {"pattern": _pattern})  # type: ignore[no-untyped-call]
-    return with_exact_end(_schema(schema))
+    return with_exact_end(schema)
 
 
 def _pattern(validator: Validator, pattern: str, instance: object, schema: object) -> Iterator[Exception]:
-    """JSON Schema's `$` is the very end of the text; Python's would let a line end follow."""
     from jsonschema import ValidationError
 
     if isinstance(instance, str) and not matches(instance, pattern):
@@ -114,4 +126,5 @@ def _pattern(validator: Validator, pattern: str, instance: object, schema: objec
 
 
 def matches(text: str, pattern: str) -> bool:
-    return bool(re.search(pattern[:-1] + r"\Z" if pattern.endswith("$") else pattern, text))
+    """Whether a text matches a pattern of JSON Schema."""
+    return bool(re.search(exact_pattern(pattern), text))

@@ -49,9 +49,12 @@ _HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table wi
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """The tree with misspelt keys put right and everything that has a finding marked broken."""
-    tree: Node = root
-    tree = _with_deep_keys(tree, findings)
-    found = schema_errors(tree, SCHEMA)
+    found = schema_errors(root, SCHEMA)
+    if not found:
+        return root
+    tree = _with_deep_keys(root, {error.path[:2] for error in found}, findings)
+    if tree is not root:
+        found = schema_errors(tree, SCHEMA)
     while unknown := [error for error in found if error.keyword == "additionalProperties"]:
         repairs = {}
         empty = {error.path for error in found if error.lacks_mapping}
@@ -69,20 +72,20 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
 
 
-def _with_deep_keys(tree: Node, findings: list[Diagnostic]) -> Node:
+def _with_deep_keys(tree: Node, wrong: Container[Path], findings: list[Diagnostic]) -> Node:
     """The tree without keys of routes and the like that stand beside these for want of indentation.
 
-    Each is reported, and what it belongs to marked broken.
+    `wrong` are the paths of parts that have errors. Each key is reported, and what it belongs to marked broken.
     """
-    wrong = {error.path[:2] for error in schema_errors(tree, SCHEMA)}
     for part, (kind, article) in _NAMED_PARTS.items():
         node = node_at(tree, (part,)) if part in mapping(tree).entries else None
         if not isinstance(node, MappingNode):
             continue
         entries: dict[str, Entry] = {}
         for name, entry in node.entries.items():
-            before = _above(entry, entries)
-            if before is None or (part, name) not in wrong or name not in keys_of(table_schema()["definitions"][kind]):
+            is_key = (part, name) in wrong and name in keys_of(table_schema()["definitions"][kind])
+            before = _above(entry, entries) if is_key else None
+            if before is None:
                 entries[name] = entry
                 continue
             message, hint = f"'{name}' is a key of {article} {kind}", f"indent it further than '{before}'"

@@ -50,7 +50,7 @@ class Condition:
         findings: dict[str, Diagnostic] = {}
         for case in cases:
             try:
-                lowered = lower_condition(_checked(text, case.type), case, envelope)
+                lowered = lower_condition(_checked(text, case.type), case)
                 self._conditions[case.name] = NativeCondition(library(), lowered)
             except (ExpressionError, TooLargeError) as error:
                 findings[case.name] = error.diagnostic

@@ -13,7 +13,7 @@ from router.compiler.expressions import Scope, check
 from router.compiler.lowering import LoweredFeed, LoweredRoute, lower_table
 from router.errors import Located
 from router.table.model import Destination, Route, Topic
-from tests.carrier.delivering import Delivering, Outcome
+from tests.carrier.delivering import Delivering, Outcome, Payload
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, written
 from tests.compiler.judging import Answer, Misfit, Plane, Question
 from tests.compiler.language import language_wire
@@ -35,7 +35,7 @@ def carrier_plane(functions: ctypes.CDLL) -> Plane:
             if asked.language.is_frame:
                 return [outcome.got for outcome in _framed(carrier, message, next(now))]
             is_ros = asked.language.is_ros
-            outcomes = carrier.from_ros(message) if is_ros else carrier.datagram(message, is_single=True)
+            outcomes = carrier.from_ros(message) if is_ros else carrier.datagram(message)
             return [outcome.got for outcome in outcomes]
 
         return answers
@@ -52,7 +52,7 @@ def _collect(asked: Question) -> CheckedCollect:
 def _framed(carrier: Delivering, payloads: Sequence[bytes], now: int) -> list[Outcome]:
     """The outcomes of the frame of these payloads, which come in any order. The one before has been forgotten."""
     shuffled = random.Random(payloads[0]).sample(payloads, len(payloads))
-    *earlier, last = (carrier.part(b"\0" + each, now, payload=(1, len(each))) for each in shuffled)
+    *earlier, last = (carrier.part(b"\0" + each, now, payload=Payload(1, len(each), True)) for each in shuffled)
     assert not any(earlier)
     assert last is not None
     return last
@@ -66,12 +66,12 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
     if asked.language.is_ros:
         target = CheckedTarget(Destination(Located("endpoint", span), span), plan=plan)
         feed = CheckedSubscription(topic, asked.source, condition, for_each, None, (target,))
-        lowered, findings = lower_table([CheckedRoute(route, asked.case, subscriptions=(feed,))], envelope)
+        lowered, findings = lower_table([CheckedRoute(route, asked.case, subscriptions=(feed,))])
     else:
         declared = topic if plan is not None else Destination(Located("endpoint", span), span)
         target = CheckedTarget(declared, type=asked.target, when=condition, plan=plan)
         case, collect = envelope.cases["source"], _collect(asked) if asked.language.is_frame else None
-        lowered, findings = lower_table([CheckedRoute(route, case, (target,), collect=collect)], envelope)
+        lowered, findings = lower_table([CheckedRoute(route, case, (target,), collect=collect)])
     if findings:
         raise Misfit(findings)
     if asked.language.is_ros:

@@ -11,6 +11,7 @@ from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope
+from tests.carrier.delivering import Payload
 from tests.oracles.envelopes import Decision
 from tests.small_tables import program
 from tests.tables import PROTOS
@@ -74,9 +75,6 @@ class CarrierSide:
         """The envelope that was read last, repaired."""
         return self._buffer.raw[: self._envelope.size]
 
-    def payload(self) -> bytes | None:
-        """The payload that was read last, if it was the only field."""
-        envelope = self._envelope
-        if not envelope.is_single:
-            return None
-        return self._buffer.raw[envelope.start : envelope.start + envelope.length]
+    def payload(self) -> Payload:
+        """Where the payload is that was read last."""
+        return Payload(self._envelope.start, self._envelope.length, self._envelope.is_single)

@@ -24,10 +24,10 @@ struct delivering {
 
 struct delivering *seam_open(counter *counters);
 void seam_close(struct delivering *of);
-size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, bool is_single,
-                     uint32_t column, int64_t received_at, const void **notes);
+size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
+                     uint32_t length, bool is_single, uint32_t column, int64_t received_at, const void **notes);
 size_t seam_part(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
-                 uint32_t length, uint32_t column, int64_t received_at, int64_t now, const void **notes);
+                 uint32_t length, bool is_single, uint32_t column, int64_t received_at, int64_t now, const void **notes);
 void seam_adopt(struct delivering *of, const struct timer_change *change);
 int64_t seam_serve(struct delivering *of, int64_t now);
 size_t seam_losses(struct delivering *of, const void **events);
@@ -115,12 +115,12 @@ static void *exactly(const void *data, size_t size) {
     return copy;
 }
 
-/* Deliver a datagram, or a payload if `is_single`. Return how many bytes of notes there are. */
-size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, bool is_single,
-                     uint32_t column, int64_t received_at, const void **notes) {
+/* Deliver a datagram. Return how many bytes of notes there are. */
+size_t seam_datagram(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
+                     uint32_t length, bool is_single, uint32_t column, int64_t received_at, const void **notes) {
     void *copy = exactly(data, size);
-    struct datagram datagram = {.data = copy, .size = size, .length = size, .is_single = is_single, .column = column,
-                                .received_at = received_at};
+    struct datagram datagram = {.data = copy, .size = size, .start = start, .length = length, .is_single = is_single,
+                                .column = column, .received_at = received_at};
     struct message message = {.datagram = &datagram};
     of->notes.size = 0;
     note_all(&of->routing.stage, to, &message);
@@ -145,12 +145,11 @@ size_t seam_losses(struct delivering *of, const void **events) {
     return size;
 }
 
-/* Deliver a datagram to targets that get frames, likewise, at `now`. Without notes, it completes none. Without a `start`, its
- * payload is not its only field. */
+/* Deliver a datagram to targets that get frames, likewise, at `now`. Without notes, it completes none. */
 size_t seam_part(struct delivering *of, const struct targets *to, const void *data, uint32_t size, uint32_t start,
-                 uint32_t length, uint32_t column, int64_t received_at, int64_t now, const void **notes) {
+                 uint32_t length, bool is_single, uint32_t column, int64_t received_at, int64_t now, const void **notes) {
     void *copy = exactly(data, size);
-    struct datagram datagram = {.data = copy, .size = size, .start = start, .length = length, .is_single = start != 0,
+    struct datagram datagram = {.data = copy, .size = size, .start = start, .length = length, .is_single = is_single,
                                 .column = column, .received_at = received_at};
     struct message message = {.datagram = &datagram, .now = now, .born = {now, now}};
     of->now = now;

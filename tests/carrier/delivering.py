@@ -37,11 +37,12 @@ def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDL
     loaded.seam_close.restype, loaded.seam_close.argtypes = None, (c_void_p,)
     loaded.seam_datagram.restype, loaded.seam_datagram.argtypes = (
         c_size_t,
-        (c_void_p, c_void_p, c_char_p, c_uint32, c_bool, c_uint32, c_int64, POINTER(c_void_p)),
+        (c_void_p, c_void_p, c_char_p, c_uint32, c_uint32, c_uint32, c_bool, c_uint32, c_int64, POINTER(c_void_p)),
     )
     loaded.seam_part.restype = c_size_t
     loaded.seam_part.argtypes = (
-        c_void_p, c_void_p, c_char_p, c_uint32, c_uint32, c_uint32, c_uint32, c_int64, c_int64, POINTER(c_void_p),
+        c_void_p, c_void_p, c_char_p, c_uint32, c_uint32, c_uint32, c_bool, c_uint32, c_int64, c_int64,
+        POINTER(c_void_p),
     )  # fmt: skip
     loaded.seam_adopt.restype, loaded.seam_adopt.argtypes = None, (c_void_p, c_void_p)
     loaded.seam_serve.restype, loaded.seam_serve.argtypes = c_int64, (c_void_p, c_int64)
@@ -61,6 +62,17 @@ class Outcome(NamedTuple):
     label: str
     got: Union[bytes, str]
     place: str = ""
+
+
+class Payload(NamedTuple):
+    """Where a payload is in its envelope: it if it `is_single`, else its pieces, from the tag of the first one."""
+
+    start: int
+    length: int
+    is_single: bool
+
+    def of(self, envelope: bytes) -> bytes:
+        return envelope[self.start : self.start + self.length]
 
 
 class Delivering:
@@ -131,23 +143,20 @@ class Delivering:
         """How many messages were counted, of those from ROS."""
         return self._counters[0]
 
-    def datagram(self, data: bytes, *, is_single: bool = False) -> list[Outcome]:
-        """Deliver an envelope, or a payload if `is_single`. Returns one outcome for each target."""
-        notes = c_void_p()
-        size = self._functions.seam_datagram(
-            self._address, byref(self._targets), data, len(data), is_single, 0, self._received_at, byref(notes)
-        )
+    def datagram(self, data: bytes, payload: Payload | None = None) -> list[Outcome]:
+        """Deliver an envelope with this payload, or a payload by itself. Returns one outcome for each target."""
+        notes, to = c_void_p(), byref(self._targets)
+        about = *(payload or Payload(0, len(data), True)), 0, self._received_at
+        size = self._functions.seam_datagram(self._address, to, data, len(data), *about, byref(notes))
         return [*self._outcomes(ctypes.string_at(notes.value or 0, size))]
 
-    def part(
-        self, data: bytes, now: int = 0, column: int = 0, payload: tuple[int, int] = (0, 0)
-    ) -> list[Outcome] | None:
-        """Deliver an envelope to targets with `collect`. `payload` is its start and its length where it is alone.
+    def part(self, data: bytes, now: int = 0, column: int = 0, payload: Payload | None = None) -> list[Outcome] | None:
+        """Deliver an envelope to targets with `collect`. Without a `payload`, it consists of its pieces.
 
         Returns one outcome for each target if it completes a frame, else None.
         """
         notes, to = c_void_p(), byref(self._targets)
-        about = *payload, column, self._received_at, now
+        about = *(payload or Payload(0, len(data), False)), column, self._received_at, now
         size = self._functions.seam_part(self._address, to, data, len(data), *about, byref(notes))
         return [*self._outcomes(ctypes.string_at(notes.value or 0, size))] or None
 

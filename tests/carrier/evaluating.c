@@ -30,7 +30,7 @@ void seam_machine_close(struct tested *tested) {
 
 bool seam_machine_read(struct tested *tested, const struct layout *layout, const uint8_t *data, size_t size) {
     machine_begin(&tested->machine, layout);
-    bool is_read = machine_read(&tested->machine, 0, data, size);
+    bool is_read = machine_read(&tested->machine, data, size);
     tested->cell_count = tested->machine.cell_count;
     tested->text_size = tested->machine.text_size;
     return is_read;

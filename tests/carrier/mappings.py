@@ -66,7 +66,7 @@ def to_ros(
     enums = tuple(wire[0].enums.values())
     plan = _plan(fields, target, Scope(case.type, enums, ros_types))
     checked = CheckedTarget(Topic(Located(TOPIC, SPAN), SPAN), None, target, None, plan)
-    lowered, findings = lower_table([CheckedRoute(_route(), case, (checked,))], wire[1])
+    lowered, findings = lower_table([CheckedRoute(_route(), case, (checked,))])
     if findings:
         raise Misfit(findings)
     carrier = Delivering(functions, lowered.to_topics["route"], RECEIVED_AT, SOURCE)
@@ -75,7 +75,7 @@ def to_ros(
         context = context_of(case.message_class.FromString(payload), case.type, enums, ros_types)
         return [verdict(partial(published, target, fields, context), None, context)]
 
-    return Mapping(lambda payload: [each.got for each in carrier.datagram(payload, is_single=True)], oracle)
+    return Mapping(lambda payload: [each.got for each in carrier.datagram(payload)], oracle)
 
 
 def from_ros(
@@ -101,7 +101,7 @@ def from_ros(
     plan = _plan(fields, case.type, scope, scope.names.get(ITEM))
     checked = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=plan, when=condition)
     feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, elements, None, (checked,))
-    lowered, findings = lower_table([CheckedRoute(_route(), case, subscriptions=(feed,))], wire[1])
+    lowered, findings = lower_table([CheckedRoute(_route(), case, subscriptions=(feed,))])
     if findings:
         raise Misfit(findings)
     carrier = Delivering(functions, lowered.from_ros[SOURCE][0], RECEIVED_AT, "not of ROS")

@@ -18,7 +18,7 @@ from router.compiler import Checked, check_table
 from router.compiler.program import Program
 from router.rehearsal.cdr import deserialize
 from router.types.model import MessageType
-from tests.carrier.delivering import Delivering, Outcome
+from tests.carrier.delivering import Delivering, Outcome, Payload
 from tests.oracles.frames import Frames, Part
 
 NS, MS = 1_000_000_000, 1_000_000
@@ -177,16 +177,18 @@ def test_the_name_of_a_frame_may_be_text(delivering: CDLL) -> None:
 
 def test_a_frame_may_have_parts_of_no_bytes(frames: Collecting) -> None:
     """As an envelope that is nothing but the payload, which is empty."""
-    assert frames.carrier.part(b"\x0a\x02\x28\x01", payload=(2, 2)) is not None
+    assert frames.carrier.part(b"\x0a\x02\x28\x01", payload=Payload(2, 2, True)) is not None
 
 
 def test_a_payload_that_comes_in_pieces_is_one_part(frames: Collecting) -> None:
     """One of another case in front of it is replaced, and fields beside it are left out."""
     pieces = [envelope("part", number=7, name="old"), b"\x48\x05", envelope("part", total=2, name="2.0")]
     assert frames.names(frames.carrier.part(b"".join(pieces))) is None
-    pieces = [envelope("part", number=9, text="gone"), envelope("other", value=3), envelope("part", total=2, place=1)]
-    pieces += [b"\x48\x05", envelope("part", number=7, name="2.1")]
-    assert frames.names(frames.carrier.part(b"".join(pieces))) == ["2.0", "2.1"]
+    replaced = envelope("part", number=9, text="gone") + envelope("other", value=3)
+    pieces = [envelope("part", total=2, place=1), b"\x48\x05", envelope("part", number=7, name="2.1")]
+    whole = replaced + b"".join(pieces) + b"\x48\x05"
+    payload = Payload(len(replaced), sum(map(len, pieces)), False)
+    assert frames.names(frames.carrier.part(whole, payload=payload)) == ["2.0", "2.1"]
 
 
 def test_what_is_held_stays_as_it_is_while_others_come_and_go(frames: Collecting) -> None:

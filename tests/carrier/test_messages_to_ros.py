@@ -23,7 +23,8 @@ from router.rehearsal.cdr import serialize as cdr
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
-from tests.carrier.delivering import Delivering
+from tests.carrier.decisions import CarrierSide
+from tests.carrier.delivering import Delivering, Payload
 from tests.carrier.mappings import to_ros
 from tests.carrier.messages import payloads
 from tests.compiler.compiling import AUTO, RECEIVED_AT, SOURCE, chosen, context_of, field_map
@@ -58,22 +59,23 @@ def checked(request: pytest.FixtureRequest, definitions: Definitions) -> Checked
     return check_table(folder / f"{request.param}.yaml", {}, definitions)
 
 
-def test_topics_of_tables_get_what_the_oracle_makes(delivering: CDLL, checked: Checked) -> None:
+def test_topics_of_tables_get_what_the_oracle_makes(library: CDLL, delivering: CDLL, checked: Checked) -> None:
     assert checked.program is not None
     routes = [route for route in checked.routes if any(target.topic for target in route.targets)]
     assert routes
+    reading = CarrierSide(library, checked.program)
     for route in routes:
-        _assert_allowed(delivering, checked.program, route)
+        _assert_allowed(delivering, reading, checked.program, route)
 
 
-def _assert_allowed(library: CDLL, program: Program, route: CheckedRoute) -> None:
+def _assert_allowed(library: CDLL, reading: CarrierSide, program: Program, route: CheckedRoute) -> None:
     lowered, case, envelope = program.lowered.to_topics[route.route.name], route.case, program.envelope
     topics = [target for target in route.targets if target.topic]
     assert lowered.targets.keys() == {topic.label for topic in topics}
     carrier, enums = Delivering(library, lowered, RECEIVED_AT, SOURCE), rover_wire()[0].enums.values()
 
-    def check(data: bytes, message: Any, *, is_single: bool) -> None:
-        got = {outcome.label: outcome.got for outcome in carrier.datagram(data, is_single=is_single)}
+    def check(data: bytes, message: Any, payload: Payload | None = None) -> None:
+        got = {outcome.label: outcome.got for outcome in carrier.datagram(data, payload)}
         for topic in topics:
             assert topic.type is not None
             assert topic.declared.fields is not None
@@ -85,14 +87,15 @@ def _assert_allowed(library: CDLL, program: Program, route: CheckedRoute) -> Non
     @given(payloads(case), st.randoms())
     def allowed(made: list[bytes], noise: random.Random) -> None:
         for payload in made:
-            check(payload, case.message_class.FromString(payload), is_single=True)
+            check(payload, case.message_class.FromString(payload))
             parts = [delimited(case.number, payload), delimited(case.number, noise.choice(made))]
             parts += [delimited(30, b"unknown"), delimited(noise.choice([*program.inbound]), b"")]
             noise.shuffle(parts)
             whole = b"".join(parts)
             parsed: Any = envelope.message_class.FromString(whole)
             if parsed.WhichOneof(envelope.oneof) == case.name:
-                check(whole, getattr(parsed, case.name), is_single=False)
+                reading.decide(whole, repairs=False)
+                check(whole, getattr(parsed, case.name), reading.payload())
 
     allowed()
 

@@ -22,7 +22,7 @@ from router.compiler.plan import Record
 from router.errors import Located, MappingError, NonFiniteError, SourceSpan
 from router.table.model import Topic
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
-from router.types.protobuf import Envelope, PayloadCase
+from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import Delivering, delivering
 
 FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
@@ -49,18 +49,18 @@ def machine(
     plan: Record, source: MessageType, target: MessageType, received_at: int, sender: str
 ) -> Callable[[Any], bytes]:
     """A function from a message to the bytes that the plan makes of it. It raises one of FAILURES if there are none."""
-    case, envelope = payload_of(source)
+    case = payload_of(source)
     span = SourceSpan("table.yaml", 7, 3, 9)
     checked = CheckedTarget(Topic(Located("topic", span), span), type=target, plan=plan)
     route: Any = SimpleNamespace(name=_ROUTE, ttl=None, ignore=None, span=span)
-    lowered, findings = lower_table([CheckedRoute(route, case, (checked,))], envelope)
+    lowered, findings = lower_table([CheckedRoute(route, case, (checked,))])
     assert not findings, findings
     carrier = Delivering(functions(), lowered.to_topics[_ROUTE], received_at, sender)
 
     def make(message: Any) -> bytes:
         payload: Any = case.message_class()
         _fill(payload, source, message)
-        (outcome,) = carrier.datagram(payload.SerializeToString(), is_single=True)
+        (outcome,) = carrier.datagram(payload.SerializeToString())
         if isinstance(outcome.got, str):
             raise NonFiniteError(outcome.got) if outcome.got == "non_finite" else MappingError(outcome.got)
         return outcome.got
@@ -79,19 +79,14 @@ def functions() -> ctypes.CDLL:
 # ---- payloads of any type
 
 
-def payload_of(source: MessageType) -> tuple[PayloadCase, Envelope]:
-    """A payload with the fields of a type, in an envelope. Its integers are as wide as protobuf has them."""
+def payload_of(source: MessageType) -> PayloadCase:
+    """A payload with the fields of a type. Its integers are as wide as protobuf has them."""
     file = FileDescriptorProto(name="made.proto", package="made", syntax="proto2")
     names: list[tuple[MessageType, str]] = []
     payload = _declare(source, file, names)
-    around = file.message_type.add(name="Envelope")
-    around.oneof_decl.add(name="cases")
-    around.field.add(name="payload", number=1, label=1, type=11, type_name=f".made.{payload}", oneof_index=0)
     pool = DescriptorPool()
     pool.Add(file)
-    classes = [GetMessageClass(pool.FindMessageTypeByName(f"made.{name}")) for name in (payload, "Envelope")]
-    case = PayloadCase("payload", 1, source, classes[0], None)
-    return case, Envelope("made.Envelope", "cases", classes[1], {"payload": case}, 0)
+    return PayloadCase("payload", 1, source, GetMessageClass(pool.FindMessageTypeByName(f"made.{payload}")), None)
 
 
 def _declare(declared: MessageType, file: FileDescriptorProto, names: list[tuple[MessageType, str]]) -> str:

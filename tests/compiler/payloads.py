@@ -55,13 +55,13 @@ def compiled_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: M
 
 def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> Callable[[bytes], bytes]:
     """The same, of messages in CDR. `source` is a type that ROS has."""
-    schema, envelope = wire
+    schema, _ = wire
     mapping = build(fields, case.type, Scope(source, tuple(schema.enums.values()), ()), SPAN)
     assert mapping.findings == []
     route: Any = SimpleNamespace(name="route", ttl=None, ignore=None, span=SPAN)
     target = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=mapping.plan)
     feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, None, None, (target,))
-    lowered, findings = lower_table([CheckedRoute(route, case, subscriptions=(feed,))], envelope)
+    lowered, findings = lower_table([CheckedRoute(route, case, subscriptions=(feed,))])
     assert findings == []
     carrier = Delivering(functions(), lowered.from_ros[SOURCE][0], RECEIVED_AT, "not of ROS")
 

@@ -288,7 +288,7 @@ def test_a_condition_of_the_receive_thread_is_bounded(when: str) -> None:
 def of_many(when: str, *, is_bounded: bool = True) -> Routine:
     _, envelope = made_wire()
     case = envelope.cases["many"]
-    source = Datagram(case, envelope)
+    source = Datagram(case)
     node = check(written(when), scope_of(case.type))
     return source.condition(source.lowering(), [node], is_bounded=is_bounded)[0]
 
@@ -329,7 +329,7 @@ def test_what_is_read_is_bounded() -> None:
     case = envelope.cases["tree"]
 
     def read_as_deep(depth: int) -> None:
-        source = Datagram(case, envelope)
+        source = Datagram(case)
         source.lowering().value(check(written(".".join(seeds(depth))), scope_of(case.type)))
         source.layout(SPAN)
 
@@ -347,7 +347,7 @@ def findings(name: str, target: MessageType) -> list[str]:
     _, envelope = made_wire()
     case = envelope.cases[name]
     plan = build(AUTO, target, scope_of(case.type), SPAN).plan
-    source = Datagram(case, envelope)
+    source = Datagram(case)
     try:
         source.published(source.lowering(), plan)
         source.layout(SPAN)

@@ -173,30 +173,17 @@ static void compact(struct collector *collector) {
     collector->used = kept;
 }
 
-static const struct wanted_field *find_field(const struct section *section, uint32_t number) {
-    for (uint32_t index = 0; index < section->count; index++)
-        if (section->fields[index].number == number) return &section->fields[index];
-    return NULL;
-}
-
-/* Write the payload of a datagram, and return its size. One that comes in pieces is merged by joining them; one of another
- * case, in front of it, is replaced. */
-static uint32_t write_payload(const struct layout *layout, const struct datagram *from, uint8_t *to) {
+/* Write the payload of a datagram, and return its size. Joining its pieces merges them. */
+static uint32_t write_payload(const struct datagram *from, uint8_t *to) {
+    struct bytes rest = {from->data + from->start, from->data + from->start + from->length}, piece;
+    uint32_t tag = 0, size = 0;
     if (from->is_single) {
-        memcpy(to, from->data + from->start, from->length);
+        memcpy(to, rest.at, from->length);
         return from->length;
     }
-    const struct section *envelope = &layout->sections[SECTION_ENVELOPE];
-    struct bytes rest = {from->data, from->data + from->size}, value;
-    uint32_t tag, size = 0;
-    while (rest.at < rest.end && read_tag(&rest, &tag) && read_value(&rest, tag & 7, &value)) {
-        const struct wanted_field *field = (tag & 7) == LEN ? find_field(envelope, tag >> 3) : NULL;
-        if (field && field->section == SECTION_PAYLOAD) {
-            memcpy(to + size, value.at, left(&value));
-            size += (uint32_t)left(&value);
-        } else if (field) {
-            size = 0;
-        }
+    while (rest.at < rest.end && read_piece(&rest, &tag, &piece)) {
+        memcpy(to + size, piece.at, left(&piece));
+        size += (uint32_t)left(&piece);
     }
     return size;
 }
@@ -206,7 +193,7 @@ static void keep(struct collector *collector, struct frame *frame, uint32_t inde
     uint32_t longest = length_of(from->size);
     if (collector->used + longest > 2 * (collector->stored + longest) + SLACK) compact(collector);
     struct record *record = record_at(collector, collector->used);
-    uint32_t size = write_payload(collector->to->layout, from, (uint8_t *)(record + 1)), length = length_of(size);
+    uint32_t size = write_payload(from, (uint8_t *)(record + 1)), length = length_of(size);
     *record = (struct record){size, (uint32_t)(frame - collector->frames), index};
     frame->places[index] = collector->used + 1;
     frame->held++;
@@ -425,7 +412,7 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
     const struct collect *of = to->collect;
     struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
     begin_datagram(machine, to, last);
-    if (!machine_read(machine, SECTION_PAYLOAD, first.bytes, first.size)) return false;
+    if (!machine_read(machine, first.bytes, first.size)) return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
         if (!list_add(machine, &items, payload_of(of->collector, frame, index)))
             return machine_refuse(machine, (struct refusal){.kind = REFUSED_ROOM});

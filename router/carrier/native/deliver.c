@@ -74,8 +74,9 @@ void begin_datagram(struct machine *machine, const struct targets *to, const str
 
 bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
     begin_datagram(machine, to, from);
-    if (!from->is_single) return machine_read(machine, SECTION_ENVELOPE, from->data, from->size);
-    return machine_read(machine, SECTION_PAYLOAD, from->data + from->start, from->length);
+    const uint8_t *payload = from->data + from->start;
+    return from->is_single ? machine_read(machine, payload, from->length)
+                           : machine_read_pieces(machine, payload, from->length);
 }
 
 /* Read the message unless that was done for another target. */

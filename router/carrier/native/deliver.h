@@ -58,9 +58,8 @@ struct target {
     uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
 };
 
-/* The first slots of every layout of datagrams, and its first sections. */
+/* The first slots of every layout of datagrams. */
 enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
-enum { SECTION_PAYLOAD, SECTION_ENVELOPE };
 
 struct collect;
 
@@ -82,8 +81,8 @@ struct targets {
 struct datagram {
     const uint8_t *data;
     uint32_t size;
-    uint32_t start, length; /* of the payload, if it is the only field */
-    bool is_single;         /* it is */
+    uint32_t start, length; /* of the payload, or of its pieces with all that is between them, as in struct envelope */
+    bool is_single;         /* it is in one piece */
     uint32_t column;        /* of the sender */
     int64_t received_at;    /* wall clock */
 };

@@ -136,20 +136,21 @@ static bool is_known(const struct wire_field *field, uint32_t wire_type) {
 /* Find the payload case of an envelope that is well formed: the last one that is there. */
 static int find_case(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
     struct bytes rest = {data, data + envelope->size};
-    uint32_t fields = 0, unknown = 0, no_message = 0;
+    uint32_t pieces = 0, unknown = 0, no_message = 0, first = 0;
     bool has_unknown = false;
     while (rest.at < rest.end) {
-        uint32_t tag;
+        uint32_t tag, begin = (uint32_t)(rest.at - data);
         struct bytes value;
         if (!read_tag(&rest, &tag) || !read_value(&rest, tag & 7, &value)) return MALFORMED;
         uint32_t number = tag >> 3, wire_type = tag & 7;
         const struct wire_field *field = find_field(&schema->types[0], number);
         bool is_case = field != NULL && (field->flags & WIRE_CASE);
-        fields++;
         if (is_case && wire_type == LEN) {
+            pieces = number == envelope->case_number ? pieces + 1 : 1;
+            if (pieces == 1) first = begin;
             envelope->case_number = number;
-            envelope->start = (uint32_t)(value.at - data);
-            envelope->length = (uint32_t)left(&value);
+            envelope->start = pieces == 1 ? (uint32_t)(value.at - data) : first;
+            envelope->length = (uint32_t)(value.end - data) - envelope->start;
         } else if (!is_known(field, wire_type)) {
             if (!has_unknown) unknown = number;
             has_unknown = true;
@@ -157,7 +158,7 @@ static int find_case(const struct wire_schema *schema, const uint8_t *data, stru
         }
     }
     if (envelope->case_number != 0) {
-        envelope->is_single = fields == 1;
+        envelope->is_single = pieces == 1;
         return -1;
     }
     if (!has_unknown) return NO_PAYLOAD;

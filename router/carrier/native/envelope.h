@@ -42,8 +42,8 @@ struct wire_schema {
 struct envelope {
     uint32_t case_number;
     uint32_t size;          /* with the trailing zeros that were put back, without those that were padding */
-    uint32_t start, length; /* of the payload, where it is the only field */
-    bool is_single;         /* the payload is the only field */
+    uint32_t start, length; /* of the payload, or from the tag of its first piece up to the end of its last one */
+    bool is_single;         /* the payload is in one piece */
     bool is_repaired;       /* `size` is not that of the datagram; counted as padded, also if there is no payload */
 };
 

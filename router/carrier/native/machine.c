@@ -38,9 +38,13 @@ static bool check_read(struct machine *machine, bool is_read) {
     return is_read || machine_refuse(machine, (struct refusal){.kind = REFUSED_MALFORMED});
 }
 
-bool machine_read(struct machine *machine, uint16_t section, const uint8_t *data, size_t size) {
+bool machine_read(struct machine *machine, const uint8_t *data, size_t size) {
     bool is_cdr = machine->layout->is_cdr;
-    return check_read(machine, is_cdr ? read_cdr(machine, section, data, size) : read_protobuf(machine, section, data, size));
+    return check_read(machine, is_cdr ? read_cdr(machine, 0, data, size) : read_protobuf(machine, 0, data, size));
+}
+
+bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t size) {
+    return check_read(machine, read_protobuf_pieces(machine, 0, data, size));
 }
 
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element) {

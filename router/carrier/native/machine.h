@@ -3,7 +3,7 @@
  *
  *     machine_begin(machine, layout);             slots have their defaults
  *     machine->slots[...] = ...;                  values other than fields: time of receipt, sender
- *     machine_read(machine, section, data, size);    fields are in slots now
+ *     machine_read(machine, data, size);             fields are in slots now
  *     evaluate_condition(...), evaluate_message(...)   any number of times (evaluate.h)
  *
  * Text, bytes and lists in slots point into the message that was read: it must not change until the next begin. */
@@ -63,8 +63,11 @@ void machine_close(struct machine *machine);
 /* Begin with another message, of this layout: slots get their defaults, cells and text are freed. */
 void machine_begin(struct machine *machine, const struct layout *layout);
 
-/* Read a message into the slots of a section. Return false if it is malformed, or for lack of memory. */
-bool machine_read(struct machine *machine, uint16_t section, const uint8_t *data, size_t size);
+/* Read a message into the slots. Return false if it is malformed, or for lack of memory. */
+bool machine_read(struct machine *machine, const uint8_t *data, size_t size);
+
+/* The same for a protobuf message in pieces (read_protobuf.h). */
+bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t size);
 
 /* Give the slots of a section their defaults, and read an element of a list of messages into them. */
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element);

@@ -278,7 +278,7 @@ struct section {
 
 /* What routines have in common that read the same messages. */
 struct layout {
-    const struct section *sections; /* the first one is the message; of a datagram the second one is its envelope */
+    const struct section *sections; /* the first one is the message */
     const struct value *defaults; /* what slots hold where nothing was read */
     const struct closed_enum *closed;
     const uint8_t *literals;

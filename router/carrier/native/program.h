@@ -78,9 +78,9 @@ struct message_record {
     int64_t received_at;  /* wall clock */
     int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct born */
     uint32_t column;      /* of the sender */
-    uint32_t is_single;   /* the payload is the only field */
+    uint32_t is_single;   /* the payload is in one piece */
     uint32_t length;      /* of the datagram */
-    uint32_t start, payload_length; /* of the payload, where it is the only field */
+    uint32_t start, payload_length; /* of the payload, as in struct envelope */
     uint32_t reserved;
 };
 

@@ -158,3 +158,11 @@ static bool read_section(struct machine *machine, uint16_t of, struct bytes rest
 bool read_protobuf(struct machine *machine, uint16_t section, const uint8_t *message, size_t size) {
     return read_section(machine, section, (struct bytes){message, message + size}, MOST_SECTIONS_DEEP);
 }
+
+bool read_protobuf_pieces(struct machine *machine, uint16_t section, const uint8_t *data, size_t size) {
+    struct bytes rest = {data, data + size}, piece;
+    uint32_t tag = 0;
+    while (rest.at < rest.end)
+        if (!read_piece(&rest, &tag, &piece) || !read_section(machine, section, piece, MOST_SECTIONS_DEEP)) return false;
+    return true;
+}

@@ -16,4 +16,8 @@ enum { MOST_SECTIONS_DEEP = 32 }; /* messages in messages */
 /* Read a message into the slots of a section, which have their defaults. */
 bool read_protobuf(struct machine *machine, uint16_t section, const uint8_t *message, size_t size);
 
+/* The same for a message that comes in pieces: fields of the same number, the first one at `data`, and perhaps others
+ * between them. */
+bool read_protobuf_pieces(struct machine *machine, uint16_t section, const uint8_t *data, size_t size);
+
 #endif

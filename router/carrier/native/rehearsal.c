@@ -219,7 +219,7 @@ static int evaluate_on_payload(struct machine *machine, const struct layout *lay
     machine_begin(machine, layout);
     machine->slots[SLOT_RECEIVED_AT].integer = received_at;
     machine->slots[SLOT_SOURCE] = *source;
-    if (!machine_read(machine, SECTION_PAYLOAD, payload, size)) return LOSS_MAPPING_ERROR;
+    if (!machine_read(machine, payload, size)) return LOSS_MAPPING_ERROR;
     return evaluate_condition(machine, condition, holds, &at);
 }
 

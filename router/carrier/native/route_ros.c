@@ -115,7 +115,7 @@ void route_ros(struct ros_routing *routing, const struct ros_route *route, const
     if (route->targets.ttl) message.born = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
     machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
-    if (!machine_read(machine, 0, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;
+    if (!machine_read(machine, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;
     else if (route->targets.ttl) date_by_stamp(routing, route, taken, &message);
     if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
     else deliver_to_all(&routing->stage, &route->targets, &message);

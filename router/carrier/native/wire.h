@@ -102,4 +102,15 @@ static inline bool read_value(struct bytes *bytes, uint32_t wire_type, struct by
     return true;
 }
 
+/* Read the next piece of a message that comes in several: fields with one tag, which is 0 in front of the first piece, and
+ * perhaps other fields between them. */
+static inline bool read_piece(struct bytes *bytes, uint32_t *tag, struct bytes *piece) {
+    uint32_t found;
+    do {
+        if (!read_tag(bytes, &found) || !read_value(bytes, found & 7, piece)) return false;
+        if (*tag == 0) *tag = found;
+    } while (found != *tag);
+    return true;
+}
+
 #endif

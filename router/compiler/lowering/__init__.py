@@ -21,7 +21,7 @@ from router.compiler.lowering.lowered import (
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
 from router.errors import Diagnostic
-from router.types.protobuf import Envelope, PayloadCase
+from router.types.protobuf import PayloadCase
 
 __all__ = [
     "Lowered",
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 
-def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Lowered, list[Diagnostic]]:
+def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnostic]]:
     """Lower all targets of a table without errors."""
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
@@ -48,7 +48,7 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Low
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             try:
                 if targets:
-                    lowered[checked.route.name] = Datagram(checked.case, envelope).lowered(checked, targets)
+                    lowered[checked.route.name] = Datagram(checked.case).lowered(checked, targets)
             except TooLargeError as error:
                 findings.append(error.diagnostic)
         for feed in checked.subscriptions:
@@ -60,8 +60,8 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope) -> tuple[Low
     return Lowered(to_destinations, to_topics, from_ros), findings
 
 
-def lower_condition(condition: Node, case: PayloadCase, envelope: Envelope) -> LoweredCondition:
+def lower_condition(condition: Node, case: PayloadCase) -> LoweredCondition:
     """Lower a condition on a payload by itself. Raises TooLargeError."""
-    source = Datagram(case, envelope)
+    source = Datagram(case)
     routine, _ = source.condition(source.lowering(), [condition])
     return LoweredCondition(routine, source.layout(condition.span))

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple, Union
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.descriptor import FieldDescriptor
 
 from router.compiler.lowering.operations import Slot
 from router.compiler.lowering.sections import Section, Wanted
 from router.declared import NONE, FieldType, ReadKind, Scalar
 from router.types.descriptors import enum_of
-from router.types.model import Field as Member
-from router.types.model import MessageType
 from router.types.wire import encoding_of
 
 
@@ -57,7 +55,7 @@ class PlacedSection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """`struct layout`. The first section is the source message; of a datagram, the second one is its envelope.
+    """`struct layout`. The first section is the source message.
 
     `closed` are the numbers of closed enums, ascending. `names` say what each slot holds, `messages` what each section
     is: for `explain`.
@@ -102,25 +100,18 @@ class Numbering:
 # ---- datagrams
 
 
-def protobuf_layout(
-    slots: Sequence[Slot], payload: Section, envelope: Descriptor, case: str, elements: Sequence[Section]
-) -> Layout:
-    """Number `slots`, from 0, then those of the payload in its envelope, and those of elements of lists."""
+def protobuf_layout(slots: Sequence[Slot], payload: Section, elements: Sequence[Section]) -> Layout:
+    """Number `slots`, from 0, then those of the payload, and those of elements of lists."""
     maker = _ProtobufNumbering(slots)
-    around = Section(MessageType(envelope.full_name), envelope)
-    around.wanted[case] = Wanted(Member(case, payload.type), section=payload)
-    maker.number_sections([payload, around, *_inner(payload), *chain.from_iterable(map(_all, elements))])
-    for root in (around, *elements):
+    roots = payload, *elements
+    maker.number_sections([*chain.from_iterable(map(_all, roots))])
+    for root in roots:
         maker.place(root)
     return maker.made(is_cdr=False, closed=maker.closed.values())
 
 
 def _all(section: Section) -> Iterator[Section]:
     yield section
-    yield from _inner(section)
-
-
-def _inner(section: Section) -> Iterator[Section]:
     for wanted in section.wanted.values():
         if wanted.section is not None:
             yield from _all(wanted.section)

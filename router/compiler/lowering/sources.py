@@ -33,7 +33,7 @@ from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_OPEN, MOST_SECTIONS_D
 from router.errors import SourceSpan
 from router.table.model import Route
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, PayloadCase
+from router.types.protobuf import PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
 """Operations that a destination's `when` may execute for a datagram, about a millisecond of the receive thread."""
@@ -83,13 +83,11 @@ class _Source:
 
 
 class Datagram(_Source):
-    """A payload in its envelope, from UDP."""
+    """A payload, from UDP."""
 
-    def __init__(self, case: PayloadCase, envelope: Envelope) -> None:
+    def __init__(self, case: PayloadCase) -> None:
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
-        around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]
         super().__init__(Section(case.type, descriptor))
-        self._case, self._envelope = case.name, around
 
     def lowered(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute:
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
@@ -129,7 +127,7 @@ class Datagram(_Source):
             if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
                 message = f"this reads a field {depth} messages deep, and at most {MOST_SECTIONS_DEEP - 1} are possible"
                 raise TooLargeError(span, message, "read fields that are less deep")
-        return _small(protobuf_layout(self.temporaries, self.root, self._envelope, self._case, self.elements), span)
+        return _small(protobuf_layout(self.temporaries, self.root, self.elements), span)
 
 
 class RosMessage(_Source):

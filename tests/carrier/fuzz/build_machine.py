@@ -37,8 +37,8 @@ def build(folder: Path, compile_: Compile = for_libfuzzer, first: int = 0, count
     for index, (program, seeds) in enumerate([*lowered_programs(), *made]):
         declarations += _arrays(index, program)
         rows.append(_row(index, program))
-        for number, (is_envelope, message) in enumerate(_messages(program, seeds, noise)):
-            (corpus / f"{index}-{number}").write_bytes(struct.pack("<HB", index, is_envelope) + message)
+        for number, (is_in_pieces, message) in enumerate(_messages(program, seeds, noise)):
+            (corpus / f"{index}-{number}").write_bytes(struct.pack("<HB", index, is_in_pieces) + message)
     declarations.append(f"enum {{ PROGRAM_COUNT = {len(rows)} }};")
     declarations.append(f"static const struct fuzzed programs[] = {{{', '.join(rows)}}};")
     (folder / "programs.h").write_text("\n".join(declarations) + "\n")
@@ -48,10 +48,10 @@ def build(folder: Path, compile_: Compile = for_libfuzzer, first: int = 0, count
 
 
 def _messages(program: Program, seeds: Seeds, noise: random.Random) -> Iterator[tuple[bool, bytes]]:
-    """Seeds, and whether each is an envelope."""
+    """Seeds, and whether each is in pieces."""
     for _ in range(SEEDS):
-        payload, envelope = seeds()
-        yield from ((is_envelope, data) for is_envelope, data in ((False, payload), (True, envelope)) if data)
+        whole, pieces = seeds()
+        yield from ((is_in_pieces, data) for is_in_pieces, data in ((False, whole), (True, pieces)) if data)
     if program.layout.is_cdr:
         for body in (bytes(380), b"\1\0\0\0" * 95, noise.randbytes(60)):
             yield False, CDR_HEADER + body
@@ -64,8 +64,7 @@ def _random_seeds() -> tuple[bytes, bytes]:
 
 
 _STRUCTURE = (
-    "struct fuzzed { struct layout layout; struct routine condition, message, list; "
-    "uint16_t stored, section, item, has_envelope; };"
+    "struct fuzzed { struct layout layout; struct routine condition, message, list; uint16_t stored, section, item; };"
 )
 
 
@@ -115,9 +114,7 @@ def _row(index: int, program: Program) -> str:
     codes = {"condition": program.condition, "message": program.message, "list": each.code}
     code = ", ".join(_code(f"{name}_{index}", code) for name, code in codes.items())
     of_each = f"{int(each.stored)}, {each.section}, {each.item}"
-    return (
-        f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}, {int(program.has_envelope)}}}"
-    )
+    return f"{{{{{arrays}, {layout.slot_count}, {int(layout.is_cdr)}}}, {code}, {of_each}}}"
 
 
 def _code(name: str, code: Sequence[Operation]) -> str:

@@ -11,7 +11,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
 
 #define FIELD(of, in) {.number = of, .type = TYPE_INT64, .slot = in, .presence = NONE, .section = NONE, .choice = NONE, .closed = NONE}
 static const struct wanted_field fields[] = {FIELD(1, BY), FIELD(2, COUNT), FIELD(3, PLACE)};
-static const struct section sections[] = {[SECTION_PAYLOAD] = {.fields = fields, .count = 3}, [SECTION_ENVELOPE] = {.count = 0}};
+static const struct section sections[] = {{.fields = fields, .count = 3}};
 static const struct value defaults[SLOTS], sources[2];
 static const struct layout layout = {.sections = sections, .defaults = defaults, .slot_count = SLOTS};
 #define LOADS(name, from) static const struct operation name[] = {{.kind = OP_LOAD, .slot = from}}

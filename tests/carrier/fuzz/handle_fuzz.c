@@ -26,7 +26,7 @@ static struct sender nowhere = {.fd = -1};
 /* A condition on the first field that every payload may have. */
 static const struct wanted_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .section = NONE,
                                             .choice = NONE, .closed = NONE}};
-static const struct section sections[] = {[SECTION_PAYLOAD] = {.fields = fields, .count = 1}, [SECTION_ENVELOPE] = {.count = 0}};
+static const struct section sections[] = {{.fields = fields, .count = 1}};
 static const struct value defaults[3], sources[COLUMNS];
 static const struct layout layout = {.sections = sections, .defaults = defaults, .slot_count = 3};
 static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6}, {.kind = OP_LOAD, .slot = 2},

@@ -20,6 +20,7 @@ from router.errors import Located
 from router.rehearsal.cdr import serialize
 from router.table.model import Destination, FieldMap, Topic
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from router.types.wire import delimited
 from tests.carrier import evaluating
 from tests.carrier.datagrams import Maker
 from tests.carrier.fuzz.random_programs import ForEach, Program
@@ -33,7 +34,7 @@ U8, I16, I32, U32, I64, U64, F32, F64 = (
 )  # fmt: skip
 
 Seeds = Callable[[], "tuple[bytes, bytes]"]
-"""Makes a message for a program, and an envelope around one, or nothing if there is none."""
+"""Makes a message for a program, and one of protobuf in pieces, or nothing."""
 
 
 class Fuzzed(NamedTuple):
@@ -109,7 +110,7 @@ def lowered_programs() -> Iterator[Fuzzed]:
             Topic(Located("topic", SPAN), SPAN), None, target, _when(when, scope), _plan(fields, target, scope)
         )
         route = CheckedRoute(_route(), case, (checked,))
-        yield from _of(_lowered(route, envelope), lambda _: _seeds_of(envelope, name, noise), noise)  # noqa: B023
+        yield from _of(_lowered(route), lambda _: _seeds_of(envelope, name, noise), noise)  # noqa: B023
     for name, fields, source, when, for_each in FROM_ROS:
         case = envelope.cases[name]
         scope = Scope(source, tuple(schema.enums.values()), ())
@@ -120,7 +121,7 @@ def lowered_programs() -> Iterator[Fuzzed]:
         board = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=plan, when=_when(when, scope))
         feed = CheckedSubscription(Topic(Located("topic", SPAN), SPAN), source, None, elements, None, (board,))
         route = CheckedRoute(_route(), case, subscriptions=(feed,))
-        yield from _of(_lowered(route, envelope), lambda _: _no_seeds, noise, source)
+        yield from _of(_lowered(route), lambda _: _no_seeds, noise, source)
 
 
 def _no_seeds() -> tuple[bytes, bytes]:
@@ -148,8 +149,8 @@ def _names(elements: Node) -> dict[str, Node]:
     return {ITEM: Variable(elements.kind.element, SPAN, ITEM), **names}
 
 
-def _lowered(route: CheckedRoute, envelope: Any) -> Lowered:
-    lowered, findings = lower_table([route], envelope)
+def _lowered(route: CheckedRoute) -> Lowered:
+    lowered, findings = lower_table([route])
     assert findings == [], findings
     return lowered
 
@@ -169,8 +170,8 @@ def _of(
 
 
 def _seeds_of(envelope: Any, name: str, noise: random.Random) -> Seeds:
-    around, payload = (Maker(each.message_class.DESCRIPTOR, noise) for each in (envelope, envelope.cases[name]))
-    return lambda: (payload.message(), around.datagram())
+    payload = Maker(envelope.cases[name].message_class.DESCRIPTOR, noise)
+    return lambda: (payload.message(), delimited(1, payload.message()) + delimited(1, payload.message()))
 
 
 def _values(declared: Type, noise: random.Random) -> Any:
@@ -198,9 +199,7 @@ def _program(route: LoweredRoute | LoweredFeed, target: LoweredTarget) -> Progra
     if isinstance(route, LoweredFeed) and route.for_each is not None:
         each = route.for_each
         for_each = ForEach(_routine(each.routine), each.scalar, each.section, each.item)
-    return Program(
-        _layout(route), _routine(target.condition), _routine(target.message), for_each, not route.layout.is_cdr
-    )
+    return Program(_layout(route), _routine(target.condition), _routine(target.message), for_each)
 
 
 def _routine(routine: Routine) -> list[evaluating.Operation]:

@@ -1,8 +1,7 @@
 /* A libFuzzer target: readers and programs read and write only what they may, whatever a message holds, and a message is
  * made twice in the same way.
  *
- * An input's first two bytes choose a program, the third one whether the rest is a payload or an envelope, if there is one
- * around it. */
+ * An input's first two bytes choose a program, the third one whether the rest is a message or, of protobuf, its pieces. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -68,31 +67,31 @@ static int make_for_each(const struct fuzzed *chosen) {
 }
 
 /* Read and evaluate as the threads do. Return the outcome. */
-static int run(const struct fuzzed *chosen, uint16_t section, const uint8_t *data, size_t size) {
+static int run(const struct fuzzed *chosen, bool is_in_pieces, const uint8_t *data, size_t size) {
     machine.output.size = 0;
     machine_begin(&machine, &chosen->layout);
     memset(machine.slots + chosen->layout.slot_count, 0xa5, sizeof *machine.slots); /* nobody is to use it */
     machine.slots[RECEIVED_AT].integer = 1700000000123456789;
     machine.slots[SOURCE] = (struct value){.bytes = (const uint8_t *)"a board", .size = 7};
-    if (!machine_read(&machine, section, data, size)) return LOSS_MAPPING_ERROR;
+    if (!(is_in_pieces ? machine_read_pieces : machine_read)(&machine, data, size)) return LOSS_MAPPING_ERROR;
     return chosen->list.count ? make_for_each(chosen) : make(chosen);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
     if (size < 3 || size > MAX_DATAGRAM) return -1;
     const struct fuzzed *chosen = &programs[(input[0] + 256 * input[1]) % PROGRAM_COUNT];
-    uint16_t section = input[2] % 2 && chosen->has_envelope;
+    bool is_in_pieces = input[2] % 2 && !chosen->layout.is_cdr;
     size -= 3;
     uint8_t *data = malloc(size ? size : 1); /* of the exact size: the sanitizer sees what is read behind it */
     memcpy(data, input + 3, size);
-    int outcome = run(chosen, section, data, size);
+    int outcome = run(chosen, is_in_pieces, data, size);
     note_outcome(&outcome, sizeof outcome);
     if (outcome == EVALUATED) {
         size_t made = machine.output.size;
         note_outcome(machine.output.data, made);
         uint8_t *first = malloc(made ? made : 1);
         memcpy(first, machine.output.data, made);
-        demand(run(chosen, section, data, size) == EVALUATED && machine.output.size == made);
+        demand(run(chosen, is_in_pieces, data, size) == EVALUATED && machine.output.size == made);
         demand(!memcmp(first, machine.output.data, made));
         free(first);
     }

@@ -78,8 +78,6 @@ class Program:
     condition: Code
     message: Code
     for_each: ForEach | None = None
-    has_envelope: bool = False
-    """The second section is the envelope around the message."""
 
 
 class _Layouts:

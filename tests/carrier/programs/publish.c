@@ -29,8 +29,8 @@ struct made {
     struct route route;
     struct target targets[TOPICS];
     struct topic topics[TOPICS];
-    struct wanted_field of_payload, of_envelope;
-    struct section sections[2];
+    struct wanted_field of_payload;
+    struct section section;
     struct value defaults[SLOTS], source;
     struct operation operations[3];
     struct layout layout;
@@ -110,14 +110,11 @@ static struct made *make(const struct round *stage, uint32_t generation) {
     check(made, "memory");
     made->of_payload = (struct wanted_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .section = NONE,
                                            .choice = NONE, .closed = NONE};
-    made->of_envelope = (struct wanted_field){.number = 1, .type = TYPE_MESSAGE, .slot = NONE, .presence = NONE,
-                                            .section = SECTION_PAYLOAD, .choice = NONE, .closed = NONE};
-    made->sections[SECTION_PAYLOAD] = (struct section){&made->of_payload, 1, 0, 0};
-    made->sections[SECTION_ENVELOPE] = (struct section){&made->of_envelope, 1, 0, 0};
+    made->section = (struct section){&made->of_payload, 1, 0, 0};
     made->operations[0] = (struct operation){.kind = OP_KNOWN, .size = sizeof header, .slot = 1};
     made->operations[1] = (struct operation){.kind = OP_LOAD, .slot = NUMBER};
     made->operations[2] = (struct operation){.kind = OP_PUT, .slot = 4};
-    made->layout = (struct layout){.sections = made->sections, .defaults = made->defaults, .literals = header,
+    made->layout = (struct layout){.sections = &made->section, .defaults = made->defaults, .literals = header,
                                    .slot_count = SLOTS};
     for (int index = 0; index < TOPICS; index++) make_target(made, index);
     struct targets publishes = {.ttl = generation % 2 ? 0 : 5000000, .layout = &made->layout, .sources = &made->source,

@@ -38,7 +38,7 @@ struct made {
     struct payload_case cases[ROUTES + 1];
     struct route routes[ROUTES];
     struct target destinations[ROUTES][DESTINATIONS];
-    struct section sections[2]; /* of which no field is wanted */
+    struct section section; /* of which no field is wanted */
     struct value defaults[SLOT_SOURCE + 1], sources[2];
     struct layout layout;
     struct operation condition;
@@ -162,7 +162,7 @@ static struct made *make(uint32_t generation) {
     check(made, "memory");
     made->topic.wanted = &wanted;
     made->feed.deadman = open_deadman();
-    made->layout = (struct layout){.sections = made->sections, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
+    made->layout = (struct layout){.sections = &made->section, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
     made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
     made->peer = (struct peer){0x7f000002, 0, 0, SEEN, 0};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};
