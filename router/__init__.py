@@ -6,6 +6,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
+__version__ = "0.1.0"
+
 _KEYBOARD_INTERRUPT = 130
 
 
