@@ -11,9 +11,7 @@ import importlib
 import io
 import os
 import re
-import shutil
 import sys
-import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -101,6 +99,9 @@ class _MainParser(argparse.ArgumentParser):
     """The verbs in groups, in place of one long list."""
 
     def format_help(self) -> str:
+        import shutil
+        import textwrap
+
         width = shutil.get_terminal_size().columns - 2
         lines = ["usage: router VERB ...", "", *textwrap.wrap(self.description or "", width)]
         for group, verbs in GROUPS.items():
