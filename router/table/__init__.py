@@ -52,13 +52,13 @@ def read_table(path: Path) -> RouteTable:
     return table
 
 
-def http_address(path: Path) -> Address | None:
+def http_address(path: Path, environ: Mapping[str, str]) -> Address | None:
     """The table's `http.address`, read without a check of the rest; None where only `load_table` can say what is wrong.
 
     `router status` waits for nothing else.
     """
     try:
-        http = load_chain(path, os.environ, [], []).get("http")
+        http = load_chain(path, environ, [], []).get("http")
         written = http.get("address") if isinstance(http, MappingNode) else None
         if isinstance(written, ScalarNode) and isinstance(written.value, str) and not written.broken:
             return parse_local(written.value)
