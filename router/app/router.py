@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from router import __version__
 from router.app.counts import ThreadCounts
 from router.app.plane import Plane
 from router.app.reloading import Reloader
@@ -209,20 +209,13 @@ class Router:
         from router.observe.metrics import CountersCollector
 
         build = {
-            "version": _version(),
+            "version": __version__,
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
         # Of this program, whose counters are there before those of the running one are adopted, once nothing is stuck.
         copies = partial(self._counts.copies, program.counters.size)
         return CountersCollector(program.counters, copies, self._asked(), build)
-
-
-def _version() -> str:
-    try:
-        return version("rover-router")
-    except PackageNotFoundError:  # run from a checkout that is not installed
-        return "unknown"
 
 
 class Services:

@@ -11,16 +11,14 @@ import importlib
 import io
 import os
 import re
-import shutil
 import sys
-import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn, TextIO, TypeAlias
 
+from router import __version__
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
-from router.ros.environment import ADDRESS_SPACE, address_space
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -82,12 +80,8 @@ _INDENT = " " * 12
 
 
 class _Version(argparse.Action):
-    """Reads the version on demand, since importlib.metadata is slow to import."""
-
     def __call__(self, parser: argparse.ArgumentParser, *rest: object) -> None:
-        from importlib.metadata import version
-
-        print(f"router {version('rover-router')}")
+        print(f"router {__version__}")
         parser.exit()
 
 
@@ -105,6 +99,9 @@ class _MainParser(argparse.ArgumentParser):
     """The verbs in groups, in place of one long list."""
 
     def format_help(self) -> str:
+        import shutil
+        import textwrap
+
         width = shutil.get_terminal_size().columns - 2
         lines = ["usage: router VERB ...", "", *textwrap.wrap(self.description or "", width)]
         for group, verbs in GROUPS.items():
@@ -173,6 +170,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             what = f"router {_verb(arguments)}: router/declared.py was not made of the present headers"
             print(with_help(what, "run 'make setup'"), file=sys.stderr)
             return BAD_TABLE
+        from router.ros.environment import ADDRESS_SPACE, address_space
+
         # Each of them may say that memory could not be had.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise

@@ -1,11 +1,13 @@
 """What of a table a shell completes: payload cases and their fields, endpoints, listeners, gateways and topics.
 
-A table with errors completes what is valid of it. Nothing is said of what cannot be read: the verb says it.
+Most are completed as they are written, without a check of the table. Nothing is said of what cannot be read: the verb
+says it.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -37,9 +39,7 @@ def completes(action: argparse.Action, words: Words) -> None:
 
 def routed(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     """The payload cases that the table routes, and its gateways."""
-    if table := _table(args):
-        yield from (route.case.value for route in table.routes if route.case.value)
-        yield from (*table.gateways, *table.ignored_gateways)
+    yield from _names(args, "routes", "gateways")
 
 
 def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:
@@ -48,8 +48,7 @@ def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:
 
 
 def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
-    table = _table(args)
-    return table.endpoints if table else ()
+    return _names(args, "endpoints")
 
 
 def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
@@ -62,14 +61,12 @@ def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 def places(args: argparse.Namespace, _: str = "") -> Iterable[str]:
     """Where datagrams are sent to: listeners and endpoints."""
-    table = _table(args)
-    return (*table.listeners, *table.endpoints) if table else ()
+    return _names(args, "listen", "endpoints")
 
 
 def silences(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     """`basestation:`, to be followed by seconds."""
-    if table := _table(args):
-        yield from (f"{name}:" for name in (*table.endpoints, *(route.case.value for route in table.routes)) if name)
+    yield from (f"{name}:" for name in _names(args, "endpoints", "routes"))
 
 
 def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
@@ -134,6 +131,16 @@ def _element(field: Field) -> object:
 def _topics(table: RouteTable) -> Iterator[str]:
     yield from (topic.topic.value for route in table.routes for topic in route.all_topics)
     yield from (inbound.topic.topic.value for gateway in table.gateways.values() for inbound in gateway.inbound)
+
+
+def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
+    """The keys below these keys of the table, or of what it extends, whether they are valid or not."""
+    from router.table.extends import load_chain
+    from router.table.nodes import MappingNode
+
+    if (path := table_if_any(args)) is not None:
+        parts = map(load_chain(path, os.environ, [], []).get, keys)
+        yield from (name for part in parts if isinstance(part, MappingNode) for name in part.entries)
 
 
 def _table(args: argparse.Namespace) -> RouteTable | None:

@@ -13,17 +13,16 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
+from typing import TYPE_CHECKING
 
 from router.assets import asset
 from router.cli import OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.init import FIRST_TABLE
-from router.cli.run import route
 from router.cli.tool_options import good_table, say
-from router.compiler.program import Program
-from router.datagrams import Wire
-from router.log import configure_log
-from router.tools.simulator import Simulator
+
+if TYPE_CHECKING:
+    from router.compiler.program import Program
 
 _DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
 Nothing leaves this computer. The first lines say where to look with a browser or Foxglove, and the command that shows
@@ -36,6 +35,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from router.cli.run import route
+    from router.log import configure_log
+
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, where the table is
     configure_log(coloured=is_coloured(sys.stderr))
@@ -61,6 +63,9 @@ def _simulated(program: Program) -> Iterator[None]:
 
     Raises UsageError where an address is taken.
     """
+    from router.datagrams import Wire
+    from router.tools.simulator import Simulator
+
     failures: list[Exception] = []
 
     def play() -> None:

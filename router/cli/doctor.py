@@ -7,12 +7,15 @@ import json
 import os
 import sys
 from collections import Counter
+from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import GREEN, RED, YELLOW, Paint, is_coloured
 from router.cli.tool_options import add_table, table_path
 from router.errors import plural
-from router.tools.doctor_checks import CheckResult, Grade
+
+if TYPE_CHECKING:
+    from router.tools.doctor_checks import CheckResult, Grade
 
 SICK = 1
 
@@ -20,7 +23,8 @@ _DESCRIPTION = f"""Look at the table, ROS, ports, buffers, clock, endpoints and 
 Exit code: {OK} nothing keeps it from working, {SICK} something does, {BAD_TABLE} the table cannot be read. What works
 less well is a warning only."""
 
-_STYLES = {Grade.FINE: GREEN, Grade.WARNING: YELLOW, Grade.PROBLEM: RED}
+_STYLES = {"ok": GREEN, "warning": YELLOW, "problem": RED}
+"""By the value of a grade."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -36,6 +40,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from router.tools.doctor import before_start, examine
+    from router.tools.doctor_checks import Grade
 
     path = table_path(args)
     grades: Counter[Grade] = Counter()
@@ -51,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def shown(result: CheckResult, *, coloured: bool) -> str:
     """One line, and a second one with the remedy."""
-    grade = Paint(coloured)(_STYLES[result.grade], f"{result.grade.value:8}")
+    grade = Paint(coloured)(_STYLES[result.grade.value], f"{result.grade.value:8}")
     text = f"{grade} {result.about:10} {result.text}"
     return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text
 
@@ -61,6 +66,8 @@ def _json(result: CheckResult) -> str:
 
 
 def _summary(grades: Counter[Grade]) -> str:
+    from router.tools.doctor_checks import Grade
+
     if not grades[Grade.PROBLEM] and not grades[Grade.WARNING]:
         return "nothing keeps the router from working here"
     counts = [plural(grades[grade], grade.value) for grade in (Grade.PROBLEM, Grade.WARNING) if grades[grade]]

@@ -17,11 +17,10 @@ from router.cli import BAD_TABLE, OK, VERBS, Subparsers, add_verb
 from router.cli.findings import print_findings
 from router.cli.tool_options import add_table, table_path
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, plural, shown_path
-from router.table import load_table
-from router.table.model import EnvelopeSettings
 from router.types.lock_file import ENVELOPE, ONEOF, short_name
 
 if TYPE_CHECKING:
+    from router.table.model import EnvelopeSettings
     from router.types.lock import Conflict
     from router.types.lock_file import Lock
 
@@ -91,11 +90,15 @@ def _settings(args: argparse.Namespace) -> EnvelopeSettings:
 
 
 def _of_folder(root: Path) -> EnvelopeSettings:
+    from router.table.model import EnvelopeSettings
+
     span = SourceSpan(shown_path(root))
     return EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
 
 
 def _of_table(path: Path) -> EnvelopeSettings:
+    from router.table import load_table
+
     table, findings = load_table(path)
     if table is None:
         raise TableError(findings)

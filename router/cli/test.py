@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import (
@@ -26,13 +26,11 @@ from router.cli.findings import (
     visible,
 )
 from router.cli.tool_options import add_styles, add_tables, table_paths
-from router.compiler import check_table
-from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, TableError, UsageError, plural, shown_path
-from router.rehearsal.coverage import Coverage
-from router.rehearsal.reading import ENDINGS, find_test_files, read_test_file
-from router.rehearsal.running import FailedStep, Result, run_tests
-from router.table import in_order
+
+if TYPE_CHECKING:
+    from router.rehearsal.coverage import Coverage
+    from router.rehearsal.running import FailedStep, Result
 
 FAILED = 1
 _DESCRIPTION = f"""Run the tests of route tables: given this message, the table sends and publishes exactly that. A
@@ -53,6 +51,8 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from router.rehearsal.reading import find_test_files
+
     if args.coverage and args.only:
         print("router test: --coverage is about all tests; leave out --only", file=sys.stderr)
         return BAD_USAGE
@@ -79,10 +79,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _tests_of(path: Path) -> Path:
     """The test file beside a table; any other path as it is. Raises UsageError for a good table without one."""
+    from router.rehearsal.reading import ENDINGS
+
     if not path.is_file() or path.name.endswith(ENDINGS):
         return path
     tests = path.with_name(f"{path.stem}.test{path.suffix}")
     if not tests.exists():
+        from router.compiler import check_table
+
         if (checked := check_table(path)).has_errors:
             raise TableError(checked.diagnostics)
         raise UsageError(f"{shown_path(path)} has no tests: there is no {shown_path(tests)}")
@@ -93,6 +97,12 @@ def _results(
     files: Sequence[Path], only: str, coverages: dict[Path, Coverage] | None
 ) -> tuple[list[Result], list[Diagnostic]]:
     """All results, and what is wrong with the test files and their tables. `coverages`, by table, are filled."""
+    from router.compiler.lookup import Definitions
+    from router.rehearsal.coverage import Coverage
+    from router.rehearsal.reading import read_test_file
+    from router.rehearsal.running import run_tests
+    from router.table import in_order
+
     results: list[Result] = []
     findings: dict[Diagnostic, None] = {}
     definitions = Definitions()

@@ -139,12 +139,18 @@ def add_url_option(parser: argparse.ArgumentParser) -> None:
 
 def running_url(args: argparse.Namespace) -> str:
     """The URL from --url or from the table, which may have errors elsewhere. Raises TableError and UsageError."""
-    from router.table import load_table
-    from router.tools.running_router import url_of
-
     if args.url:
         return str(args.url).strip()
-    table, findings = load_table(table_path(args))
+
+    from os import environ
+
+    from router.table import http_address, load_table
+    from router.tools.running_router import url_at, url_of
+
+    path = table_path(args)
+    if (address := http_address(path, environ)) is not None:
+        return url_at(address)
+    table, findings = load_table(path)
     if table is None:
         raise TableError(findings)
     return url_of(table)

@@ -11,10 +11,7 @@ from pathlib import Path
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import count_line, print_findings, severity
 from router.cli.tool_options import add_styles, add_tables, table_paths
-from router.compiler import check_table
-from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, UsageError, shown_path
-from router.table import summary
 
 _DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint. A folder stands for the
 *.yaml and *.yml in it (not in folders below it, and not *.test.yaml).
@@ -31,6 +28,10 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from router.compiler import check_table
+    from router.compiler.lookup import Definitions
+    from router.table import summary
+
     tables = find_tables(table_paths(args))
     findings: dict[Diagnostic, None] = {}  # tables that extend the same one share its findings
     definitions = Definitions()

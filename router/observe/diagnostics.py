@@ -14,8 +14,9 @@ from router.clock import wall_ns
 from router.compiler.cdr import HEADER, put_length, put_text
 from router.compiler.program import GatewayPlan
 from router.log import logger
-from router.observe import health
-from router.observe.health import PERIOD, Kind, Look, Problem
+from router.observe import problems
+from router.observe.health import PERIOD, Look
+from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
 from router.observe.watch import LAST_SEEN, Health
 from router.table.model import Endpoint, Route
@@ -33,10 +34,10 @@ class Level(enum.IntEnum):
 
 
 _LEVELS = {
-    health.Level.CRITICAL: Level.ERROR,
-    health.Level.WARNING: Level.WARN,
-    health.Level.INFO: Level.OK,
-    health.Level.CALM: Level.OK,
+    problems.Level.CRITICAL: Level.ERROR,
+    problems.Level.WARNING: Level.WARN,
+    problems.Level.INFO: Level.OK,
+    problems.Level.CALM: Level.OK,
 }
 _SEVERITY = (Level.OK, Level.WARN, Level.STALE, Level.ERROR)
 

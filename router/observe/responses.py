@@ -20,7 +20,7 @@ from prometheus_client.exposition import choose_encoder
 from router.assets import page_policy
 from router.clock import wall_ns
 from router.errors import RouterError
-from router.observe.health import Kind
+from router.observe.problems import Kind
 from router.observe.running import Running
 from router.observe.snapshot import COLLECTED_AT
 from router.observe.status import Status

@@ -7,7 +7,8 @@ from collections import deque
 
 from router.clock import boottime_ns, wall_ns
 from router.log import logger
-from router.observe.health import PERIOD, WINDOW, Kind, Look
+from router.observe.health import PERIOD, WINDOW, Look
+from router.observe.problems import Kind
 from router.observe.running import Running
 from router.observe.snapshot import DELIVERED, Snapshot, snapshot
 from router.threads import Thread, background_threads, join_or_leave

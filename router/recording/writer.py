@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
-from importlib.metadata import version
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
@@ -29,6 +28,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from router import __version__
 from router.clock import wall_ns
 from router.errors import StartError
 from router.log import logger
@@ -59,7 +59,7 @@ class RecordingFile:
         self._written_schemas: set[int] = set()
         self._indexes: list[ChunkIndex] = []
         self._messages: Counter[int] = Counter()
-        head = MCAP0_MAGIC + _encoded([Header("", f"{LIBRARY} {version('rover-router')}")])
+        head = MCAP0_MAGIC + _encoded([Header("", f"{LIBRARY} {__version__}")])
         metadata = _encoded([Metadata(name=METADATA, metadata=dict(about))])
         self._metadata = MetadataIndex(offset=len(head), length=len(metadata), name=METADATA)
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)

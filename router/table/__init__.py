@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from router import inputs
 from router.errors import Diagnostic, Severity, TableError, plural
-from router.table.addresses import outside_findings
-from router.table.build import build_table
+from router.table.addresses import BadAddressError, outside_findings, parse_local
 from router.table.extends import load_chain
-from router.table.mistakes import cut_findings
-from router.table.model import RouteTable
-from router.table.shape import check_shape
-from router.table.shorthand import written_out
-from router.table.source import Source
+from router.table.nodes import MappingNode, ScalarNode
+
+if TYPE_CHECKING:
+    from router.table.addresses import Address
+    from router.table.model import RouteTable
+    from router.table.source import Source
 
 
 def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[RouteTable | None, list[Diagnostic]]:
@@ -23,6 +24,11 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     The table is None only when nothing usable could be built (unreadable, bad YAML, no envelope); else
     it holds what is valid, and `broken` names what was left out. `environ` None means the environment.
     """
+    from router.table.build import build_table
+    from router.table.mistakes import cut_findings
+    from router.table.shape import check_shape
+    from router.table.shorthand import written_out
+
     sources: list[Source] = []
     findings: list[Diagnostic] = []
     table = None
@@ -44,6 +50,21 @@ def read_table(path: Path) -> RouteTable:
     if table is None or any(finding.severity is Severity.ERROR for finding in findings):
         raise TableError(findings)
     return table
+
+
+def http_address(path: Path, environ: Mapping[str, str]) -> Address | None:
+    """The table's `http.address`, read without a check of the rest; None where only `load_table` can say what is wrong.
+
+    `router status` waits for nothing else.
+    """
+    try:
+        http = load_chain(path, environ, [], []).get("http")
+        written = http.get("address") if isinstance(http, MappingNode) else None
+        if isinstance(written, ScalarNode) and isinstance(written.value, str) and not written.broken:
+            return parse_local(written.value)
+    except (TableError, BadAddressError):
+        pass
+    return None
 
 
 def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:

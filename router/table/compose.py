@@ -15,7 +15,6 @@ from typing import NamedTuple
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.mistakes import exclamation, explain
 from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
 from router.table.source import Source, fill, foreign_blank, has_variables, unusable_character
 
@@ -75,6 +74,8 @@ class _Composer:
                     last = event
                 yield event
         except yaml.MarkedYAMLError as error:
+            from router.table.mistakes import explain
+
             raise TableError([explain(error, self._source, self._open_quote(last), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
@@ -202,6 +203,9 @@ class _Composer:
     def _has_tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent, span: SourceSpan) -> bool:
         if event.tag is None:
             return False
+
+        from router.table.mistakes import exclamation
+
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
         hint = "remove it; quotes make a value text"
         if (found := exclamation(self._source, span.line - 1)) is not None:

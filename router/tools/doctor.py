@@ -12,7 +12,7 @@ from pathlib import Path
 from router.compiler import Checked, check_table
 from router.compiler.program import Program
 from router.errors import Severity, TransportError, plural, shown_path
-from router.observe.health import Level
+from router.observe.problems import Level
 from router.table import summary
 from router.tools.doctor_checks import (
     CheckResult,

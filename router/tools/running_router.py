@@ -9,16 +9,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from email.message import Message
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
-from router.observe.health import Kind, Problem
-from router.observe.snapshot import COLLECTED_AT, Snapshot, parse_metrics
-from router.observe.tap import Lost, StreamReader
-from router.recording.mirror import MirroredDatagram
-from router.table.model import RouteTable
-from router.tools.udp import reachable
+from router.observe.problems import Kind, Problem
+
+if TYPE_CHECKING:
+    from router.observe.snapshot import Snapshot
+    from router.observe.tap import Lost
+    from router.recording.mirror import MirroredDatagram
+    from router.table.addresses import Address
+    from router.table.model import RouteTable
 
 PATIENCE = 5.0
 """Seconds; a router answers at once, and says once a second in a tap that it is there."""
@@ -49,7 +51,14 @@ def url_of(table: RouteTable) -> str:
     """Return where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
     if table.http is None:
         raise UsageError(f"{table.path} has no 'http.address', without which a running router cannot be asked")
-    return f"http://{reachable(table.http.value)}"
+    return url_at(table.http.value)
+
+
+def url_at(address: Address) -> str:
+    """The URL of a router whose `http.address` this is."""
+    from router.tools.udp import reachable
+
+    return f"http://{reachable(address)}"
 
 
 def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
@@ -69,6 +78,8 @@ def metrics(url: str) -> Snapshot:
 
     Raises TransportError where nobody answers, or something else than a router.
     """
+    from router.observe.snapshot import COLLECTED_AT, parse_metrics
+
     text, headers = _got(url, "/metrics")
     try:
         at = float(headers.get(COLLECTED_AT) or time.time())
@@ -118,6 +129,8 @@ def tap(
 
 
 def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[MirroredDatagram | Lost]]:
+    from router.observe.tap import StreamReader
+
     reader = StreamReader()
     while True:
         try:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.metrics import INTENDED_REASONS
-from router.observe.health import DROPS, Kind, Level, Problem
+from router.observe.problems import DROPS, Kind, Level, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
 WINDOW = 3.0

@@ -9,12 +9,13 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from router.compiler.network import recognisers
 from router.errors import TransportError, UsageError, did_you_mean
-from router.net.kernel import interface_address, why_not_bound
 from router.table.addresses import Address
-from router.table.model import Listener, RouteTable
+
+if TYPE_CHECKING:
+    from router.table.model import Listener, RouteTable
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"
@@ -62,8 +63,12 @@ def reachable(address: Address, interface: str | None = None) -> Address:
     """
     if address.host != ANY_HOST:
         return address
-    host = interface_address(interface) if interface else LOOPBACK
-    if host is None:
+    if interface is None:
+        return address._replace(host=LOOPBACK)
+
+    from router.net.kernel import interface_address
+
+    if (host := interface_address(interface)) is None:
         raise UsageError(f"network interface '{interface}' is not there, or has no IPv4 address to send to")
     return address._replace(host=host)
 
@@ -75,6 +80,8 @@ def listener_address(listener: Listener) -> Address:
 
 def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
     """A function from a peer's address to its endpoint's name, else to the address as text."""
+    from router.compiler.network import recognisers
+
     by_host, by_address = recognisers(table.endpoints if table is not None else {}, None)
 
     def name_of(peer: tuple[str, int]) -> str:
@@ -85,6 +92,8 @@ def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
 
 def open_udp(address: Address, purpose: str) -> socket.socket:
     """A non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
+    from router.net.kernel import why_not_bound
+
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         opened.setblocking(False)

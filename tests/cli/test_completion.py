@@ -88,7 +88,7 @@ def test_the_table_is_the_one_that_is_named_before(folder: Path) -> None:
     assert completed("router explain rock_", folder, ROUTER_TABLE="own.yaml") == ["rock_measure_result"]
 
 
-def test_a_table_with_errors_completes_what_is_valid_of_it(tmp_path: Path) -> None:
+def test_a_table_with_errors_completes_what_is_written_in_it(tmp_path: Path) -> None:
     (tmp_path / "broken.yaml").write_text(BROKEN.replace("PROTOS", shlex.quote(str(PROTOS))))
     assert completed("router explain -t broken.yaml ", tmp_path) == ["gps_info", "imu_info"]
     assert completed("router tap -t broken.yaml --from ", tmp_path) == ["board"]

@@ -32,6 +32,7 @@ import signal
 
 from router.cli import demo
 from router.compiler import check_table
+from router.tools import simulator
 
 
 class Failing:
@@ -44,7 +45,7 @@ class Failing:
     stop = close = __init__
 
 
-demo.Simulator = Failing
+simulator.Simulator = Failing
 with demo._simulated(check_table(demo.FIRST_TABLE / "routes" / "rover.yaml").program):
     assert signal.sigwait({signal.SIGTERM}) == signal.SIGTERM
 """

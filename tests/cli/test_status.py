@@ -9,7 +9,7 @@ import pytest
 
 from router.cli import NETWORK_FAULT, OK, main
 from router.cli.status import DEGRADED
-from router.observe.health import Kind, Problem
+from router.observe.problems import Kind, Problem
 from tests.tools.answering import answering
 
 SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, " for 8 s", "Check power and cable.")

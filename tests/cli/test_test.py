@@ -41,7 +41,7 @@ def rover(site: Path, unchanged: TestFile, monkeypatch: pytest.MonkeyPatch) -> P
     for name in ("rover.yaml", "rover.test.yaml"):
         shutil.copy(ROUTES / name, site / "routes")
     monkeypatch.chdir(site)
-    monkeypatch.setattr("router.cli.test.Definitions", lambda: DEFINITIONS)
+    monkeypatch.setattr("router.compiler.lookup.Definitions", lambda: DEFINITIONS)
     return site / "routes" / "rover.yaml"
 
 

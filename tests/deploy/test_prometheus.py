@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from router.compiler.metrics import INTENDED_REASONS
-from router.observe.health import DROPS, Kind
-from router.observe.health import PAGE as HEALTH_PAGE
+from router.observe.problems import DROPS, Kind
+from router.observe.problems import PAGE as HEALTH_PAGE
 from tests.deploy.promql import selectors
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,8 @@ import pytest
 from router.compiler import metrics
 from router.compiler.metrics import Mismatch
 from router.observe import watch
-from router.observe.health import PAGE, PERIOD, REMEDIES, WINDOW, Kind, Level, Problem
+from router.observe.health import PERIOD, REMEDIES, WINDOW
+from router.observe.problems import PAGE, Kind, Level, Problem
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
 from tests.observe.counting import SECOND, Counting

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
-from router.observe.health import Problem
+from router.observe.problems import Problem
 
 COLLECTED_AT = 1_500_000_000.25
 """When its numbers were read, s."""

@@ -16,7 +16,7 @@ import pytest
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.errors import StartError
-from router.observe.health import Kind, Problem
+from router.observe.problems import Kind, Problem
 from router.table.addresses import Address
 from router.tools import doctor_checks
 from router.tools.doctor import before_start, examine

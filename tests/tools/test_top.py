@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
-from router.observe.health import Kind, Problem
+from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
 from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
 from router.tools.top_table import latency_text, reasons_text, targets_text
