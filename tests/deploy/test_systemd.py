@@ -296,6 +296,20 @@ def test_a_killed_router_comes_back(running: Machine) -> None:
     )
 
 
+def test_a_loop_of_crashes_ends(running: Machine) -> None:
+    running.shell(
+        "mkdir -p /run/systemd/system/rover-router.service.d\n"
+        "printf '[Service]\\nType=exec\\nExecStart=\\nExecStart=/bin/false\\n' "
+        "> /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload"
+    )
+    running.run("systemctl", "restart", "rover-router", check=False)
+    running.wait_for("systemctl is-failed -q rover-router")
+    running.shell("rm /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload")
+    assert "Start request repeated too quickly" in running.journal()
+    running.shell("systemctl reset-failed rover-router; systemctl start rover-router")
+    assert running.state() == "active"
+
+
 def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_what_python_does(running: Machine) -> None:
     running.shell(
         "mkdir -p /run/systemd/system/rover-router.service.d\n"
