@@ -147,12 +147,6 @@ def test_it_runs_on_the_carrier(running: Machine) -> None:
     assert f"{ROOT}/router/carrier/native/libcarrier.so" in running.shell(f"cat /proc/{pid}/maps")
 
 
-def test_what_python_compiles_it_finds_at_the_next_start(running: Machine) -> None:
-    """The service may not write beside its sources."""
-    cache = Path(f"/var/cache/rover-router{ROOT}/router/app")
-    assert running.shell(f"stat -c %U {cache}/router.*.pyc").split() == ["rover-router"]
-
-
 def test_what_receives_and_brakes_runs_at_a_real_time_priority(running: Machine) -> None:
     if running.run("prlimit", "--rtprio=1", "true", check=False).returncode:
         pytest.skip("systemd may not raise limits here; tests/platforms/systemd.sh boots one that may")
