@@ -342,6 +342,6 @@ def test_a_bad_table_stops_it_for_good_with_what_to_do_and_datagrams_do_not_star
     assert running.show("NRestarts") == "0"
     assert running.state("rover-router.socket") == "active"
     assert "did you mean 'routes'?" in running.journal()
-    assert "-> " in running.journal()
+    assert "help: " in running.journal()
     running.shell("systemctl reset-failed rover-router; systemctl start rover-router")
     assert running.state() == "active"
