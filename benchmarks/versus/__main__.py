@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.versus import report, results, sized
+from benchmarks.versus import report, results, sized, unrecorded
 from benchmarks.versus.building import build
 from benchmarks.versus.figures import judge
 from benchmarks.versus.processes import cores
@@ -55,14 +55,15 @@ def main() -> None:
     output = args.output or (None if args.quick else results.DEFAULT)
     known = results.load(output) if output else results.empty()
     build()
-    for routes in (sized.SMALL, sized.LARGE):
+    for routes in (sized.SMALL, sized.LARGE, sized.LARGEST):
         sized.write(routes, sized.folder(routes))
+    unrecorded.write()
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.sched_setaffinity(0, {cores().helpers})
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started is ended too
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["ROS_LOG_DIR"] = folder
+        os.environ["ROS_LOG_DIR"] = os.environ["STATE_DIRECTORY"] = folder
         for scenario in args.only:
             entry = measured(scenario, pace, 1 if args.quick else args.repeat, Path(folder))
             print(report.text(scenario.name, entry), flush=True)

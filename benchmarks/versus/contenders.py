@@ -52,13 +52,17 @@ class Ports:
 
 @dataclass(frozen=True)
 class Router:
-    """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any. `payloads`: which."""
+    """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any. `payloads`: which.
+
+    `board`: host and port of a board to which a deadman sends at the start.
+    """
 
     name: str
     table: Path
     copies: int = 1
     listens: bool = True
     payloads: Path = PAYLOADS
+    board: tuple[str, int] | None = None
 
     def words(self, _: Ports) -> list[object]:
         return [sys.executable, "-m", "router", "run", self.table, "--log-level", "error"]
@@ -79,6 +83,7 @@ class Native:
     copies: int = 1
     listens: bool = True
     payloads: Path = PAYLOADS
+    board: None = None
 
     def words(self, ports: Ports) -> list[object]:
         to = [word for port in (ports.first, ports.second)[: self.copies] for word in ("--to", f"127.0.0.1:{port}")]

@@ -70,6 +70,10 @@ class Helper(AbstractContextManager["Helper"]):
         answer: dict[str, Any] = json.loads(line)
         return answer
 
+    def fileno(self) -> int:
+        """Readable when a result is there."""
+        return self._out.fileno()
+
     def is_running(self) -> bool:
         return self._process.poll() is None
 
@@ -136,6 +140,11 @@ def _probe(*words: object) -> Helper:
 
 def subscriber(topics: Sequence[Topic]) -> Helper:
     return _probe("subscribe", *(f"{topic.name}:{topic.kind}" for topic in topics))
+
+
+def first_message(topic: Topic) -> Helper:
+    """A subscriber, ready before the topic is there, with a result as soon as a message comes."""
+    return _probe("first", f"{topic.name}:{topic.kind}")
 
 
 def publisher(rate: float, seconds: float) -> Helper:

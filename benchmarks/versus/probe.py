@@ -1,11 +1,12 @@
 """The ROS side of a measurement: a subscriber, or a paced publisher. A program of its own, and knows nothing else.
 
     python -m benchmarks.versus.probe subscribe imu_data:comms/msg/ImuSensorInformation ...
+    python -m benchmarks.versus.probe first imu_data:comms/msg/ImuSensorInformation
     python -m benchmarks.versus.probe publish --rate 1000 --seconds 5
 
-Both print {"matched": true} once the other side is there, and one line of JSON with the result at the end. Messages
-are taken and published as bytes, in a loop around a bare wait set: rclpy's executor and message objects cost several
-times what is to be measured, on the core that generator and sink share.
+They print {"matched": true} once the other side is there, `first` as soon as it is ready for it, and one line of JSON
+with the result at the end. Messages are taken and published as bytes, in a loop around a bare wait set: rclpy's
+executor and message objects cost several times what is to be measured, on the core that generator and sink share.
 """
 
 from __future__ import annotations
@@ -107,6 +108,19 @@ def subscribe(node: Node, topics: Mapping[str, str]) -> None:
     tell()
 
 
+def first(node: Node, topic: str, kind: str) -> None:
+    """Tells when a message comes. Its publisher may be there or not."""
+    subscription = node.create_subscription(message_class(kind), topic, lambda _: None, PATIENT_DEPTH, raw=True)
+    wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+    say(matched=True)
+    while subscription.handle.take_message(subscription.msg_type, True) is None:
+        wait_set.clear_entities()
+        wait_set.add_subscription(subscription.handle)
+        wait_set.wait(100_000_000)
+    say(received=1)
+    signal.pause()
+
+
 def publish(node: Node, rate: float, seconds: float) -> None:
     """Publishes on an absolute schedule, once a line arrives on stdin."""
     topic, kind = OUTBOUND
@@ -132,6 +146,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     modes = parser.add_subparsers(dest="mode", required=True)
     modes.add_parser("subscribe").add_argument("topics", nargs="+", metavar="TOPIC:TYPE")
+    modes.add_parser("first").add_argument("topic", metavar="TOPIC:TYPE")
     publishing = modes.add_parser("publish")
     publishing.add_argument("--rate", type=float, required=True)
     publishing.add_argument("--seconds", type=float, required=True)
@@ -140,6 +155,8 @@ def main() -> None:
     node = rclpy.create_node("bench_probe", start_parameter_services=False, enable_rosout=False)
     if args.mode == "subscribe":
         subscribe(node, dict(topic.split(":") for topic in args.topics))
+    elif args.mode == "first":
+        first(node, *args.topic.split(":"))
     else:
         publish(node, args.rate, args.seconds)
     node.destroy_node()  # leaving silently would keep the subject waiting for acknowledgements

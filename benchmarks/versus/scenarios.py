@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from benchmarks.versus import sized
+from benchmarks.versus import sized, unrecorded
 from benchmarks.versus.contenders import PAYLOADS, TABLES, Contender, Native, Router
 from benchmarks.versus.costs import inbound_cost, outbound_cost
 from benchmarks.versus.figures import Aim
 from benchmarks.versus.flood import flood
-from benchmarks.versus.footprint import start_and_memory
+from benchmarks.versus.footprint import start_and_memory, start_and_reload
 from benchmarks.versus.helpers import ALL_TOPICS, IMU
 from benchmarks.versus.latencies import latency
 from benchmarks.versus.limits import highest_rate, overload
@@ -56,7 +56,14 @@ LATENCY = at_most(
     "peer", {f"{edge}_{quantile}_us": 1.0 for edge in ("udp", "udp_subscribed") for quantile in ("p50", "p99")}
 )
 LATENCY += at_most("peer", {f"ros_{quantile}_us": 1.0 for quantile in ("p50", "p99")})
-FOOTPRINT = (Aim("start_s", at_most=1.0), Aim("rss_mb", at_most=120))
+DRIVING_BOARD = "127.0.0.222", 25008
+FOOTPRINT = (
+    Aim("start_s", at_most=0.7),
+    Aim("start_s@again", at_most=0.2),
+    Aim("ros_s"),
+    Aim("ros_s@again", at_most=1.0),
+)
+BRAKE = (Aim("brake_s", at_most=0.7), Aim("brake_s@again", at_most=0.15))
 
 SCENARIOS = (
     Scenario(
@@ -127,17 +134,41 @@ SCENARIOS = (
     ),
     Scenario(
         "footprint",
-        "Start to the first datagram routed, and memory after 60 s at 5000 per second",
+        "Start to the first datagram routed and the first message on ROS, and memory after 60 s at 5000 per second",
         (OWN, PEER),
         start_and_memory,
-        (*FOOTPRINT, Aim("start_s", "peer"), Aim("rss_mb", "peer")),
+        (
+            *FOOTPRINT,
+            Aim("rss_mb", at_most=80),
+            *(Aim(metric, "peer") for metric in ("start_s", "start_s@again", "ros_s@again", "rss_mb")),
+        ),
     ),
     Scenario(
         "footprint_rover",
-        "The same with all routes of the rover",
-        (Router("router", TABLES / "rover.yaml"),),
+        "The same with all routes of the rover, and start to the first brake at the board",
+        (Router("router", TABLES / "rover.yaml", board=DRIVING_BOARD),),
         start_and_memory,
-        FOOTPRINT,
+        (*BRAKE, *FOOTPRINT, Aim("rss_mb")),
+    ),
+    Scenario(
+        "footprint_unrecorded",
+        "The same without the table's recordings",
+        (Router("router", unrecorded.TABLE, board=DRIVING_BOARD),),
+        start_and_memory,
+        (*BRAKE, *FOOTPRINT, Aim("rss_mb", at_most=90)),
+    ),
+    Scenario(
+        "footprint_1000",
+        "Start and reload of a table with 1,000 routes",
+        (sized_router("routes_1000", sized.LARGEST),),
+        start_and_reload,
+        (
+            Aim("start_s", at_most=3.0),
+            Aim("start_s@again", at_most=0.3),
+            Aim("ros_s"),
+            Aim("ros_s@again"),
+            Aim("reload_s", at_most=3.0),
+        ),
     ),
     Scenario(
         "table_size",

@@ -1,7 +1,8 @@
 """Route tables of any size, with the .proto files and datagrams that go with them. Knows nothing of measuring.
 
 Four payload cases are the rover's, under their own numbers; the others are copies of those four messages under names
-and numbers of their own. Each case has a route with one destination and two topics.
+and numbers of their own. Each case has a route with one destination and two topics; in the largest table, which
+would have too many values, one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from router.types.wire import LEN
 from tests.envelopes import tag
 from tests.tables import PROTOS
 
-SMALL, LARGE = 26, 260
+SMALL, LARGE, LARGEST = 26, 260, 1000
 FIRST_COPY = 101
 """Field number, above all of the rover's."""
 
@@ -61,7 +62,9 @@ def write(count: int, target: Path) -> None:
     all_cases = list(_cases(count))
     (target / "protos" / ENVELOPE).write_text(_envelope(all_cases), encoding="utf-8")
     (target / "payloads.txt").write_text("\n".join(_payloads(all_cases)), encoding="utf-8")
-    (target / "table.yaml").write_text(yaml.safe_dump(_table(all_cases), sort_keys=False), encoding="utf-8")
+    (target / "table.yaml").write_text(
+        yaml.safe_dump(_table(all_cases, 1 if count == LARGEST else 2), sort_keys=False), encoding="utf-8"
+    )
 
 
 def _cases(count: int) -> Iterator[Case]:
@@ -91,17 +94,18 @@ def _payloads(cases: Sequence[Case]) -> Iterator[str]:
         yield f"{case.name} {(tag(case.number, LEN) + behind_tag).hex()}"
 
 
-def _table(cases: Sequence[Case]) -> dict[str, Any]:
+def _table(cases: Sequence[Case], topics: int) -> dict[str, Any]:
     return {
         "version": 1,
         "envelope": {"protos": "protos", "message": "PBEnvelope", "oneof": "payload"},
+        "http": {"address": "127.0.0.1:${METRICS_PORT:-29108}"},
         "listen": {"all": {"address": "127.0.0.1:${LISTEN_PORT:-5000}"}},
         "endpoints": {
             "sensor_board": {"address": "127.0.0.30:8", "kind": "board"},
             "first": {"address": "127.0.0.1:${FIRST_PORT:-6000}", "kind": "tool"},
         },
         "routes": {
-            case.name: {"source": "sensor_board", "destinations": ["first"], "topics": list(_topics(case))}
+            case.name: {"source": "sensor_board", "destinations": ["first"], "topics": list(_topics(case))[:topics]}
             for case in cases
         },
     }

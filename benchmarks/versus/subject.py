@@ -34,9 +34,12 @@ class Subject(AbstractContextManager["Subject"]):
             self._process = spawn(words, cores().subject, environment=environment, stderr=stderr)
 
     def __exit__(self, *_: object) -> None:
-        """The whole family; a wrapper would leave its children behind."""
+        self.end(signal.SIGTERM, signal.SIGKILL)
+
+    def end(self, *numbers: signal.Signals) -> None:
+        """The whole family, by these signals; a wrapper would leave its children behind."""
         alive, deadline = self.pids(), time.monotonic() + STOP_SECONDS
-        for number in (signal.SIGTERM, signal.SIGKILL):
+        for number in numbers:
             for pid in alive:
                 with suppress(ProcessLookupError):
                     os.kill(pid, number)

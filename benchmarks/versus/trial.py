@@ -44,9 +44,9 @@ class Trial:
     pace: Pace
     folder: Path
 
-    def start(self) -> Subject:
+    def start(self, ports: Ports | None = None) -> Subject:
         """The process, just started."""
-        return Subject(self.contender, Ports.free(), self.folder / f"{self.contender.name}.log")
+        return Subject(self.contender, ports or Ports.free(), self.folder / f"{self.contender.name}.log")
 
     @contextmanager
     def started(self) -> Iterator[Subject]:

@@ -290,6 +290,20 @@ def test_a_killed_router_comes_back(running: Machine) -> None:
     )
 
 
+def test_a_loop_of_crashes_ends(running: Machine) -> None:
+    running.shell(
+        "mkdir -p /run/systemd/system/rover-router.service.d\n"
+        "printf '[Service]\\nType=exec\\nExecStart=\\nExecStart=/bin/false\\n' "
+        "> /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload"
+    )
+    running.run("systemctl", "restart", "rover-router", check=False)
+    running.wait_for("systemctl is-failed -q rover-router")
+    running.shell("rm /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload")
+    assert "Start request repeated too quickly" in running.journal()
+    running.shell("systemctl reset-failed rover-router; systemctl start rover-router")
+    assert running.state() == "active"
+
+
 def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_what_python_does(running: Machine) -> None:
     running.shell(
         "mkdir -p /run/systemd/system/rover-router.service.d\n"
@@ -328,6 +342,6 @@ def test_a_bad_table_stops_it_for_good_with_what_to_do_and_datagrams_do_not_star
     assert running.show("NRestarts") == "0"
     assert running.state("rover-router.socket") == "active"
     assert "did you mean 'routes'?" in running.journal()
-    assert "-> " in running.journal()
+    assert "help: " in running.journal()
     running.shell("systemctl reset-failed rover-router; systemctl start rover-router")
     assert running.state() == "active"
