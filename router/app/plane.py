@@ -24,7 +24,8 @@ from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import EventReader, EventThread
 from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
-from router.carrier.outlets import Names, Outlets, Publication
+from router.carrier.names import Names
+from router.carrier.outlets import Outlets, Publication
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import where_refused, why_rejected
@@ -157,7 +158,7 @@ class Plane:
         native = native_program(program, generation, outlets)
         from_ros = native_from_ros(program, generation, outlets, opened.subscriptions)
         for arrays in (native.arrays, from_ros.arrays):
-            arrays.append(outlets)
+            arrays.keep(outlets)
         adopted = [*outlets.pacers(), *native.states.adopted, *from_ros.states.adopted]
         clients = {
             plan.route: self._client_deadmen.kept(plan, counters, opened.publications, state)
@@ -207,7 +208,7 @@ class Plane:
                 undo.callback(thread.stay)
             # Before the publish thread gets a message of this program.
             topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
-            built.native.arrays.append(topics)
+            built.native.arrays.keep(topics)
             self._publishing.change(topics)
             if earlier is None:
                 self._carrier.start(change_to(built.native, built.timers(None, of_topics=False)), built.native)

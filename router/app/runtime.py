@@ -115,7 +115,7 @@ class Runtime:
             undo.callback(sockets.opened.close)
             self._counts.make_room(program.counters)
             now = self.plane.now
-            state = State(now.state if now else None)
+            state = State(self.plane.library, now.state if now else None)
             if now is None:
                 self.plane.start_deadmen(program, sockets.senders, state)
             topics = self._prepare_topics(program, undo)

@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Mapping
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.carrier.schema import wire_kind
 from router.declared import BoardFlag, WireKind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
@@ -15,16 +16,17 @@ class NativeBoards:
     """A `struct board` for each endpoint that is a board. C may use them as long as this object lives."""
 
     def __init__(self, boards: Mapping[str, BoardLimits]) -> None:
+        self.arrays = Arrays()
         trees: dict[int, _Tree] = {}  # boards with the same firmware share one
         self._boards: dict[str, c.Board] = {}
         for name, limits in boards.items():
             key = id(limits.fields)
             if key not in trees:
-                trees[key] = _Tree(limits.fields)
-            self._boards[name] = c.Board(
+                trees[key] = _Tree(limits.fields, self.arrays)
+            board = c.Board(
                 messages=trees[key].messages, longest=limits.longest, allows_non_finite=limits.allows_non_finite
             )
-        self._trees = trees
+            self._boards[name] = self.arrays.add(board)
 
     def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
         """The board that an endpoint is; None for another kind of endpoint."""
@@ -35,12 +37,12 @@ class NativeBoards:
 class _Tree:
     """The tree of messages that an envelope is, flattened: each place has an index, and a run of counters."""
 
-    def __init__(self, envelope: BoardMessage) -> None:
+    def __init__(self, envelope: BoardMessage, arrays: Arrays) -> None:
         self._messages: list[c.BoardMessage] = []
-        self._arrays: list[object] = []
+        self._arrays = arrays
         self._counters = 0
         self._add(envelope)
-        self.messages = (c.BoardMessage * len(self._messages))(*self._messages)
+        self.messages = arrays.array(c.BoardMessage, self._messages)
 
     def _add(self, message: BoardMessage) -> int:
         index, first = len(self._messages), self._counters
@@ -48,8 +50,7 @@ class _Tree:
         ordered = sorted(message.items())
         counters = {number: self._counter() for number, field in ordered if field.most is not None}
         fields = [self._field(number, field, counters.get(number, 0)) for number, field in ordered]
-        array = (c.BoardField * len(fields))(*fields)
-        self._arrays.append(array)
+        array = self._arrays.array(c.BoardField, fields)
         self._messages[index] = c.BoardMessage(
             fields=array, count=len(fields), first_counter=first, counter_count=self._counters - first
         )
@@ -77,5 +78,5 @@ class _Tree:
             longest=field.longest or 0,
             most=field.most or 0,
             counter=counter,
-            path=field.path.encode(),
+            path=self._arrays.text(field.path.encode()),
         )

@@ -7,8 +7,9 @@ import os
 from collections.abc import Mapping
 from time import sleep
 
-from router.carrier.deadmen import NativeDeadman, open_deadman, replaced
-from router.carrier.outlets import Names, Publication
+from router.carrier.deadmen import NativeDeadman, destinations_of, replaced, settings
+from router.carrier.names import Names
+from router.carrier.outlets import Publication
 from router.carrier.ring import Ring
 from router.carrier.state import State
 from router.carrier.threads import NativeThread
@@ -71,14 +72,17 @@ class ClientDeadmen(NativeThread):
         self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
     ) -> ClientDeadman:
         """The deadman of a topic, which lives as long as programs have it with this publisher. Raises MemoryError."""
-        used = {topic: publications[topic] for topic, _ in plan.datagrams}
-        return state.keep(("client deadman", plan, tuple(used.values())), lambda: self.add(plan, counters, used))
-
-    def add(self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication]) -> ClientDeadman:
-        """Serve a deadman from now on, by the publisher of its topic. Raises MemoryError."""
-        outlets = {topic: {"publisher": publications[topic].address} for topic, _ in plan.datagrams}
-        address = open_deadman(self._library, self._group, self._names, counters, plan, outlets)
-        return ClientDeadman(self._library, self._group, address, plan, publications)
+        topics = [topic for topic, _ in plan.datagrams]
+        used = [publications[topic] for topic in topics]
+        return state.open(
+            ("client deadman", plan.route),
+            (plan, *used),
+            lambda address: ClientDeadman(self._library, self._group, address, topics, used),
+            "deadman_open",
+            self._group,
+            *settings(plan, counters, self._names),
+            *destinations_of(plan, counters, self._names, used, "publisher"),
+        )
 
     def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
         """Go on from the deadmen of a program to those of the next one, which has that generation. By name.

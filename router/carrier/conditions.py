@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
+from router.carrier.arrays import Arrays
 from router.carrier.lowered import Routines, native_values
 from router.compiler.lowering import LoweredCondition
 from router.declared import EVALUATED, LOSSES
@@ -13,7 +14,7 @@ class NativeCondition:
     """A condition on the payloads of one case."""
 
     def __init__(self, library: ctypes.CDLL, lowered: LoweredCondition) -> None:
-        self._arrays: list[object] = []
+        self._arrays = Arrays()
         routines = Routines(lowered.layout, self._arrays)
         self._routine = routines.routine(lowered.routine)
         self._layout = routines.layout()
@@ -24,7 +25,7 @@ class NativeCondition:
 
         Raises MemoryError.
         """
-        named: list[object] = []
+        named = Arrays()
         sender, holds = native_values([source.encode()], named), ctypes.c_bool()
         routine, size = ctypes.byref(self._routine), len(payload)
         outcome = self._holds(self._layout, routine, sender, received_at, payload, size, ctypes.byref(holds))

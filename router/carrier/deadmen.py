@@ -3,33 +3,42 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
-from typing import TypeVar
 
 from router import declared as c
-from router.carrier.outlets import Addressed, Names
-from router.carrier.ring import Ring
-from router.carrier.state import State
 from router.carrier.threads import NativeThread
-from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from typing import TypeVar
+
+    from router.carrier.names import Names
+    from router.carrier.outlets import Addressed
+    from router.carrier.ring import Ring
+    from router.carrier.state import State
+    from router.compiler.metrics import Counters
+    from router.compiler.program import DeadmanPlan
+
+    Deadman = TypeVar("Deadman", bound="NativeDeadman")
 
 
 class NativeDeadman:
-    """The deadman of one route. `address` is that of its `struct deadman`."""
+    """The deadman of one route, which sends to `endpoints`. `address` is that of its `struct deadman`."""
 
-    def __init__(self, library: ctypes.CDLL, deadmen: int, address: int, plan: DeadmanPlan, keep: object) -> None:
+    def __init__(
+        self, library: ctypes.CDLL, deadmen: int, address: int, endpoints: Iterable[str], keep: object = None
+    ) -> None:
         self.address = address
         self._library = library
         self._deadmen = deadmen
-        self._plan = plan
+        self._endpoints = endpoints
         self._keep = keep
         self._successor: NativeDeadman | None = None
 
     def start(self, now: int) -> list[str]:
         """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached."""
         reached = self._library.deadman_start(self._deadmen, self.address, now)
-        return [endpoint for bit, (endpoint, _) in enumerate(self._plan.datagrams) if reached >> bit & 1]
+        return [endpoint for bit, endpoint in enumerate(self._endpoints) if reached >> bit & 1]
 
     def succeeds(self, earlier: NativeDeadman) -> None:
         """Live as long as `earlier`, whose feeds act on this one once the carrier has replaced it."""
@@ -55,14 +64,17 @@ class DeadmanGroup:
         self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
     ) -> NativeDeadman:
         """The deadman of a route, which lives as long as programs have it with these senders. Raises MemoryError."""
-        used = {endpoint: senders[endpoint] for endpoint, _ in plan.datagrams}
-        return state.keep(("deadman", plan, tuple(used.values())), lambda: self.add(plan, counters, used))
-
-    def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed]) -> NativeDeadman:
-        """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
-        outlets = {endpoint: {"sender": senders[endpoint].address} for endpoint, _ in plan.datagrams}
-        address = open_deadman(self._library, self.address, self._names, counters, plan, outlets)
-        return NativeDeadman(self._library, self.address, address, plan, senders)
+        endpoints = [endpoint for endpoint, _ in plan.datagrams]
+        used = [senders[endpoint] for endpoint in endpoints]
+        return state.open(
+            ("deadman", plan.route),
+            (plan, *used),
+            lambda address: NativeDeadman(self._library, self.address, address, endpoints, used),
+            "deadman_open",
+            self.address,
+            *settings(plan, counters, self._names),
+            *destinations_of(plan, counters, self._names, used),
+        )
 
 
 class Deadmen(NativeThread, DeadmanGroup):
@@ -80,9 +92,6 @@ class Deadmen(NativeThread, DeadmanGroup):
         self._library.timers_end(self.address)
 
 
-Deadman = TypeVar("Deadman", bound=NativeDeadman)
-
-
 def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
     """The deadmen of a program that go on from other ones of an earlier program, by route, each with that one."""
     pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
@@ -91,40 +100,25 @@ def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[
     return pairs
 
 
-def open_deadman(
-    library: ctypes.CDLL,
-    group: int,
-    names: Names,
-    counters: Counters,
-    plan: DeadmanPlan,
-    outlets: Mapping[str, Mapping[str, int]],
-) -> int:
-    """Return the address of a `struct deadman`, which is served from now on. Raises MemoryError.
+def settings(plan: DeadmanPlan, counters: Counters, names: Names) -> tuple[int, int, bool, int, int, int]:
+    """What `deadman_open` gets between the group and the destinations."""
+    active, trips = counters.index("deadman_active", plan.route), counters.index("deadman_trips", plan.route)
+    return plan.timeout, plan.repeat, plan.at_start, active, trips, names.number(plan.route)
 
-    `outlets` has the sender or the publisher, as in `struct deadman_destination`, by the name of each destination.
-    """
-    destinations = [
+
+def destinations_of(
+    plan: DeadmanPlan, counters: Counters, names: Names, outlets: Iterable[Addressed], kind: str = "sender"
+) -> tuple[ctypes.Array[c.DeadmanDestination], int]:
+    """What a deadman sends to its outlets, senders or publishers (`kind`), as `deadman_open` gets it."""
+    made = [
         c.DeadmanDestination(
             datagram=datagram,
             size=len(datagram),
             sent=counters.index("deadman_datagrams_sent", plan.route, name),
             send_errors=counters.index("deadman_send_errors", plan.route, name),
             id=names.number(name),
-            **outlets[name],
+            **{kind: outlet.address},
         )
-        for name, datagram in plan.datagrams
+        for (name, datagram), outlet in zip(plan.datagrams, outlets, strict=True)
     ]
-    address = library.deadman_open(
-        group,
-        plan.timeout,
-        plan.repeat,
-        plan.at_start,
-        counters.index("deadman_active", plan.route),
-        counters.index("deadman_trips", plan.route),
-        names.number(plan.route),
-        (c.DeadmanDestination * len(destinations))(*destinations),
-        len(destinations),
-    )
-    if not address:
-        raise MemoryError("a deadman of the carrier cannot be opened")
-    return int(address)
+    return (c.DeadmanDestination * len(made))(*made), len(made)

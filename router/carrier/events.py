@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from socket import inet_ntoa
 from typing import cast
 
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Mismatch, Report

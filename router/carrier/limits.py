@@ -7,6 +7,7 @@ from math import ceil
 from typing import NamedTuple
 
 from router import declared as c
+from router.carrier.state import opened
 
 _UNKNOWN = -(1 << 63)
 _NS = 1_000_000_000
@@ -41,19 +42,16 @@ class RateLimit:
     """`struct limit`, open for one thread at a time: passes at most `hertz` messages per second."""
 
     def __init__(self, library: ctypes.CDLL, hertz: float) -> None:
-        self._structure = open_limit(hertz)
-        self._at = ctypes.addressof(self._structure)
+        self._at = opened(library, "limit_open", period(hertz))
+        self._close = library.limit_close
         self._passes = library.limit_passes
 
     def may_pass(self, now: int) -> bool:
         """Return whether a message may pass now (boot clock, ns); if so, it takes the place."""
         return bool(self._passes(self._at, now))
 
-
-def open_limit(hertz: float) -> c.Limit:
-    """Return a limit of which nothing was used: a whole period ago at any time, as the boot clock is not negative."""
-    between = period(hertz)
-    return c.Limit(period=between, late=between - between // 2, next_pass=-between)
+    def __del__(self) -> None:
+        self._close(self._at)
 
 
 def period(hertz: float) -> int:

@@ -6,7 +6,7 @@ import ctypes
 from functools import cache
 from socket import inet_ntoa
 
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.reasons import REJECTIONS
 from router.carrier.ring import Ring
 from router.datagrams import Peer

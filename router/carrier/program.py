@@ -9,9 +9,9 @@ import ctypes
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.carrier.deadmen import NativeDeadman
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
@@ -29,16 +29,17 @@ class NativeProgram:
 
     generation: int
     states: TargetStates = field(default_factory=TargetStates)
-    arrays: list[object] = field(default_factory=list)
+    arrays: Arrays = field(default_factory=Arrays)
     structure: c.Program = field(default_factory=c.Program)
 
 
 def native_program(program: Program, generation: int, outlets: Outlets) -> NativeProgram:
     """Make the arrays of a program; `generation` numbers the programs of the process."""
-    schema = wire_schema(program.envelope, program.inbound.keys())
     plans = [plan for several in program.inbound.values() for plan in several]
     made = NativeProgram(generation)
-    made.arrays += [schema, made.states]
+    made.arrays.keep(made.states)
+    if outlets.boards is not None:
+        made.arrays.include(outlets.boards.arrays)
     targets = TargetWriter(program, outlets, generation, made.arrays, made.states)
     numbers = {plan.route: number for number, plan in enumerate(plans)}
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
@@ -48,10 +49,10 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
         listener_count=len(program.listeners),
         case_count=len(program.envelope.cases),
         unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
-        schema=ctypes.pointer(schema.schema),
-        listeners=writer.array(c.Listener, writer.listeners()),
-        cases=writer.array(c.PayloadCase, writer.cases()),
-        routes=writer.array(c.Route, [writer.route(plan) for plan in plans]),
+        schema=ctypes.pointer(wire_schema(program.envelope, program.inbound.keys(), made.arrays)),
+        listeners=made.arrays.array(c.Listener, writer.listeners()),
+        cases=made.arrays.array(c.PayloadCase, writer.cases()),
+        routes=made.arrays.array(c.Route, [writer.route(plan) for plan in plans]),
     )
     return made
 
@@ -84,14 +85,6 @@ class _Writer:
     def counters(self) -> Counters:
         return self.program.counters
 
-    def array(self, kind: Any, elements: Sequence[Any]) -> Any:
-        """An array that lives as long as the program; NULL for none."""
-        if not elements:
-            return None
-        made = (kind * len(elements))(*elements)
-        self.made.arrays.append(made)
-        return made
-
     # senders and payload cases
 
     def cases(self) -> list[c.PayloadCase]:
@@ -119,8 +112,8 @@ class _Writer:
             id=self.outlets.names.number(name),
             repairs=framing is Framing.ZERO_TRIMMED,
             keeps_input=opened.is_inherited,
-            peers=self.array(c.Peer, peers),
-            choices=self.array(c.Choice, list(self._choices())),
+            peers=self.made.arrays.array(c.Peer, peers),
+            choices=self.made.arrays.array(c.Choice, list(self._choices())),
             peer_count=len(peers),
             columns=len(self.columns) + 1,
             received=counters.index("datagrams_received", name),

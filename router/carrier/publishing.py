@@ -6,7 +6,7 @@ import ctypes
 from time import sleep
 
 from router import declared as c
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.ring import Ring
 from router.carrier.threads import NativeThread
 from router.clock import monotonic_ns

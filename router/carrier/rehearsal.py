@@ -15,7 +15,8 @@ from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import Changed, EventReader, Told
-from router.carrier.outlets import Names, Outlets
+from router.carrier.names import Names
+from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.reasons import where_refused, why_rejected
 from router.carrier.ros_routes import NativeFromRos, native_from_ros
@@ -75,7 +76,7 @@ class Stage:
 
     def adopt(self, program: Program) -> None:
         """Go on with a program, which takes over what has the same key, as at a reload. Raises MemoryError."""
-        earlier, state = self._opened.running, State(self._opened.state)
+        earlier, state = self._opened.running, State(self._library, self._opened.state)
         self._generation += 1
         running = self._built(program, state)
         self._serve(running, earlier)
@@ -84,7 +85,7 @@ class Stage:
 
     def restart(self, now: int) -> None:
         """Begin anew with the program in use, as a router that has just started. Raises MemoryError."""
-        running, state = self._in_use, State(self._opened.state)
+        running, state = self._in_use, State(self._library, self._opened.state)
         fixed = self._fixed(running.program, state, running.fixed.boards)
         state.forget_previous()
         self._opened.reopen(now)
@@ -207,7 +208,7 @@ class _Opened:
         self.library = library
         self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
         self.running: _Running | None = None
-        self.state = State()
+        self.state = State(library)
         self._open(now)
 
     def _open(self, now: int) -> None:
@@ -228,7 +229,7 @@ class _Opened:
         self.library.rehearsal_end(self.address)
         if self.running is not None:
             self.running.release()
-        self.running, self.state = None, State()
+        self.running, self.state = None, State(self.library)
         self.library.rehearsal_close(self.address)
         self.address = 0
 

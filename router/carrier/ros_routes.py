@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Protocol
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.carrier.lowered import Routines
 from router.carrier.outlets import Outlets
 from router.carrier.targets import TargetStates, TargetWriter
@@ -40,7 +41,7 @@ class NativeFromRos:
 
     topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)
     urgent: set[str] = field(default_factory=set)
-    arrays: list[object] = field(default_factory=list)
+    arrays: Arrays = field(default_factory=Arrays)
     states: TargetStates = field(default_factory=TargetStates)
     subscriptions: Mapping[str, Subscription] = field(default_factory=dict)
 
@@ -60,12 +61,14 @@ def native_from_ros(
 ) -> NativeFromRos:
     """Make the arrays of all routes from ROS. `subscriptions` are by topic."""
     made = NativeFromRos(subscriptions=subscriptions)
-    made.arrays.append(made.states)
+    made.arrays.keep(made.states)
+    if outlets.boards is not None:
+        made.arrays.include(outlets.boards.arrays)
     writer = TargetWriter(program, outlets, generation, made.arrays, made.states)
     for topic, feeds in program.lowered.from_ros.items():
         plans = {plan.route: plan for plan in program.outbound[topic]}
         routes = [_route(writer, plans[feed.route], feed) for feed in feeds]
-        made.topics[topic] = (c.RosRoute * len(routes))(*routes)
+        made.topics[topic] = made.arrays.array(c.RosRoute, routes)
         if any(feed.is_urgent for feed in feeds):
             made.urgent.add(topic)
     return made

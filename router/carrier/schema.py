@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.declared import WireFlag, WireKind
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope
 from router.types.undecidable import all_fields, all_types
 from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, validates_text
-
-
-@dataclass(frozen=True, slots=True)
-class WireSchema:
-    """A `struct wire_schema`, and the arrays that it points to. C may use it as long as this object lives."""
-
-    schema: c.WireSchema
-    types: ctypes.Array[c.WireType]
-    fields: Sequence[ctypes.Array[c.WireField]]
 
 
 def wire_kind(field: FieldDescriptor) -> WireKind:
@@ -39,31 +29,26 @@ _BY_TYPE: Mapping[int, WireKind] = {
 _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.I64, I32: WireKind.I32}
 
 
-def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
-    """Return the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route."""
+def wire_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
+    """Make the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
     flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
     indexes = all_types(descriptor)
-    arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
-    types = (c.WireType * len(arrays))(
-        *(
-            c.WireType(fields=fields, count=len(fields), accepts_zero=parses(each, delimited(0, b"")))
-            for fields, each in zip(arrays, indexes, strict=True)
-        )
-    )
-    return WireSchema(c.WireSchema(types=types, count=len(types)), types, arrays)
+    types = []
+    for each, index in indexes.items():
+        fields = _lowered(each, indexes, {} if index else flags)
+        accepts_zero = parses(each, delimited(0, b""))
+        types.append(c.WireType(fields=arrays.array(c.WireField, fields), count=len(fields), accepts_zero=accepts_zero))
+    return arrays.add(c.WireSchema(types=arrays.array(c.WireType, types), count=len(types)))
 
 
 def _case_flags(number: int, routed: Container[int]) -> int:
     return WireFlag.CASE | WireFlag.ROUTED if number in routed else WireFlag.CASE
 
 
-def _lowered(
-    descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, int]
-) -> ctypes.Array[c.WireField]:
+def _lowered(descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, int]) -> list[c.WireField]:
     fields = sorted(all_fields(descriptor), key=lambda field: field.number)
-    lowered = [_lowered_field(field, indexes, flags.get(field.number, 0)) for field in fields]
-    return (c.WireField * len(lowered))(*lowered)
+    return [_lowered_field(field, indexes, flags.get(field.number, 0)) for field in fields]
 
 
 def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: int) -> c.WireField:

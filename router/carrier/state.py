@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from typing import TypeVar, cast
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import ctypes
+    from collections.abc import Callable, Hashable
+    from typing import TypeVar
 
-T = TypeVar("T")
+    T = TypeVar("T")
+    Place = tuple[str | None, ...]
 
 
 class State:
@@ -15,7 +19,8 @@ class State:
     same object, whichever of them runs. A key therefore has to contain everything that its object depends on.
     """
 
-    def __init__(self, previous: State | None = None) -> None:
+    def __init__(self, library: ctypes.CDLL, previous: State | None = None) -> None:
+        self._library = library
         self._previous: dict[Hashable, object] = previous._kept if previous else {}
         self._kept: dict[Hashable, object] = {}
 
@@ -23,7 +28,42 @@ class State:
         """Return the object with this key, of this program or the previous one; make it if there is none."""
         if key not in self._kept:
             self._kept[key] = self._previous[key] if key in self._previous else make()
-        return cast("T", self._kept[key])
+        return self._kept[key]  # type: ignore[return-value]  # the key says what it is
+
+    def open(self, place: Place, rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object) -> T:
+        """As `keep`, of what a function of the library opens; `wrap` gets its address. Raises MemoryError.
+
+        `place` names it within its program, and is the key together with `rest`.
+        """
+        return self.keep((place, rest), lambda: wrap(self.opened(place, function, *arguments)))
+
+    def opened(self, place: Place, function: str, *arguments: object) -> int:
+        """Call a function of the library that opens something, and return the address. Raises MemoryError."""
+        return opened(self._library, function, *arguments)
 
     def forget_previous(self) -> None:
         self._previous = {}
+
+
+class Native:
+    """A structure of the carrier at `address`, which lives as long as this object, and as what it refers to (`keep`).
+
+    `close` is the function of the library that frees it.
+    """
+
+    def __init__(self, close: Callable[[int], None], address: int, keep: object = None) -> None:
+        self.address = address
+        self._close = close
+        self._keep = keep
+
+    def __del__(self) -> None:
+        if self.address:
+            self._close(self.address)
+
+
+def opened(library: ctypes.CDLL, function: str, *arguments: object) -> int:
+    """Return the address that a function of the library returns. Raises MemoryError where it is 0."""
+    address = int(getattr(library, function)(*arguments) or 0)
+    if not address:
+        raise MemoryError(f"{function} has no memory or descriptors")
+    return address

@@ -5,15 +5,20 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.carrier.collectors import native_collect
-from router.carrier.deferrals import Adoption, held_period
+from router.carrier.deferrals import Adoption
+from router.carrier.limits import period
 from router.carrier.lowered import Routines, native_values
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import LOSSES
+from router.carrier.state import Native
 from router.compiler.lowering import LoweredRoute, LoweredTarget
 from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
+from router.table.model import OnLimit
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route by `source_of` in native/deliver.h; all publishers of a topic together are None."""
@@ -29,7 +34,7 @@ class TargetStates:
     adopted: list[Adoption] = field(default_factory=list)
     _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan], Sources]] = field(default_factory=list)
     _collects: list[tuple[c.Targets, c.Collect, RoutePlan]] = field(default_factory=list)
-    _kept: list[object] = field(default_factory=list)
+    _bound: Arrays = field(default_factory=Arrays)
 
     def add(
         self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan], sources: Sources
@@ -44,7 +49,7 @@ class TargetStates:
     def release(self) -> None:
         """Let go of the state. No message may come before `bind`."""
         self.adopted.clear()
-        self._kept.clear()
+        self._bound.clear()
 
     def bind(self, outlets: Outlets) -> None:
         """Have all targets refer to other state, that of `outlets`."""
@@ -60,30 +65,28 @@ class TargetStates:
         for native, target in zip(made.targets[: made.count], targets, strict=True):
             if target.is_deferred:
                 deferrals = {place: outlets.deferral(plan, target, source) for place, source in sources.items()}
-                native.deferrals = _by_place({place: deferral.address for place, deferral in deferrals.items()})
-                self._kept += deferrals.values()
+                native.deferrals = self._by_place(deferrals)
                 to = ctypes.addressof(made), ctypes.addressof(native)
                 self.adopted += [Adoption(each.address, target.is_topic, *to) for each in deferrals.values()]
             if target.max_rate is not None and not native.period:
                 limits = {place: outlets.limit(plan, target, source) for place, source in sources.items()}
-                native.limits = _by_place({place: ctypes.addressof(limit) for place, limit in limits.items()})
-                self._kept += limits.values()
+                native.limits = self._by_place(limits)
             if target.deadmen:
                 feeds = outlets.feeds(plan, target)
-                native.feeds, native.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
+                native.feeds, native.feed_count = self._bound.array(c.Feed, feeds), len(feeds)
 
     def _bind_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
         collector = outlets.collector(plan)
         collect.collector = collector.address
-        self._kept.append(collector)
+        self._bound.keep(collector)
         self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
 
-
-def _by_place(addresses: Mapping[int, int]) -> ctypes.Array[ctypes.c_void_p]:
-    made = (ctypes.c_void_p * (max(addresses) + 1))()
-    for place, address in addresses.items():
-        made[place] = address
-    return made
+    def _by_place(self, opened: Mapping[int, Native]) -> Any:
+        made = self._bound.add((ctypes.c_void_p * (max(opened) + 1))())
+        for place, each in opened.items():
+            made[place] = each.address
+            self._bound.keep(each)
+        return made
 
 
 @dataclass(slots=True)
@@ -93,10 +96,10 @@ class TargetWriter:
     program: Program
     outlets: Outlets
     generation: int
-    arrays: list[object]
+    arrays: Arrays
     states: TargetStates
     _topics: dict[str, c.Topic] = field(default_factory=dict)
-    _sources: ctypes.Array[c.Value] | None = None
+    _sources: Any = None
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
         """Targets that get datagrams; `lowered` are the routines of those that have some."""
@@ -106,7 +109,7 @@ class TargetWriter:
         made = self.targets(plan, targets, lowered.targets, routines)
         if lowered.collect is not None:
             collect = native_collect(lowered.collect, routines, self._ids_of_senders())
-            made.collect = ctypes.pointer(collect)
+            made.collect = ctypes.pointer(self.arrays.add(collect))
             self.states.add_collector(self.outlets, made, collect, plan)
         made.layout, made.sources = routines.layout(), self._names_of_senders()
         return made
@@ -130,15 +133,14 @@ class TargetWriter:
         number = self.outlets.names.number
         together = c.Targets(
             ttl=plan.ttl or 0,
-            targets=(c.Target * len(made))(*made),
+            targets=self.arrays.array(c.Target, made),
             count=len(made),
             route=number(plan.route),
             topic=c.NO_NAME if plan.topic is None else number(plan.topic),
             generation=self.generation,
         )
         self.states.add(self.outlets, together, plan, targets, self._sources_of(plan))
-        self.arrays.append(together)
-        return together
+        return self.arrays.add(together)
 
     def _complete(self, made: c.Target, plan: RoutePlan, target: TargetPlan) -> None:
         """Add what all targets have."""
@@ -152,7 +154,7 @@ class TargetWriter:
         made.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in LOSSES]
         if not target.is_topic:
             made.delivered_bytes = counters.index("sent_bytes", *place)
-        made.period, made.priority = held_period(target), c.Priority[target.priority.name]
+        made.period, made.priority = _held_period(target), c.Priority[target.priority.name]
 
     def _destination(self, target: TargetPlan) -> c.Target:
         made = c.Target(
@@ -161,16 +163,14 @@ class TargetWriter:
         )
         if self.outlets.boards is not None:
             made.board = self.outlets.boards.pointer(target.label)
-            self.arrays.append(self.outlets.boards)
         return made
 
     def _topic_target(self, target: TargetPlan) -> c.Target:
         if target.label not in self._topics:
             publication = self.outlets.publications[target.label]
-            self._topics[target.label] = c.Topic(
-                publisher=publication.address, wanted=ctypes.addressof(publication.wanted)
-            )
-            self.arrays.append(publication)
+            topic = c.Topic(publisher=publication.address, wanted=ctypes.addressof(publication.wanted))
+            self._topics[target.label] = self.arrays.add(topic)
+            self.arrays.keep(publication)
         return c.Target(topic=ctypes.pointer(self._topics[target.label]))
 
     def _sources_of(self, plan: RoutePlan) -> Sources:
@@ -186,8 +186,13 @@ class TargetWriter:
     def _labels_of_senders(self) -> list[str]:
         return [*self.program.table.endpoints, source_label(STRANGER)]
 
-    def _names_of_senders(self) -> ctypes.Array[c.Value]:
+    def _names_of_senders(self) -> Any:
         """By column."""
         if self._sources is None:
             self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources
+
+
+def _held_period(target: TargetPlan) -> int:
+    """The time between two messages of a target with `on_limit: latest`, in ns; 0 without."""
+    return period(target.max_rate) if target.max_rate is not None and target.on_limit is OnLimit.LATEST else 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
+from router.carrier.arrays import Arrays
 from router.carrier.build import build, is_current
 from router.carrier.library import load
 from router.carrier.schema import wire_schema
@@ -57,7 +58,8 @@ class CarrierSide:
     """`envelope_read` in the carrier's library."""
 
     def __init__(self, library: ctypes.CDLL, made: Program) -> None:
-        self._lowered = wire_schema(made.envelope, made.inbound)
+        self._memory = Arrays()
+        self._schema = wire_schema(made.envelope, made.inbound, self._memory)
         self._read = library.envelope_read
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
@@ -67,7 +69,7 @@ class CarrierSide:
         kept = data[:MAX_DATAGRAM]
         # What an earlier datagram left behind this one must not count.
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
-        schema, envelope = self._lowered.schema, self._envelope
+        schema, envelope = self._schema, self._envelope
         code = self._read(ctypes.byref(schema), self._buffer, len(data), repairs, ctypes.byref(envelope))
         return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
 

@@ -10,11 +10,13 @@ from struct import Struct
 from typing import NamedTuple, Union
 
 from router import declared as c
+from router.carrier.arrays import Arrays
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.collectors import NativeCollector, native_collect
+from router.carrier.collectors import native_collect
 from router.carrier.lowered import Routines, native_values
 from router.carrier.reasons import LOSSES
 from router.carrier.ros_routes import native_for_each
+from router.carrier.state import Native, opened
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.declared import NONE
 from tests.carrier.building import MEMORY, sanitizing
@@ -93,12 +95,12 @@ class Delivering:
     ) -> None:
         self._functions, self._received_at = functions, received_at
         self._lowered = [*lowered.targets.values()]
-        self._arrays: list[object] = []
+        self._arrays = Arrays()
         self._counters = (c_int64 * (1 + (1 + len(self._lowered)) * _OF_TARGET))()
         routines = Routines(lowered.layout, self._arrays)
         wanted, is_from_ros = (ctypes.c_uint8 * 1)(1), isinstance(lowered, LoweredFeed)
         topic = c.Topic(wanted=ctypes.addressof(wanted))
-        self._arrays += [wanted, topic]
+        self._arrays.keep(wanted, topic)
         targets = []
         for number, target in enumerate(self._lowered):
             first = 1 + number * _OF_TARGET
@@ -122,12 +124,13 @@ class Delivering:
             )
         self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.pointer(self._targets)))
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
-            collector = NativeCollector(functions, timeout)
+            address = opened(functions, "collector_open", timeout)
+            collector = Native(functions.collector_close, address)
             self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
             collect = native_collect(lowered.collect, routines, range(1 + len(others)))
             collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
-            self._arrays.append(collector)
+            self._arrays.keep(collector)
         self._targets.layout = routines.layout()
         if self._route is not None:
             self._route.targets = self._targets

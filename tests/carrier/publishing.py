@@ -16,7 +16,8 @@ from router import declared as c
 from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
 from router.carrier.deferrals import timer_change
-from router.carrier.outlets import Names, Outlets
+from router.carrier.names import Names
+from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
@@ -66,7 +67,7 @@ class Publishing:
         self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack, queue: int = 1 << 16
     ) -> None:
         self.program = program
-        self._library, self._state = library, State()
+        self._library, self._state = library, State(library)
         self._received, self._published, self._braked = ((c_int64 * MOST_COUNTERS)() for _ in range(3))
         self._names = Names()
         self._events, self._ring = Ring(library, 1 << 16), Ring(library, queue)
@@ -94,7 +95,7 @@ class Publishing:
 
     def change(self, generation: int, program: Program | None = None) -> None:
         """Receive with another program from now on; the thread goes on to it."""
-        self._state = State(self._state)
+        self._state = State(self._library, self._state)
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
         self._carrier.change(change_to(self._programs[-1], timer_change(())))

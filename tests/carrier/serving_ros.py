@@ -18,7 +18,8 @@ from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.deferrals import timer_change
 from router.carrier.from_ros import FromRosThread
-from router.carrier.outlets import Names, Outlets
+from router.carrier.names import Names
+from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.ros_routes import native_from_ros
 from router.carrier.state import State
@@ -136,12 +137,13 @@ class ServingRos:
         for board in self.boards.values():
             stack.callback(board.close)
         self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self.names)
+        state = State(library)
         self.by_route: dict[str, NativeDeadman] = {
-            plan.route: self.deadmen.add(plan, program.counters, self.boards) for plan in program.deadmen
+            plan.route: self.deadmen.kept(plan, program.counters, self.boards, state) for plan in program.deadmen
         }
         outlets = Outlets(
             library=library,
-            state=State(),
+            state=state,
             names=self.names,
             listeners={},
             senders=self.boards,
@@ -151,7 +153,7 @@ class ServingRos:
             boards=NativeBoards(program.boards),
         )
         self.messages = native_from_ros(program, 1, outlets)
-        self.messages.arrays.append(outlets)
+        self.messages.arrays.keep(outlets)
         timers = timer_change([*outlets.pacers(), *self.messages.states.adopted])
         library.timers_change(self.deadmen.address, ctypes.byref(timers))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}

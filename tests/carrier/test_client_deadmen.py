@@ -14,8 +14,9 @@ from typing import Any, cast
 import pytest
 
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.ring import Ring
+from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
@@ -39,6 +40,7 @@ class Clients:
     """The deadmen of topics, with publishers of a middleware for tests."""
 
     def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL) -> None:
+        self._library = library
         self.publishers: dict[str, Publisher] = {}
         self.counts = (ctypes.c_int64 * 200)()
         self._counters, self._names, self._functions = Counters(), Names(), functions
@@ -54,7 +56,7 @@ class Clients:
             self.publishers[topic] = Publisher(self._functions)
         payload = (topic, b"stop " + topic.encode())
         plan = DeadmanPlan(f"gateway:{topic}", timeout_ms * MS, repeat_ms * MS, (payload,), at_start)
-        return self.deadmen.add(plan, self._counters, self.publishers)
+        return self.deadmen.kept(plan, self._counters, self.publishers, State(self._library))
 
     def count(self, metric: str, topic: str = "/word") -> int:
         labels = (topic,) if metric in {"datagrams_sent", "send_errors"} else ()

@@ -25,9 +25,10 @@ from hypothesis import strategies as st
 
 from router import declared as c
 from router.carrier.deadmen import Deadmen, NativeDeadman
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
+from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
@@ -101,7 +102,7 @@ class NativeSide:
         self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
-        return self.deadmen.add(plan, self._counters, senders(self._outlets))
+        return self.deadmen.kept(plan, self._counters, senders(self._outlets), State(self._library))
 
     def replace(self, later: NativeDeadman, earlier: NativeDeadman) -> None:
         later.succeeds(earlier)

@@ -23,7 +23,8 @@ from rclpy.node import Node
 
 from router.carrier.deadmen import Deadmen
 from router.carrier.from_ros import FromRosThread
-from router.carrier.outlets import Names, Outlets
+from router.carrier.names import Names
+from router.carrier.outlets import Outlets
 from router.carrier.ring import Ring
 from router.carrier.ros_routes import native_from_ros
 from router.carrier.sender import NativeSender
@@ -95,12 +96,12 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         deadmen = Deadmen(library, (ctypes.c_int64 * (1 << 12))(), Ring(library, 1 << 12), names)
         outlets = Outlets(
             library=library,
-            state=State(),
+            state=State(library),
             names=names,
             listeners={},
             senders=senders,
             publications={},
-            deadmen={plan.route: deadmen.add(plan, made.counters, senders) for plan in made.deadmen},
+            deadmen={plan.route: deadmen.kept(plan, made.counters, senders, State(library)) for plan in made.deadmen},
             bandwidths={},
         )
         (plan,) = made.subscriptions

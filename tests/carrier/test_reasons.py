@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 
 from router.carrier.events import EventReader, Told
 from router.carrier.library import library
-from router.carrier.outlets import Names
+from router.carrier.names import Names
 from router.carrier.reasons import _WORDS, LOSSES, REJECTIONS
 from router.carrier.rehearsal import Stage
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report

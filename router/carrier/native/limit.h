@@ -14,6 +14,10 @@ struct limit {
     int64_t next_pass;    /* from when on a message may pass; -period at first */
 };
 
+/* A limit that passes a message each `period`, of which nothing was used. NULL for lack of memory. */
+struct limit *limit_open(int64_t period);
+void limit_close(struct limit *limit);
+
 /* Whether a message may pass now; if so, it takes the place. */
 bool limit_passes(struct limit *limit, int64_t now);
 

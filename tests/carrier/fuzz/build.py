@@ -16,8 +16,10 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
+from router.carrier.arrays import Arrays
 from router.carrier.build import sources
-from router.carrier.schema import WireSchema, wire_schema
+from router.carrier.schema import wire_schema
+from router.declared import WireSchema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table
 from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
@@ -37,7 +39,8 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     noise = random.Random(1)
     for index, schema in enumerate(SCHEMAS):
         made = table(schema, folder)
-        declarations += _arrays(index, wire_schema(made.envelope, made.inbound))
+        memory = Arrays()
+        declarations += _arrays(index, wire_schema(made.envelope, made.inbound, memory))
         maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
         if schema == "rover":
@@ -59,11 +62,13 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
 
 def _arrays(index: int, lowered: WireSchema) -> Iterator[str]:
     """The types of a schema in C, as `types_INDEX`."""
-    for number, fields in enumerate(lowered.fields):
+    all_types = lowered.types[: lowered.count]
+    for number, each in enumerate(all_types):
+        fields = each.fields[: each.count]
         values = ", ".join(f"{{{field.number}, {field.kind}, {field.flags}, {field.type}}}" for field in fields)
         yield f"static const struct wire_field fields_{index}_{number}[] = {{{values or '{0, 0, 0, 0}'}}};"
     types = ", ".join(
-        f"{{fields_{index}_{number}, {each.count}, {each.accepts_zero}}}" for number, each in enumerate(lowered.types)
+        f"{{fields_{index}_{number}, {each.count}, {each.accepts_zero}}}" for number, each in enumerate(all_types)
     )
     yield f"static const struct wire_type types_{index}[] = {{{types}}};"
 
