@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from mmap import MAP_PRIVATE, mmap
 from typing import cast
 
 from router.carrier.threads import NativeThread
@@ -30,12 +31,15 @@ class ThreadCounts:
 
     @staticmethod
     def fixed() -> ctypes.Array[ctypes.c_int64]:
-        """Counts of a native thread: they never move."""
-        return (ctypes.c_int64 * MOST_COUNTERS)()
+        """Counts of a native thread: they never move, and take memory only where something was counted."""
+        pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
+        return (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)
 
     def add_thread(self, thread: NativeThread) -> None:
         """Count what a native thread counts in an array that is `fixed`, by copies that balance."""
-        self._add(cast("list[int]", thread.counts), thread.counters)  # the array is only indexed and sliced
+        counts = cast("list[int]", thread.counts)  # the array is only indexed and sliced
+        counts[: self.counters.size] = self.counters.fresh_counts()  # no page fault in the thread
+        self._add(counts, thread.counters)
 
     def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
         self.counters.grow(counts)

@@ -1,0 +1,36 @@
+"""What a running router has in memory: not what it might need, and nothing that only the start needed."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+from typing import Any
+
+from router.app.counts import MOST_COUNTERS, ThreadCounts
+from router.carrier.library import load
+from router.carrier.ring import Ring
+
+_mincore = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)(
+    ("mincore", ctypes.CDLL(None))
+)
+
+
+def pages_in_memory(array: ctypes.Array[Any]) -> int:
+    """How many pages of an array that begins with a page are in memory."""
+    pages = (ctypes.c_ubyte * -(-ctypes.sizeof(array) // mmap.PAGESIZE))()
+    assert _mincore(ctypes.addressof(array), ctypes.sizeof(array), pages) == 0
+    return sum(page & 1 for page in pages)
+
+
+def test_counters_that_no_table_has_take_no_memory() -> None:
+    counts = ThreadCounts.fixed()
+    assert len(counts) == MOST_COUNTERS
+    counts[0] += 1
+    counts[MOST_COUNTERS - 1] += 1
+    assert pages_in_memory(counts) == 2
+
+
+def test_a_ring_from_which_nothing_was_taken_has_no_buffer_in_memory() -> None:
+    ring = Ring(load(), 1 << 18)
+    assert len(ring.take()) == 0
+    assert pages_in_memory(ring._records) == 0
