@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
@@ -20,6 +21,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 )
 
 from router.errors import SourceSpan, StartError
+from router.imports import left_out, postponed
 from router.ros.environment import ros_package_remedy
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
@@ -35,6 +37,16 @@ _BASIC: dict[str, Type] = {
     "double": Float(64),
     **{str(it): it for it in (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (False, True))},
 }
+
+
+@contextmanager
+def lean_interfaces() -> Iterator[None]:
+    """Import modules of message types inside, but not what these import and CDR bytes need not.
+
+    That is numpy, for fields of fixed length, and the generator of such modules, with its parsers.
+    """
+    with postponed("numpy"), left_out("rosidl_generator_py.generate_py_impl"):
+        yield
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
@@ -61,7 +73,8 @@ def loaded_class(name: str) -> Any:
     """As `installed_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
     message_class = installed_class(name)
     try:
-        check_is_valid_msg_type(message_class)
+        with lean_interfaces():
+            check_is_valid_msg_type(message_class)
     except Exception as error:  # a library that cannot be loaded, or anything else
         why = f"{error}: {error.__context__}" if error.__context__ else str(error)  # the latter names the library
         raise StartError(f"{name} cannot be used: {why}", _remedy(name)) from error
@@ -81,7 +94,8 @@ def installed_class(name: str) -> Any:
     if not _has_part(package, kind):
         raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name))
     try:
-        found = _member(importlib.import_module(f"{package}.{kind}"), short)
+        with lean_interfaces():
+            found = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
         raise StartError(f"{name} cannot be loaded: {error}") from error
     if not hasattr(found, "get_fields_and_field_types"):

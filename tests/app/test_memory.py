@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import subprocess
+import sys
+from importlib.util import find_spec
 from typing import Any
+
+import pytest
 
 from router.app.counts import MOST_COUNTERS, ThreadCounts
 from router.carrier.library import load
 from router.carrier.ring import Ring
+from tests.app.conftest import Site
 
 _mincore = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)(
     ("mincore", ctypes.CDLL(None))
@@ -34,3 +40,33 @@ def test_a_ring_from_which_nothing_was_taken_has_no_buffer_in_memory() -> None:
     ring = Ring(load(), 1 << 18)
     assert len(ring.take()) == 0
     assert pages_in_memory(ring._records) == 0
+
+
+UNUSED = ("numpy", "lark", "em")
+"""Large modules that what a router with topics imports would import."""
+
+ROUTER = """\
+import sys
+from pathlib import Path
+import router.cli.run
+from router.app import Router
+from router.compiler import check_table
+
+with Router(check_table(Path(sys.argv[1])).program):
+    print(*sys.modules)
+"""
+IMU = """\
+  imu_info:
+    source: sensor_board
+    topic: {topic: imu, type: sensor_msgs/msg/Imu, fields: {orientation_covariance: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
+"""
+
+
+def test_a_router_with_topics_has_not_imported_what_it_does_not_use(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    assert all(map(find_spec, UNUSED))
+    ran = subprocess.run(
+        [sys.executable, "-c", ROUTER, str(site.write(IMU))], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert "sensor_msgs.msg._imu" in ran.stdout.split()
+    assert set(UNUSED) & set(ran.stdout.split()) == set()
