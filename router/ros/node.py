@@ -33,11 +33,17 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
     try:
         with _environment(_transport_variables(os.environ)):
             # The router has its own log: no log file of ROS, no /rosout. No parameter services either: parameters
-            # fill the table's variables at start, so that setting them later would have no effect.
+            # fill the table's variables at start, so that setting them later would have no effect. Nor a service
+            # that describes types: rclpy's executor would answer it, and none runs.
             context.init(list(ros_args), initialize_logging=False)
             with lean_interfaces():
                 node = Node(
-                    name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False
+                    name,
+                    namespace=namespace,
+                    context=context,
+                    enable_rosout=False,
+                    start_parameter_services=False,
+                    parameter_overrides=[Parameter("start_type_description_service", value=False)],
                 )
         _ignore_sim_time(node)
         return node
