@@ -59,12 +59,11 @@ class ThreadCounts:
         """Add the counts of `counters`, which continue the present ones. Raises StartError."""
         if counters.size > MOST_COUNTERS:
             raise StartError(f"the table has {counters.size} counters, and there is room for {MOST_COUNTERS}")
-        present = dict(self.counters.series())
-        new = [index for series, index in counters.series() if series not in present]
+        new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             counters.grow(counts)
-            for index in new:  # a program that was abandoned may have counted there
-                counts[index] = 0
+            for run in new:  # a program that was abandoned may have counted there
+                counts[run] = [0] * (run.stop - run.start)
 
     def replace(self, counters: Counters) -> None:
         """Adopt `counters`, once no thread counts by the earlier ones."""
