@@ -1,4 +1,4 @@
-"""Installed ROS message types: their Python classes, checked against the table's definitions, and their fields."""
+"""Installed ROS message types, checked against the table's definitions: their Python classes, and their fields."""
 
 from __future__ import annotations
 
@@ -23,12 +23,10 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 from router.errors import SourceSpan, StartError
 from router.imports import left_out, postponed
 from router.ros.environment import ros_package_remedy
+from router.ros.type_support import Definition, class_for_cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
-
-Definition = tuple[tuple[str, str], ...]
-"""The fields of a type, each as its name and its type in rclpy's spelling."""
 
 _BASIC: dict[str, Type] = {
     "boolean": Bool(),
@@ -58,7 +56,16 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
 
 def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """As `loaded_class`, if the class and all types in it are installed as in `definitions`. Raises StartError."""
+    """What rclpy takes for a type that is published and taken as CDR.
+
+    Raises StartError unless it and all types in it are installed as in `definitions`.
+    """
+    package, kind, short = _parts(name)
+    if _has_part(package, kind):
+        with lean_interfaces():
+            found = class_for_cdr(package, kind, short, definitions)
+        if found is not None:
+            return found
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
@@ -87,10 +94,7 @@ def installed_class(name: str) -> Any:
     The name may come from a client: only Python packages with a part `msg`, `srv` or `action` are imported. Raises
     StartError.
     """
-    parts = _NAME.fullmatch(name)
-    if parts is None:
-        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
-    package, kind, short = parts.groups()
+    package, kind, short = _parts(name)
     if not _has_part(package, kind):
         raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name))
     try:
@@ -101,6 +105,14 @@ def installed_class(name: str) -> Any:
     if not hasattr(found, "get_fields_and_field_types"):
         raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
     return found
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Package, kind and short name. Raises StartError."""
+    parts = _NAME.fullmatch(name)
+    if parts is None:
+        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
+    return parts.groups()
 
 
 def _has_part(package: str, kind: str) -> bool:
