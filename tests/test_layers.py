@@ -10,7 +10,7 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors inputs assets clock imports log threads"
+GROUND = "declared errors inputs assets clock lean log threads"
 LANGUAGE = "declared errors inputs assets table types compiler"
 IMPORTS = {
     "declared": "",
@@ -18,7 +18,7 @@ IMPORTS = {
     "inputs": "declared",
     "assets": "",
     "clock": "",
-    "imports": "",
+    "lean": "",
     "log": "clock errors",
     "threads": "clock log",
     "table": "errors inputs assets",

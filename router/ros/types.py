@@ -21,7 +21,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 )
 
 from router.errors import SourceSpan, StartError
-from router.imports import left_out, postponed
+from router.lean import left_out, postponed
 from router.ros.environment import ros_package_remedy
 from router.ros.type_support import Definition, class_for_cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from router.imports import left_out, postponed
+from router.lean import left_out, postponed
 
 
 @pytest.fixture(autouse=True)
