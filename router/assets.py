@@ -31,7 +31,7 @@ def page_policy(page: bytes) -> str:
     """The Content-Security-Policy of a page whose scripts and styles are all in it; it may connect to nothing yet."""
     import base64
     import re
-    from hashlib import sha256
+    from hashlib import sha256  # here, as `table` has imported it without OpenSSL
 
     sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
     for kind, text in re.findall(rb"<(script|style)[^>]*>(.*?)</\1>", page, re.DOTALL):
