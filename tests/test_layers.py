@@ -19,7 +19,7 @@ IMPORTS = {
     "assets": "",
     "clock": "",
     "lean": "",
-    "log": "clock errors",
+    "log": "clock errors lean",
     "threads": "clock log",
     "table": "errors inputs assets lean",
     "types": "declared errors inputs assets lean",

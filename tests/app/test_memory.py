@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ from router.app.counts import MOST_COUNTERS, ThreadCounts
 from router.carrier.library import load
 from router.carrier.ring import Ring
 from tests.app.conftest import Site
+from tests.ports import free_port
 
 _mincore = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)(
     ("mincore", ctypes.CDLL(None))
@@ -42,9 +44,6 @@ def test_a_ring_from_which_nothing_was_taken_has_no_buffer_in_memory() -> None:
     assert pages_in_memory(ring._records) == 0
 
 
-UNUSED = ("numpy", "lark", "em", "sensor_msgs.msg")
-"""Large modules that what a router with topics imports would import."""
-
 ROUTER = """\
 import sys
 from pathlib import Path
@@ -60,13 +59,27 @@ IMU = """\
     source: sensor_board
     topic: {topic: imu, type: sensor_msgs/msg/Imu, fields: {orientation_covariance: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
 """
+GATEWAY = """\
+gateways:
+  page: {transport: {websocket: "127.0.0.1:%d"}}
+"""
+UNUSED_BY_TOPICS = ("numpy", "lark", "em", "sensor_msgs.msg", "rich", "asyncio", "ssl", "_hashlib")
+UNUSED_BY_GATEWAYS = ("numpy", "lark", "em", "sensor_msgs.msg", "rich")
+"""Large modules that libraries would import."""
 
 
-def test_a_router_with_topics_has_not_imported_what_it_does_not_use(site: Site) -> None:
+@pytest.mark.parametrize(
+    ("routes", "unused"),
+    [
+        pytest.param(IMU, UNUSED_BY_TOPICS, id="topics"),
+        pytest.param(IMU + GATEWAY % free_port(kind=socket.SOCK_STREAM), UNUSED_BY_GATEWAYS, id="gateway"),
+    ],
+)
+def test_a_router_has_not_imported_what_it_does_not_use(site: Site, routes: str, unused: tuple[str, ...]) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    assert all(map(find_spec, UNUSED))
+    assert all(map(find_spec, unused))
     ran = subprocess.run(
-        [sys.executable, "-c", ROUTER, str(site.write(IMU))], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", ROUTER, str(site.write(routes))], capture_output=True, text=True, check=True, timeout=60
     )
     assert "sensor_msgs.sensor_msgs_s__rosidl_typesupport_c" in ran.stdout.split()
-    assert set(UNUSED) & set(ran.stdout.split()) == set()
+    assert set(unused) & set(ran.stdout.split()) == set()
