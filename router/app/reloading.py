@@ -10,7 +10,7 @@ from router.app.runtime import Runtime
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
-from router.compiler.check import Checked
+from router.compiler.check import Checked, uncollected
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
@@ -54,7 +54,7 @@ class Reloader:
             if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
-            with background_threads(), reloading():
+            with background_threads(), reloading(), uncollected():
                 kind, result = self._attempt(self._runtime.program)
             self._count(kind)
             self._remember(is_good=result.ok)
