@@ -119,6 +119,7 @@ def check_table(
         lowered, limits = lower_table(routes)
         findings += limits
         lowered = None if limits else lowered
+    schema.sources.close()
     return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)
 
 

@@ -133,6 +133,11 @@ class ProtoSources:
         return self._opened[file].span(name, part)
 
 
+    def close(self) -> None:
+        """Free what was made to find places. It is made again for the next one."""
+        self._opened.clear()
+
+
 class _File:
     """The places in one file."""
 
