@@ -119,6 +119,7 @@ def check_table(
         lowered, limits = lower_table(routes)
         findings += limits
         lowered = None if limits else lowered
+    schema.sources.close()
     return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)
 
 
@@ -134,8 +135,10 @@ def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: i
 
 
 def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:
+    counted = {id(limits.fields): limits.fields for limits in boards.values()}  # boards have the fields in common
+    sizes = {key: places(fields) for key, fields in counted.items()}
     for name, limits in boards.items():
-        messages, lists = places(limits.fields)
+        messages, lists = sizes[id(limits.fields)]
         if messages > MOST_MESSAGES or lists > MOST_LISTS:
             what = f"an envelope for '{name}' has {messages:,} places of messages and {lists:,} of repeated fields"
             hint = f"the router takes {MOST_MESSAGES:,} and {MOST_LISTS:,}: make it another kind of endpoint"

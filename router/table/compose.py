@@ -150,6 +150,8 @@ class _Composer:
 
     def _place(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextPlace:
         line, first, end_line, last = _marks(event)
+        if not event.style and event.value and event.value == self._source.lines[line][first:last]:
+            return TextPlace(span, ((0, span),))
         if event.style in ("'", '"'):
             first, last = first + 1, last - 1
         elif event.style in ("|", ">"):
@@ -262,14 +264,18 @@ class Surprise(NamedTuple):
     remedy: str
 
 
+_NUMBERS = frozenset("0123456789+-.")
+"""What a number begins with, and what nearly all other scalars do not."""
 _TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
 _OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
 _BINARY = Surprise("a binary number", "write a decimal number")
 _HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
 _GROUPED = Surprise("a number", "leave out the '_'")
-_SURPRISES = (
-    (re.compile("|".join(_TRUTH)), Surprise("a truth value", "write true or false")),
-    (re.compile("~"), Surprise("an empty value", "leave the key out, or in a route write {ignore: why}")),
+_WORD_SURPRISES: dict[str, Surprise] = {
+    **dict.fromkeys(_TRUTH, Surprise("a truth value", "write true or false")),
+    "~": Surprise("an empty value", "leave the key out, or in a route write {ignore: why}"),
+}
+_NUMBER_SURPRISES = (
     (re.compile(r"[-+]?0[0-9_]+|0o[0-7]+"), _OCTAL),
     (re.compile(r"[-+]?0b[01_]+"), _BINARY),
     (re.compile(r"[-+]0x[0-9a-fA-F_]+|0x(?=.*_)[0-9a-fA-F_]+"), _HEXADECIMAL),
@@ -286,6 +292,8 @@ def resolve(text: str) -> Plain:
     """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` and `1e999` stay text."""
     if text in _WORDS:
         return _WORDS[text]
+    if text[0] not in _NUMBERS:
+        return text
     if _INT.fullmatch(text):
         return int(text)
     if _HEX.fullmatch(text):
@@ -297,4 +305,6 @@ def resolve(text: str) -> Plain:
 
 def surprise(text: str) -> Surprise | None:
     """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
-    return next((found for pattern, found in _SURPRISES if pattern.fullmatch(text)), None)
+    if text[:1] not in _NUMBERS:
+        return _WORD_SURPRISES.get(text)
+    return next((found for pattern, found in _NUMBER_SURPRISES if pattern.fullmatch(text)), None)

@@ -66,6 +66,8 @@ def unusable_character(text: str) -> tuple[int, str] | None:
 
 def foreign_blank(text: str) -> str | None:
     """The name of the first character that looks like a space, or like nothing, and is no space to YAML."""
+    if text.isascii():
+        return None
     found = next((char for char in text if unicodedata.category(char) in ("Zs", "Cf") and char != " "), None)
     return f"U+{ord(found):04X}" if found else None
 

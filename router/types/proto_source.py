@@ -132,6 +132,10 @@ class ProtoSources:
             self._opened[file] = _File(FileDescriptorProto.FromString(self._encoded[file]), self._paths[file])
         return self._opened[file].span(name, part)
 
+    def close(self) -> None:
+        """Free what was made to find places. It is made again for the next one."""
+        self._opened.clear()
+
 
 class _File:
     """The places in one file."""

@@ -97,6 +97,8 @@ class ProtoSchema:
 
     def board_options(self, field: FieldDescriptor) -> BoardOptions:
         """What the `.options` file beside the field's `.proto` says about it."""
+        if not self._options:
+            return NO_OPTIONS
         options = self._options.get(container(field).file.name)
         return options.of(container(field).full_name, field.name) if options is not None else NO_OPTIONS
 
