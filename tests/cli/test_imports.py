@@ -86,8 +86,9 @@ def test_status_reads_an_address_and_asks_there(tmp_path: Path) -> None:
     assert found.packages == {"observe", "table", "tools"}
 
 
-def test_status_at_a_url_reads_no_table(tmp_path: Path) -> None:
-    found = imported(tmp_path, "status", "--url", "http://127.0.0.1:9")
+@pytest.mark.parametrize("verb", ["status", "reload"])
+def test_what_is_at_a_url_needs_no_table(verb: str, tmp_path: Path) -> None:
+    found = imported(tmp_path, verb, "--url", "http://127.0.0.1:9")
     assert found.heavy == set()
     assert found.packages == {"observe", "tools"}
 
