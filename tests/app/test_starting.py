@@ -121,6 +121,16 @@ def test_a_signal_ends_it_gracefully(table: Path, number: signal.Signals) -> Non
     assert end(process, number) == ["router stopping", "router stopped"]
 
 
+@pytest.mark.parametrize("how", [MODULE, SCRIPT])
+def test_its_process_ends_without_what_libraries_do_at_the_end(table: Path, tmp_path: Path, how: Sequence[str]) -> None:
+    library = tmp_path / "library"
+    library.mkdir()
+    (library / "sitecustomize.py").write_text("import atexit, time\natexit.register(time.sleep, 60)\n")
+    process = start(how, "run", table, path=str(library))
+    wait_for_start(process)
+    assert end(process) == ["router stopping", "router stopped"]
+
+
 def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table: Path) -> None:
     port = free_port()
     process = start(MODULE, "run", table, "--ros-args", "-p", f"listen_port:={port}")
