@@ -18,7 +18,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     hold_signals(arguments)
-    gc.set_threshold(_UNTIL_COLLECTED)
+    if _verb(arguments) != "run":  # which sets up its own process
+        gc.set_threshold(_UNTIL_COLLECTED)
     try:
         from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
     except KeyboardInterrupt:
@@ -33,6 +34,9 @@ def hold_signals(arguments: Sequence[str]) -> None:
 
     Blocked in all threads, they run no handler and interrupt no system call. Other verbs are ended by them, as usual.
     """
-    verb = next((argument for argument in arguments if not argument.startswith("-")), None)
-    if verb == "run":
+    if _verb(arguments) == "run":
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})
+
+
+def _verb(arguments: Sequence[str]) -> str | None:
+    return next((argument for argument in arguments if not argument.startswith("-")), None)

@@ -94,7 +94,6 @@ def _watchdog_ns() -> int | None:
 def tune_interpreter() -> None:
     """Set up the process for low latency. To be called once, by the owner of the process, after start-up."""
     gc.freeze()  # objects made at start-up live as long as the process and need no scan
-    gc.set_threshold(700, 10, 10)  # Python's own: `router.main` has raised it for the start
     may_open, may_request = resource.getrlimit(resource.RLIMIT_NOFILE)
     if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few for as many clients of a gateway
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))

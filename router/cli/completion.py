@@ -7,12 +7,12 @@ says it.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from router import inputs
 from router.cli.tool_options import table_if_any
 from router.errors import RouterError, TableError
 
@@ -139,7 +139,7 @@ def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
     from router.table.nodes import MappingNode
 
     if (path := table_if_any(args)) is not None:
-        parts = map(load_chain(path, os.environ, [], []).get, keys)
+        parts = map(load_chain(path, inputs.ENVIRONMENT, [], []).get, keys)
         yield from (name for part in parts if isinstance(part, MappingNode) for name in part.entries)
 
 

@@ -142,13 +142,11 @@ def running_url(args: argparse.Namespace) -> str:
     if args.url:
         return str(args.url).strip()
 
-    from os import environ
-
     from router.table import http_address, load_table
     from router.tools.running_router import url_at, url_of
 
     path = table_path(args)
-    if (address := http_address(path, environ)) is not None:
+    if (address := http_address(path, inputs.ENVIRONMENT)) is not None:
         return url_at(address)
     table, findings = load_table(path)
     if table is None:

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 
 from router import inputs
@@ -167,8 +167,9 @@ class Scanned:
         return "." not in name.removeprefix(f"{self.package}." if self.package else "")
 
 
+@lru_cache(maxsize=64)
 def scan(content: bytes) -> Scanned:
-    """The declarations and imports of a file, in order."""
+    """The declarations and imports of a file, in order. Several questions are asked about each file."""
     package = ""
     names: list[str] = []
     messages: set[str] = set()

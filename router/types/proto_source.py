@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import enum
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Union
 
-from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto, SourceCodeInfo
+from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto
 
 from router import inputs
 from router.errors import SourceSpan, shown_path
@@ -92,7 +92,6 @@ class Part(enum.Enum):
 class _Place(NamedTuple):
     """`parts` holds the steps from `path` to the name, the number and the type, the likeliest first."""
 
-    file: str
     path: _Path
     parts: Mapping[Part, tuple[int, ...]]
 
@@ -109,66 +108,93 @@ _VALUE_PARTS = {Part.NAME: (1,), Part.NUMBER: (2,)}
 class ProtoSources:
     """Asked by full name: `PBEnvelope`, `PBEnvelope.imu_info`, `SensorState`, `SensorState.SENSOR_IDLE`.
 
-    An enum's values are named below their enum here, which is not protobuf's own scoping.
+    An enum's values are named below their enum here, which is not protobuf's own scoping. What protoc says of a file is
+    kept as its bytes until a place in it is asked for, as it seldom is, and takes ten times as much memory then.
     """
 
     def __init__(self, files: Iterable[FileDescriptorProto], paths: Mapping[str, Path]) -> None:
-        self._files = {file.name: file for file in files}
-        self._texts = {name: ProtoText(path) for name, path in paths.items()}
-        self._locations: dict[str, dict[_Path, SourceCodeInfo.Location]] = {}
-        self._places: dict[str, _Place] = {}
-        for file in self._files.values():
-            self._add_file(file)
+        self._encoded: dict[str, bytes] = {}
+        self._opened: dict[str, _File] = {}
+        self._paths = paths
+        self._holders: dict[str, str] = {}
+        for file in files:
+            self._encoded[file.name] = file.SerializeToString()
+            self._holders |= dict.fromkeys((name for name, _, _ in _holders(file)), file.name)
 
     def file(self, name: str) -> str:
-        """The file that declares `name`, relative to the folder of the protos, with `/`."""
-        return self._places[name].file
+        """The file that declares a message or an enum, relative to the folder of the protos, with `/`."""
+        return self._holders[name]
 
     def span(self, name: str, part: Part = Part.NAME) -> SourceSpan:
         """The place of a declaration, or of a part of it where it has that part."""
+        file = self._holders.get(name) or self._holders[name.rpartition(".")[0]]
+        if file not in self._opened:
+            self._opened[file] = _File(FileDescriptorProto.FromString(self._encoded[file]), self._paths[file])
+        return self._opened[file].span(name, part)
+
+
+class _File:
+    """The places in one file."""
+
+    def __init__(self, file: FileDescriptorProto, path: Path) -> None:
+        self._text = ProtoText(path)
+        self._locations = {tuple(each.path): tuple(each.span) for each in file.source_code_info.location}
+        self._places: dict[str, _Place] = {}
+        for name, place, declared in _holders(file):
+            self._places[name] = _Place(place, _TYPE_PARTS)
+            if isinstance(declared, DescriptorProto):
+                self._add(name, [each.name for each in declared.field], (*place, _MESSAGE_FIELD), _FIELD_PARTS)
+            else:
+                self._add(name, [each.name for each in declared.value], (*place, _ENUM_VALUE), _VALUE_PARTS)
+
+    def _add(self, holder: str, names: Iterable[str], path: _Path, parts: Mapping[Part, tuple[int, ...]]) -> None:
+        for index, name in enumerate(names):
+            self._places[f"{holder}.{name}"] = _Place((*path, index), parts)
+
+    def span(self, name: str, part: Part) -> SourceSpan:
         place = self._places[name]
         for step in place.parts.get(part, (1,)):
-            if (location := self._location(place.file, (*place.path, step))) is not None:
-                return self._texts[place.file].span(location.span)
+            if (location := self._locations.get((*place.path, step))) is not None:
+                return self._text.span(location)
         path = place.path
-        while (around := self._location(place.file, path)) is None:  # as for the entries of a map, written nowhere
+        while (around := self._locations.get(path)) is None:  # as for the entries of a map, written nowhere
             path = path[:-2]
-        return self._texts[place.file].span(around.span)
+        return self._text.span(around)
 
-    def comment(self, name: str) -> str:
-        """The comment above and beside a declaration, as one line; empty where there is none."""
-        place = self._places[name]
-        location = self._location(place.file, place.path)
-        if location is None:
-            return ""
-        return " ".join(f"{location.leading_comments} {location.trailing_comments}".split())
 
-    def _location(self, file: str, path: _Path) -> SourceCodeInfo.Location | None:
-        if file not in self._locations:
-            self._locations[file] = {
-                tuple(location.path): location for location in self._files[file].source_code_info.location
-            }
-        return self._locations[file].get(path)
+def field_comments(files: Iterable[FileDescriptorProto]) -> dict[str, str]:
+    """The comments above and beside fields, each as one line, by full name. Fields without one are left out."""
+    found: dict[str, str] = {}
+    for file in files:
+        comments = {
+            tuple(each.path): " ".join(f"{each.leading_comments} {each.trailing_comments}".split())
+            for each in file.source_code_info.location
+            if each.leading_comments or each.trailing_comments
+        }
+        for name, path, declared in _holders(file):
+            if isinstance(declared, DescriptorProto):
+                for index, member in enumerate(declared.field):
+                    if comment := comments.get((*path, _MESSAGE_FIELD, index)):
+                        found[f"{name}.{member.name}"] = comment
+    return found
 
-    def _add_file(self, file: FileDescriptorProto) -> None:
-        prefix = f"{file.package}." if file.package else ""
-        for index, message in enumerate(file.message_type):
-            self._add_message(file.name, (_FILE_MESSAGE, index), prefix, message)
-        for index, declared in enumerate(file.enum_type):
-            self._add_enum(file.name, (_FILE_ENUM, index), prefix, declared)
 
-    def _add_message(self, file: str, path: _Path, prefix: str, message: DescriptorProto) -> None:
-        name = prefix + message.name
-        self._places[name] = _Place(file, path, _TYPE_PARTS)
-        for index, member in enumerate(message.field):
-            self._places[f"{name}.{member.name}"] = _Place(file, (*path, _MESSAGE_FIELD, index), _FIELD_PARTS)
-        for index, nested in enumerate(message.nested_type):
-            self._add_message(file, (*path, _MESSAGE_NESTED, index), f"{name}.", nested)
-        for index, declared in enumerate(message.enum_type):
-            self._add_enum(file, (*path, _MESSAGE_ENUM, index), f"{name}.", declared)
+_Holder = tuple[str, _Path, Union[DescriptorProto, EnumDescriptorProto]]
 
-    def _add_enum(self, file: str, path: _Path, prefix: str, declared: EnumDescriptorProto) -> None:
-        name = prefix + declared.name
-        self._places[name] = _Place(file, path, _TYPE_PARTS)
-        for index, value in enumerate(declared.value):
-            self._places[f"{name}.{value.name}"] = _Place(file, (*path, _ENUM_VALUE, index), _VALUE_PARTS)
+
+def _holders(file: FileDescriptorProto) -> Iterator[_Holder]:
+    """The messages and enums of a file, nested ones too, each with its full name and path."""
+    prefix = f"{file.package}." if file.package else ""
+    for index, message in enumerate(file.message_type):
+        yield from _within(message, prefix, (_FILE_MESSAGE, index))
+    for index, declared in enumerate(file.enum_type):
+        yield prefix + declared.name, (_FILE_ENUM, index), declared
+
+
+def _within(message: DescriptorProto, prefix: str, path: _Path) -> Iterator[_Holder]:
+    name = prefix + message.name
+    yield name, path, message
+    for index, nested in enumerate(message.nested_type):
+        yield from _within(nested, f"{name}.", (*path, _MESSAGE_NESTED, index))
+    for index, declared in enumerate(message.enum_type):
+        yield f"{name}.{declared.name}", (*path, _MESSAGE_ENUM, index), declared

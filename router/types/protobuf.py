@@ -33,7 +33,7 @@ from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
 from router.types.proto_files import OPTIONS, Folder, envelope_file, proto_of, reached, read_folder
-from router.types.proto_source import Part, ProtoSources
+from router.types.proto_source import Part, ProtoSources, field_comments
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
 from router.types.undecidable import undecidable
 from router.types.wire import encoding_of, validates_text
@@ -75,7 +75,7 @@ class ProtoSchema:
         self.messages: Mapping[str, MessageType]
         self.enums: Mapping[str, Enum]
         names = [file.name for file in compiled.file]
-        self.messages, self.enums = build_types(self._pool, names, self.sources, self.board_options)
+        self.messages, self.enums = build_types(self._pool, names, field_comments(compiled.file), self.board_options)
 
     def message_class(self, name: str) -> MessageClass:
         """The Python class of a message, by full name. Raises KeyError."""
@@ -344,7 +344,7 @@ def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
 def build_types(
     pool: DescriptorPool,
     file_names: Sequence[str],
-    sources: ProtoSources,
+    comments: Mapping[str, str],
     options_of: Callable[[FieldDescriptor], BoardOptions],
 ) -> tuple[dict[str, MessageType], dict[str, Enum]]:
     """All messages and enums of the files, nested ones too, by full name and in declared order."""
@@ -368,7 +368,7 @@ def build_types(
                 has_presence=field.has_presence,
                 is_required=field.is_required or messages[message.full_name].is_map_entry,
                 oneof=field.containing_oneof.name if field.containing_oneof else None,
-                comment=sources.comment(f"{message.full_name}.{field.name}"),
+                comment=comments.get(field.full_name, ""),
                 is_unchecked=field.type == FieldDescriptor.TYPE_STRING and not validates_text(field),
                 is_group=field.type == FieldDescriptor.TYPE_GROUP,
             )

@@ -209,7 +209,8 @@ def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Ite
 
 def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
     _want_small([(operation, place.span) for operation, place in placed])
-    return tuple(operation for operation, _ in placed), tuple(str(place) for _, place in placed)
+    texts = {id(place): str(place) for place in {id(place): place for _, place in placed}.values()}
+    return tuple(operation for operation, _ in placed), tuple(texts[id(place)] for _, place in placed)
 
 
 # ---- limits
@@ -218,6 +219,9 @@ def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
 def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
     """Raise TooLargeError for what nests deeper than a routine can."""
     operations = [operation for operation, _ in placed]
+    kinds = [operation.kind for operation in operations]
+    if len(kinds) < MOST_STACKED and kinds.count(Op.REPEAT) <= MOST_LOOPS and kinds.count(Op.OPEN) <= MOST_OPEN:
+        return
     loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
     limits = (
         (depths(operations), MOST_STACKED - 1, "intermediate values are needed here", "use fewer brackets in brackets"),
