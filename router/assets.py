@@ -5,8 +5,6 @@ Knows no file's meaning. `routes/`, `protos/` and `schemas/` are such files.
 
 from __future__ import annotations
 
-import base64
-import re
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
@@ -29,15 +27,14 @@ def is_installed(path: Path) -> bool:
     return path.resolve().is_relative_to(_PACKAGE.resolve())
 
 
-_INLINE_ELEMENT = re.compile(rb"<(script|style)[^>]*>(.*?)</\1>", re.DOTALL)
-
-
 def page_policy(page: bytes) -> str:
     """The Content-Security-Policy of a page whose scripts and styles are all in it; it may connect to nothing yet."""
+    import base64
+    import re
     from hashlib import sha256  # here, as `table` has imported it without OpenSSL
 
     sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
-    for kind, text in _INLINE_ELEMENT.findall(page):
+    for kind, text in re.findall(rb"<(script|style)[^>]*>(.*?)</\1>", page, re.DOTALL):
         sources[kind].append(f"'sha256-{base64.b64encode(sha256(text).digest()).decode()}'")
     scripts, styles = (" ".join(hashes) or "'none'" for hashes in sources.values())
     return (

@@ -87,15 +87,11 @@ logger: FilteringBoundLogger = LazyLogger("router")
 
 
 def _import_structlog() -> ModuleType:
-    """Without rich, which it would import for tracebacks that are not used here: more than half of the time."""
-    is_left_out = "rich" not in sys.modules
-    if is_left_out:
-        sys.modules["rich"] = None  # type: ignore[assignment]
-    try:
+    """Without rich, which it imports for tracebacks that are not used here, and asyncio, for methods that are not."""
+    from router.lean import left_out, postponed
+
+    with left_out("rich"), postponed("asyncio"):
         import structlog
-    finally:
-        if is_left_out:
-            del sys.modules["rich"]
     return structlog
 
 

@@ -10,20 +10,21 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors inputs assets clock log threads"
-LANGUAGE = "declared errors inputs assets table types compiler"
+GROUND = "declared errors inputs assets lean clock log threads"
+LANGUAGE = "declared errors inputs assets lean table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
     "inputs": "declared",
     "assets": "",
     "clock": "",
-    "log": "clock errors",
+    "lean": "",
+    "log": "clock errors lean",
     "threads": "clock log",
-    "table": "errors inputs assets",
-    "types": "declared errors inputs assets",
+    "table": "errors inputs assets lean",
+    "types": "declared errors inputs assets lean",
     "values": "errors types",
-    "compiler": "declared errors inputs assets table types",
+    "compiler": "declared errors inputs assets lean table types",
     "datagrams": "declared errors table types",
     "net": f"{GROUND} {LANGUAGE} datagrams",
     "carrier": f"{GROUND} {LANGUAGE} datagrams net",
@@ -39,7 +40,7 @@ IMPORTS = {
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"declared", "errors", "table", "types", "values", "compiler", "datagrams"}
+PURE = {"declared", "errors", "lean", "table", "types", "values", "compiler", "datagrams"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

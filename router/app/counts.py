@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from mmap import MAP_PRIVATE, mmap
 from typing import cast
 
 from router.carrier.threads import NativeThread
@@ -30,12 +31,15 @@ class ThreadCounts:
 
     @staticmethod
     def fixed() -> ctypes.Array[ctypes.c_int64]:
-        """Counts of a native thread: they never move."""
-        return (ctypes.c_int64 * MOST_COUNTERS)()
+        """Counts of a native thread: they never move, and take memory only where something was counted."""
+        pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
+        return (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)
 
     def add_thread(self, thread: NativeThread) -> None:
         """Count what a native thread counts in an array that is `fixed`, by copies that balance."""
-        self._add(cast("list[int]", thread.counts), thread.counters)  # the array is only indexed and sliced
+        counts = cast("list[int]", thread.counts)  # the array is only indexed and sliced
+        counts[: self.counters.size] = self.counters.fresh_counts()  # no page fault in the thread
+        self._add(counts, thread.counters)
 
     def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
         self.counters.grow(counts)
@@ -55,12 +59,11 @@ class ThreadCounts:
         """Add the counts of `counters`, which continue the present ones. Raises StartError."""
         if counters.size > MOST_COUNTERS:
             raise StartError(f"the table has {counters.size} counters, and there is room for {MOST_COUNTERS}")
-        present = dict(self.counters.series())
-        new = [index for series, index in counters.series() if series not in present]
+        new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             counters.grow(counts)
-            for index in new:  # a program that was abandoned may have counted there
-                counts[index] = 0
+            for run in new:  # a program that was abandoned may have counted there
+                counts[run] = [0] * (run.stop - run.start)
 
     def replace(self, counters: Counters) -> None:
         """Adopt `counters`, once no thread counts by the earlier ones."""

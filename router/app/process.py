@@ -98,3 +98,4 @@ def tune_interpreter() -> None:
     if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few for as many clients of a gateway
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
     sys.setswitchinterval(0.0005)  # the longest that gateways wait for a busy thread
+    gc.enable()  # it may have been paused until here

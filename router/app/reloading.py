@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from router.app.memory import drop_idle_code
 from router.app.process import reloading
 from router.app.runtime import Runtime
 from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
-from router.compiler.check import Checked
+from router.compiler.check import Checked, uncollected
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
@@ -42,6 +43,7 @@ class Reloader:
     def open(self) -> None:
         """Allow reloads, once the router runs."""
         self._is_open = True
+        drop_idle_code()
 
     def close(self) -> None:
         """Wait for a reload that is running; refuse any other."""
@@ -54,10 +56,11 @@ class Reloader:
             if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
-            with background_threads(), reloading():
+            with background_threads(), reloading(), uncollected():
                 kind, result = self._attempt(self._runtime.program)
             self._count(kind)
             self._remember(is_good=result.ok)
+            drop_idle_code()
             seconds = round((monotonic_ns() - began) / 1e9, 3)
         log = logger.info if result.ok else logger.error
         event = "table reloaded" if result.ok else "the table was not taken over, and nothing has changed"

@@ -78,8 +78,11 @@ class Router:
             with background_threads():
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)
-                self._open_services(change, services)
+            if self._first.table.record is not None:  # kept for the recorder, which opens later
+                self._runtime.plane.observe(is_observed=True)
             self._runtime.start(change)
+            with background_threads():
+                self._open_services(change, services)
             self._reloader.open()
             opening.callback(self._unwatch_all)
             self._watch()

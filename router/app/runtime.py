@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from router.app.plane import Built, Opened, Plane
@@ -80,10 +80,12 @@ class Runtime:
         return stalled
 
     def start(self, change: Change) -> None:
-        """Run the prepared program."""
+        """Run the prepared program, then open its gateways. Raises StartError; then the program runs all the same."""
         self.adopt(change)
-        with background_threads():
-            self.finish(change, None)
+        with background_threads(), ExitStack() as undo:
+            gateways = self._prepare_gateways(change.built, undo)
+            undo.pop_all()
+            self.finish(replace(change, gateways=gateways), None)
 
     def close_with(self, closing: ExitStack) -> None:
         """Have `closing` close sockets and ROS, after the services that use them."""
@@ -102,8 +104,8 @@ class Runtime:
     def prepare(self, program: Program) -> Change:
         """Open what `program` needs and is not open yet. Raises StartError, with nothing changed.
 
-        For the first program, deadmen send their payload of the start here: nothing is received yet, but gateways serve
-        clients as soon as they are open.
+        For the first program, deadmen send their payload of the start here, and gateways are opened by `start`: they
+        take longer than to receive, forward and publish.
         """
         if self._unfinished and self.plane.has_passed():
             self._close_unfinished()  # first: it may be opened again
@@ -127,7 +129,7 @@ class Runtime:
                 state,
             )
             built = self.plane.build(program, opened)
-            gateways = self._prepare_gateways(built, undo)
+            gateways = self._prepare_gateways(built, undo) if now else None
             return Change(sockets, topics, built, gateways, undo.pop_all())
 
     def adopt(self, change: Change) -> None:
@@ -139,6 +141,7 @@ class Runtime:
         except BaseException:
             change.undo.close()
             raise
+        change.undo.pop_all()  # discarded
         self.sockets.apply(change.sockets)
         if self._ros is not None and change.ros is not None:
             self._ros.apply(change.ros)
@@ -149,7 +152,6 @@ class Runtime:
         If a thread is stuck there, as in the middleware, that stays open until it goes on. All of it is done even if
         one step raises.
         """
-        change.undo.pop_all()  # discarded
         with ExitStack() as last_first:
             last_first.callback(self._close_passed, change, earlier)
             if self._ros is not None and change.ros is not None:
@@ -171,7 +173,7 @@ class Runtime:
         """Close what all threads have passed, in this reload and in those before."""
         self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
-            if self.plane.has_passed():
+            if earlier is None or self.plane.has_passed():
                 last_first.callback(self._counts.replace, change.program.counters)
                 last_first.callback(self._close_unfinished)
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from mmap import MAP_PRIVATE, mmap
 
 from router.declared import MAX_DATAGRAM, MessageRecord
 
@@ -13,12 +14,13 @@ class Ring:
     """A ring for `capacity` bytes, a power of two. It is never closed: native threads may hold it until the end."""
 
     def __init__(self, library: ctypes.CDLL, capacity: int) -> None:
-        """Raises MemoryError, also for a lack of descriptors."""
+        """Raises MemoryError, also for a lack of descriptors, or OSError."""
         self._library = library
         self.address: int = library.ring_open(capacity)
         if not self.address:
             raise MemoryError("a queue of the carrier cannot be opened")
-        self._records = ctypes.create_string_buffer(max(1 << 16, 2 * LONGEST_RECORD))
+        pages = mmap(-1, max(1 << 16, 2 * LONGEST_RECORD), flags=MAP_PRIVATE)  # used once something comes
+        self._records = (ctypes.c_char * len(pages)).from_buffer(pages)
         self._view = memoryview(self._records).cast("B")
 
     def take(self) -> memoryview:

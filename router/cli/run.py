@@ -17,6 +17,7 @@ from router.app.process import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, good_table, table_path
+from router.compiler.check import uncollected
 from router.compiler.program import Program
 from router.errors import UsageError
 from router.log import LEVELS as LOG_LEVELS
@@ -54,9 +55,10 @@ def run(args: argparse.Namespace) -> int:
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
     environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
-    program = good_table(_table(args, parameters.get(ROUTES_PATH)), environ)[1]  # a reload can free the rest
-    _warn_of(without_effect(args.ros_args, program, environ.asked))
-    route(program, args.ros_args, environ)
+    with uncollected():  # until the router has started
+        program = good_table(_table(args, parameters.get(ROUTES_PATH)), environ)[1]  # a reload can free the rest
+        _warn_of(without_effect(args.ros_args, program, environ.asked))
+        route(program, args.ros_args, environ)
     return OK
 
 

@@ -6,7 +6,7 @@ them from here. Counting itself is `counts[index] += 1` in the thread that owns 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -194,19 +194,15 @@ UNKNOWN_CASE = "unknown"
 HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000))
 
 
-@dataclass(frozen=True, slots=True)
-class Series:
-    """What an index counts: a metric, with its label values in the metric's order.
-
-    A histogram has several indexes in a row, one for each `cell`: each bound, everything slower, the sum (ns).
-    """
+class Series(NamedTuple):
+    """What is counted: a metric, with its label values in the metric's order."""
 
     metric: str
     labels: tuple[str, ...]
-    cell: int = 0
 
 
 HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
+"""The indexes of a histogram, in a row: one for each bound, everything slower, the sum (ns)."""
 
 
 class Mismatch(NamedTuple):
@@ -243,8 +239,8 @@ class Counters:
     that only the earlier one had are no longer current, but keep their indexes until `settle` frees them.
     """
 
-    _indexes: dict[Series, int] = field(default_factory=dict)
-    _current: set[Series] = field(default_factory=set)
+    _indexes: dict[tuple[str, ...], int] = field(default_factory=dict)  # the first one, by metric and labels
+    _current: set[tuple[str, ...]] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
     _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
@@ -266,35 +262,44 @@ class Counters:
     def are_commands(self, route: str, target: str) -> bool:
         return self._commanded.get((route, target), False)
 
-    def index(self, metric: str, *labels: str) -> int:
-        """Return the first index of a series, which is current from now on."""
+    def index(self, *series: str) -> int:
+        """Return the first index of a series, which is current from now on: `index(metric, *labels)`."""
+        self._current.add(series)
+        index = self._indexes.get(series)
+        return self._open(series) if index is None else index
+
+    def _open(self, series: tuple[str, ...]) -> int:
+        metric, *labels = series
         declared = _BY_NAME[metric]
         if len(labels) != len(declared.labels):
             raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
-        first = Series(metric, labels)
-        self._current.add(first)
-        if first not in self._indexes:
-            length = _length_of(declared)
-            start = self._run(length)
-            for cell in range(length):
-                self._indexes[Series(metric, labels, cell)] = start + cell
-        return self._indexes[first]
-
-    def _run(self, length: int) -> int:
-        """Return the first of `length` indexes in a row that no series has."""
+        length = _length_of(declared)
         if free := self._free.get(length):
-            return free.pop()
-        self._size += length
-        return self._size - length
+            start = free.pop()
+        else:
+            start = self._size
+            self._size += length
+        self._indexes[series] = start
+        return start
 
     @property
     def size(self) -> int:
         """The length of a list of counts."""
         return self._size
 
-    def series(self) -> Iterable[tuple[Series, int]]:
-        """Return every series with its index, also those of earlier programs that have counted something."""
-        return self._indexes.items()
+    def series(self) -> Iterator[tuple[Series, int]]:
+        """Yield every series with its first index, also those of earlier programs that have counted something."""
+        for (metric, *labels), index in self._indexes.items():
+            yield Series(metric, tuple(labels)), index
+
+    def new_runs(self, earlier: Counters) -> Iterator[slice]:
+        """Yield the indexes of each series that `earlier`, which these counters continue, does not have."""
+        for series in self._indexes.keys() - earlier._indexes.keys():
+            yield self._run(series)
+
+    def _run(self, series: tuple[str, ...]) -> slice:
+        start = self._indexes[series]
+        return slice(start, start + _length_of(_BY_NAME[series[0]]))
 
     def fresh_counts(self) -> list[int]:
         """Return a list of zeros, one for each index, for one thread to own."""
@@ -312,17 +317,15 @@ class Counters:
         so that totals never decrease.
         """
         lists = list(threads)
-        for first in [series for series in self._indexes if series.cell == 0 and series not in self._current]:
-            declared, start = _BY_NAME[first.metric], self._indexes[first]
-            length = _length_of(declared)
-            run = slice(start, start + length)
-            if declared.kind in _COUNTED and any(any(counts[run]) for counts in lists):
+        for series in [series for series in self._indexes if series not in self._current]:
+            run = self._run(series)
+            if _BY_NAME[series[0]].kind in _COUNTED and any(any(counts[run]) for counts in lists):
                 continue
+            length = run.stop - run.start
             for counts in lists:
                 counts[run] = [0] * length
-            for cell in range(length):
-                del self._indexes[Series(first.metric, first.labels, cell)]
-            self._free.setdefault(length, []).append(start)
+            del self._indexes[series]
+            self._free.setdefault(length, []).append(run.start)
 
 
 _COUNTED = ("counter", "histogram")

@@ -14,7 +14,6 @@ from itertools import count
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import msgspec
-import numpy as np
 import orjson
 
 from router.compiler.cdr import (
@@ -218,6 +217,8 @@ _MOST_SAID = 48
 
 def _units(data: bytes) -> Any:
     """The UTF-16 units of a wstring, which has 32 bits for each."""
+    import numpy as np  # for texts and lists that few messages have: it takes 0.1 s and 20 MB
+
     units = np.frombuffer(data, "<u4")
     if len(units) and units.max() > _LARGEST_UNIT:
         raise UnreadableError("a wstring has units that are no UTF-16")
@@ -249,6 +250,8 @@ def _sequence(letter: str) -> Callable[[bytes], Any]:
         number = len(data) // size
         if number <= _SHORT:
             return struct.unpack(f"<{number}{letter}", data)
+        import numpy as np  # as in _units
+
         values = np.frombuffer(data, f"<{letter}" if letter != "?" else "u1")
         # orjson would write the shortest text that is the same float32, and clients read doubles.
         return _in_chunks(values.astype("<f8") if letter == "f" else values != 0 if letter == "?" else values)

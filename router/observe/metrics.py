@@ -45,12 +45,11 @@ class CountersCollector(Collector):
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
-            if series.cell == 0:
-                metric = metric_named(series.metric)
-                labels = dict(zip(metric.labels, series.labels, strict=True))
-                if metric.tells_commands:
-                    labels[COMMAND] = str(counters.are_commands(labels["route"], labels["target"])).lower()
-                self._indexes[series.metric].append((labels, index))
+            metric = metric_named(series.metric)
+            labels = dict(zip(metric.labels, series.labels, strict=True))
+            if metric.tells_commands:
+                labels[COMMAND] = str(counters.are_commands(labels["route"], labels["target"])).lower()
+            self._indexes[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:
         threads = self._counts()

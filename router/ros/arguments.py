@@ -20,7 +20,7 @@ from router.table.model import NodeSettings
 
 ROUTES_PATH = "routes_path"
 
-_PARAMETERS_OF_ROS = ("use_sim_time", "start_type_description_service")
+_PARAMETERS_OF_ROS = ("use_sim_time",)
 _NODE_RULES = ("__node", "__name", "__ns")
 _LOGGING = ("--log-level", "--log-config-file", "--log-file-name")
 _SWITCHES = ("rosout-logs", "stdout-logs", "external-lib-logs")

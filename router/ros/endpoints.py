@@ -188,18 +188,19 @@ def opened_beside(
 
     Returns all endpoints by topic, and those that were opened.
     """
-    classes = {}
+    classes: dict[str, type] = {}  # by name: the search for one, and for those in it, takes half a millisecond
     for plan in plans:
         if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
             kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
             what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
             raise StartError(f"{spans[plan.label]}: {what} while it runs", "restart it, or take another name")
-        classes[plan.label] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
+        if plan.type_name not in classes:
+            classes[plan.type_name] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []
     with ExitStack() as opening:
         for plan in plans:
             if plan.label not in now or now[plan.label].plan != plan:
-                opened.append(open_one(plan, classes[plan.label], spans[plan.label]))
+                opened.append(open_one(plan, classes[plan.type_name], spans[plan.label]))
                 opening.callback(opened[-1].close)
         opening.pop_all()
     beside = {each.plan.label: each for each in opened}

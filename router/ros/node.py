@@ -15,6 +15,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from router.errors import StartError
 from router.log import logger
+from router.ros.types import lean_interfaces
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
 """What rclpy raises for invalid arguments, names and settings; its own errors derive from RuntimeError."""
@@ -32,9 +33,18 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
     try:
         with _environment(_transport_variables(os.environ)):
             # The router has its own log: no log file of ROS, no /rosout. No parameter services either: parameters
-            # fill the table's variables at start, so that setting them later would have no effect.
+            # fill the table's variables at start, so that setting them later would have no effect. Nor a service
+            # that describes types: rclpy's executor would answer it, and none runs.
             context.init(list(ros_args), initialize_logging=False)
-            node = Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
+            with lean_interfaces():
+                node = Node(
+                    name,
+                    namespace=namespace,
+                    context=context,
+                    enable_rosout=False,
+                    start_parameter_services=False,
+                    parameter_overrides=[Parameter("start_type_description_service", value=False)],
+                )
         _ignore_sim_time(node)
         return node
     except RCL_ERRORS as error:

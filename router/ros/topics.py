@@ -19,7 +19,8 @@ from rclpy.serialization import deserialize_message
 from router.errors import StartError, TransportError
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import Arrivals, RawSubscription
-from router.ros.types import Definition, installed_type, loaded_class, usable_class
+from router.ros.type_support import Definition
+from router.ros.types import installed_type, loaded_class, usable_class
 from router.types.model import MessageType
 
 DEPTH = 100

@@ -1,11 +1,12 @@
-"""Installed ROS message types: their Python classes, checked against the table's definitions, and their fields."""
+"""Installed ROS message types, checked against the table's definitions: their Python classes, and their fields."""
 
 from __future__ import annotations
 
 import importlib
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
@@ -20,13 +21,12 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 )
 
 from router.errors import SourceSpan, StartError
+from router.lean import left_out, postponed
 from router.ros.environment import ros_package_remedy
+from router.ros.type_support import Definition, class_for_cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
-
-Definition = tuple[tuple[str, str], ...]
-"""The fields of a type, each as its name and its type in rclpy's spelling."""
 
 _BASIC: dict[str, Type] = {
     "boolean": Bool(),
@@ -35,6 +35,16 @@ _BASIC: dict[str, Type] = {
     "double": Float(64),
     **{str(it): it for it in (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (False, True))},
 }
+
+
+@contextmanager
+def lean_interfaces() -> Iterator[None]:
+    """Import modules of message types inside, but not what these import and CDR bytes need not.
+
+    That is numpy, for fields of fixed length, and the generator of such modules, with its parsers.
+    """
+    with postponed("numpy"), left_out("rosidl_generator_py.generate_py_impl"):
+        yield
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
@@ -46,7 +56,16 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
 
 def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """As `loaded_class`, if the class and all types in it are installed as in `definitions`. Raises StartError."""
+    """What rclpy takes for a type that is published and taken as CDR.
+
+    Raises StartError unless it and all types in it are installed as in `definitions`.
+    """
+    package, kind, short = _parts(name)
+    if _has_part(package, kind):
+        with lean_interfaces():
+            found = class_for_cdr(package, kind, short, definitions)
+        if found is not None:
+            return found
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
@@ -61,7 +80,8 @@ def loaded_class(name: str) -> Any:
     """As `installed_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
     message_class = installed_class(name)
     try:
-        check_is_valid_msg_type(message_class)
+        with lean_interfaces():
+            check_is_valid_msg_type(message_class)
     except Exception as error:  # a library that cannot be loaded, or anything else
         why = f"{error}: {error.__context__}" if error.__context__ else str(error)  # the latter names the library
         raise StartError(f"{name} cannot be used: {why}", _remedy(name)) from error
@@ -74,19 +94,25 @@ def installed_class(name: str) -> Any:
     The name may come from a client: only Python packages with a part `msg`, `srv` or `action` are imported. Raises
     StartError.
     """
-    parts = _NAME.fullmatch(name)
-    if parts is None:
-        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
-    package, kind, short = parts.groups()
+    package, kind, short = _parts(name)
     if not _has_part(package, kind):
         raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name))
     try:
-        found = _member(importlib.import_module(f"{package}.{kind}"), short)
+        with lean_interfaces():
+            found = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
         raise StartError(f"{name} cannot be loaded: {error}") from error
     if not hasattr(found, "get_fields_and_field_types"):
         raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
     return found
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Package, kind and short name. Raises StartError."""
+    parts = _NAME.fullmatch(name)
+    if parts is None:
+        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
+    return parts.groups()
 
 
 def _has_part(package: str, kind: str) -> bool:

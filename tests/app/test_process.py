@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -113,3 +115,12 @@ def test_the_watchdog_of_another_process_is_not_ours(manager: socket.socket, mon
     with supervised(_not_asked):
         assert said(manager) == ["READY=1"]
     assert said(manager)[0] == "STOPPING=1"
+
+
+def test_garbage_collection_goes_on_once_the_interpreter_is_tuned_although_the_start_has_paused_it() -> None:
+    code = (
+        "import gc; from router.app import tune_interpreter; from router.compiler.check import uncollected\n"
+        "with uncollected(): tune_interpreter(); print(gc.isenabled())"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert child.stdout == "True\n"

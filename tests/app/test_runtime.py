@@ -139,6 +139,62 @@ def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
     assert [each.data for each in read(recording)] == [DRIVE] * 100
 
 
+def test_what_comes_before_the_recorder_is_open_is_recorded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = Recorder.__init__
+
+    def open_late(*arguments: Any) -> None:
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+        opened(*arguments)
+
+    monkeypatch.setattr(Recorder, "__init__", open_late)
+    with Router(site.program(ROUTE + "record: {directory: recordings}\n")):
+        pass
+    [recording] = (site.folder / "recordings").iterdir()
+    assert [each.data for each in read(recording)] == [PH]
+
+
+GATEWAY = TOPIC + 'gateways: {dashboard: {transport: {websocket: "127.0.0.1:PORT"}}}\n'
+
+
+@pytest.mark.parametrize("has_gateway", [False, True])
+def test_it_forwards_before_gateways_and_pages_are_open(
+    site: Site, monkeypatch: pytest.MonkeyPatch, has_gateway: bool
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from router.gateway.thread import GatewayThread
+
+    forwarded: list[str] = []
+
+    def forward_before(kind: type, method: str) -> None:
+        original = getattr(kind, method)
+
+        def forward(*arguments: Any) -> Any:
+            site.send(PH)
+            assert site.basestation.recv(1000) == PH
+            forwarded.append(kind.__name__)
+            return original(*arguments)
+
+        monkeypatch.setattr(kind, method, forward)
+
+    forward_before(GatewayThread, "prepare")
+    forward_before(HttpServer, "__init__")
+    http = f'http: {{address: "127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"}}\n'
+    gateway = GATEWAY.replace("PORT", str(free_port(kind=socket.SOCK_STREAM))) if has_gateway else ""
+    with Router(site.program(ROUTE + gateway + http)):
+        assert forwarded == ["GatewayThread", "HttpServer"][not has_gateway :]
+
+
+def test_a_gateway_that_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        program = site.program(ROUTE + GATEWAY.replace("PORT", str(taken.getsockname()[1])))
+        with pytest.raises(StartError, match=r"table.yaml:14:\d+"), Router(program):
+            pass
+    with Router(program):  # the listener's port is free again
+        pass
+
+
 def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, saved = threading.Event(), SimpleQueue[str]()
 

@@ -28,8 +28,7 @@ def test_histogram_takes_a_run_of_slots() -> None:
     counters = Counters()
     first = counters.index("route_duration_seconds", "a")
     assert counters.index("route_duration_seconds", "b") == first + HISTOGRAM_CELLS
-    cells = [series.cell for series, _ in counters.series() if series.labels == ("a",)]
-    assert cells == list(range(HISTOGRAM_CELLS))
+    assert counters.size == 2 * HISTOGRAM_CELLS
 
 
 def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:
@@ -43,8 +42,8 @@ def test_metric_names_are_unique() -> None:
 
 def test_rover_has_every_series_before_the_first_datagram(rover_program: Program) -> None:
     series = dict(rover_program.counters.series())
-    assert len(set(series.values())) == len(series)
-    assert sorted(series.values()) == list(range(len(series)))
+    taken = [index + cell for each, index in series.items() for cell in range(_cells(each))]
+    assert sorted(taken) == list(range(rover_program.counters.size))
     for listener in rover_program.listeners:
         for reason in REJECT_REASONS:
             assert Series("datagrams_rejected", (listener.name, reason)) in series
@@ -59,6 +58,20 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
             assert all(Series("messages_dropped", (route, target.label, reason)) in series for reason in DROP_REASONS)
         for name in ("route_duration_seconds", "route_last_message_timestamp_seconds"):
             assert Series(name, (route,)) in series
+
+
+def _cells(series: Series) -> int:
+    return HISTOGRAM_CELLS if metric(series.metric).kind == "histogram" else 1
+
+
+def test_runs_of_new_series_are_known_before_anything_is_counted_in_them() -> None:
+    first = Counters()
+    first.index("datagrams_received", "rover")
+    then = first.continued()
+    then.index("datagrams_received", "rover")
+    timed, new = then.index("route_duration_seconds", "drive"), then.index("datagrams_received", "arm")
+    found = {(run.start, run.stop) for run in then.new_runs(first)}
+    assert found == {(timed, timed + HISTOGRAM_CELLS), (new, new + 1)}
 
 
 def test_books_that_continue_others_keep_what_was_counted() -> None:

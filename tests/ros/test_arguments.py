@@ -42,6 +42,10 @@ def unread(tmp_path: Path, *words: str, table: str = TABLE) -> dict[str, str]:
         (("-p", "prot:=9999"), {"-p prot": "did you mean 'port'?"}),
         (("-p", "rover_router:zoom:=1"), {"-p zoom": "the table's variables are page, port"}),
         (
+            ("-p", "start_type_description_service:=true"),
+            {"-p start_type_description_service": "the table's variables are page, port"},
+        ),
+        (
             ("--params-file", "{folder}/params.yaml"),
             {
                 "-p prot": "did you mean 'port'?",

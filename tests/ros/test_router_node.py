@@ -57,6 +57,12 @@ def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: 
         wait_until(lambda: not wanted[0])
 
 
+@pytest.mark.parametrize("args", [(), ("--ros-args", "-p", "start_type_description_service:=true")])
+def test_there_is_no_service_that_nobody_would_answer(args: tuple[str, ...]) -> None:
+    with closing(open_ros(args=args)) as ros:
+        assert list(ros._node.services) == []
+
+
 def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
         assert ros.wanted["greeting"][0] == 1

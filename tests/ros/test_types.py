@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
@@ -28,7 +29,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 from router.compiler.lookup import definitions_of
 from router.errors import StartError
 from router.ros import types as ros_types
-from router.ros.types import installed_class, installed_type, usable_class
+from router.ros.types import installed_class, installed_type, loaded_class, usable_class
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
 
@@ -164,7 +165,47 @@ def test_what_belongs_to_a_service_is_named_so_and_its_class_matches() -> None:
             1,
         ),
     )
-    assert usable_class(event.name, definitions_of(event)) is installed_class(event.name)
+    found = usable_class(event.name, definitions_of(event))
+    assert found.__class__._TYPE_SUPPORT is loaded_class(event.name).__class__._TYPE_SUPPORT
+
+
+def test_a_type_for_cdr_has_the_type_support_of_its_class() -> None:
+    interfaces = ros_interfaces()
+    for name in sorted(filter(is_installed, interfaces.names())):
+        declared = interfaces.get(name)
+        assert declared
+        quick, loaded = usable_class(name, definitions_of(declared)), loaded_class(name)
+        assert quick is not loaded, name
+        assert quick.__class__._TYPE_SUPPORT is loaded.__class__._TYPE_SUPPORT, name
+        assert (quick.__module__.split(".")[:2], quick.__name__) == (
+            loaded.__module__.split(".")[:2],
+            loaded.__name__,
+        )
+
+
+@pytest.mark.parametrize("other", [("data", "wstring"), ("date", "string")])
+def test_a_type_that_is_installed_otherwise_is_refused(other: tuple[str, str]) -> None:
+    with pytest.raises(StartError, match=r"std_msgs/msg/String as installed is not what the table was compiled for"):
+        usable_class("std_msgs/msg/String", {"std_msgs/msg/String": (other,)})
+
+
+def test_a_type_with_another_one_in_it_that_is_installed_otherwise_is_refused() -> None:
+    declared = ros_interfaces().get("sensor_msgs/msg/Imu")
+    assert declared
+    changed = {**definitions_of(declared), "std_msgs/msg/Header": (("frame_id", "string"),)}
+    with pytest.raises(StartError, match=r"^std_msgs/msg/Header as installed is not what the table was compiled for"):
+        usable_class(declared.name, changed)
+
+
+def test_a_type_for_cdr_imports_no_class() -> None:
+    code = (
+        "import sys; from router.compiler.lookup import definitions_of; from router.types.ros import ros_interfaces\n"
+        "from router.ros.node import open_node; from router.ros.types import usable_class; open_node('quick')\n"
+        "imu = ros_interfaces().get('sensor_msgs/msg/Imu'); usable_class(imu.name, definitions_of(imu))\n"
+        "print({'numpy', 'sensor_msgs.msg', 'geometry_msgs'} & sys.modules.keys())"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert child.stdout == "set()\n"
 
 
 def test_a_request_without_fields_has_none() -> None:
