@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import ctypes
 from bisect import bisect_right
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator
 from functools import cache
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
-from router import declared as c
 from router.carrier.boards import NativeBoards
-from router.carrier.deadmen import DeadmanGroup, NativeDeadman
+from router.carrier.deadmen import DeadmanGroup
 from router.carrier.deferrals import Adoption
 from router.carrier.names import Names
 from router.carrier.outlets import Outlets
@@ -61,6 +60,8 @@ def image_of(library: ctypes.CDLL, program: Program) -> tuple[Parts, bytes]:
     memory = _Memory(native, symbols)
     image, relocations, imports = memory.image()
     parts: Parts = {
+        "counters": program.counters.size,
+        "mirror_lost": program.counters.index("mirror_dropped") if program.table.record is not None else None,
         "names": state.names.all(),
         "listeners": [
             (each.name, tuple(each.address.value), each.interface, each.receive_buffer) for each in program.listeners
@@ -136,7 +137,7 @@ class _Recorder(State):
 
 
 def _plain(argument: object) -> object:
-    """An argument as the head start gets it: (number,) of a symbol, a list of the destinations of a deadman, or itself."""
+    """An argument as the head start gets it: (number,) of a symbol, a list of a deadman's destinations, or itself."""
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), ctypes.string_at(_address_in(each, "datagram"), each.size), each.sent,
@@ -204,17 +205,21 @@ class _Memory:
 
     def _pointers(self, block: Any, address: int) -> Iterator[int]:
         """Where in a block pointers are."""
-        for at, is_certain in _pointers_in(type(block)):
+        for at, is_certain in _pointers_in(cast("Hashable", type(block))):
             if is_certain or address + at in self._references:
                 yield at
 
 
 @cache
 def _pointers_in(kind: Any) -> tuple[tuple[int, bool], ...]:
-    """Where pointers are in a type of C, and whether it is one in any case: a `struct value` may hold something else."""
+    """Where pointers are in a type of C, and whether always: a `struct value` may hold something else there."""
     if issubclass(kind, ctypes.Array):
         size, within = ctypes.sizeof(kind._type_), _pointers_in(kind._type_)
-        return tuple((index * size + at, sure) for index in range(kind._length_ if within else 0) for at, sure in within)
+        return tuple(
+            (begin + at, sure)
+            for begin in (range(0, size * kind._length_, size) if within else ())
+            for at, sure in within
+        )
     if issubclass(kind, ctypes.Structure):
         fields = [(getattr(kind, name).offset, _pointers_in(field)) for name, field, *_ in kind._fields_]
         return tuple((begin + at, sure) for begin, within in fields for at, sure in within)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from router.inputs import Plain
 
 _WORD = 8
-_GENERATION = 1
+GENERATION = 1
 """Of the kept program; that of the first one that is compiled is higher."""
 
 
@@ -50,20 +50,21 @@ class HeadStart:
         self.opened: dict[tuple[str | None, ...], int] = {}
         self.sent: dict[str, list[str]] = {}
         parts: Mapping[str, Any] = kept.parts  # type: ignore[assignment]  # those of carrier/image.py
-        self.forwarding = Forwarding(self.library, parts["names"])
+        self._kept = kept.parts, bytes(kept.image)
+        self.forwarding = Forwarding(self.library, parts["counters"], parts["names"])
         with ExitStack() as undo:
             undo.callback(self._close_sockets)
             self._open_sockets(parts)
             self._open_what_is_kept(parts)
             self._image = _Image(kept.image, parts, self._symbols(parts))
-            self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=_GENERATION)
+            self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=GENERATION)
             self._change = c.Change(program=self._image.at(c.Program, parts["program"]))
             self._change.timers = self._timers(parts, of_topics=False)
             undo.callback(self.forwarding.deadmen.end)
             self._start_deadmen(parts)
             self._fill_listeners(parts)
-            if error := self.forwarding.carrier.try_to_start(self._change):
-                raise OSError(error, "the threads cannot be started")
+            self.forwarding.mirror(parts["mirror_lost"])
+            self.forwarding.carrier.start(self._change, self._image)
             undo.pop_all()
 
     def close(self) -> None:
@@ -74,6 +75,10 @@ class HeadStart:
         self.forwarding.deadmen.end()
         self.forwarding.carrier.close()
         self._close_sockets()
+
+    def is_of(self, parts: object, image: bytes) -> bool:
+        """Whether it runs the program that has these parts and this image."""
+        return self._kept == (parts, image)
 
     def bind_topic(self, topic: str, publisher: int) -> None:
         """Have messages for a topic published by a publisher, before the thread that publishes runs."""
@@ -213,8 +218,16 @@ class Beginning:
         return taken
 
 
-def begin() -> Beginning:
+BEGUN: list[Beginning] = []
+"""What `begin` has begun, at most once in a process."""
+
+
+def begin() -> None:
     """Begin with the kept program of this command line. From then on SIGINT and SIGTERM wait until they are handled."""
+    BEGUN.append(_beginning())
+
+
+def _beginning() -> Beginning:
     kept, why = store.find()
     if kept is None:
         return Beginning(None, why)
