@@ -11,6 +11,9 @@ from contextlib import suppress
 
 __version__ = "0.1.0"
 
+NO_CACHE = "--no-cache"
+"""Of `router run`: without a head start."""
+
 _KEYBOARD_INTERRUPT = 130
 _UNTIL_COLLECTED = 200_000
 """Objects after which Python searches for cycles. With its 700, `validate` spends a fifth of its time on that."""
@@ -22,6 +25,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     hold_signals(arguments)
     if _verb(arguments) != "run":  # which sets up its own process
         gc.set_threshold(_UNTIL_COLLECTED)
+    elif argv is None and NO_CACHE not in arguments:
+        from router.kept.head_start import begin
+
+        begin()
     try:
         from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
     except KeyboardInterrupt:

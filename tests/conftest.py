@@ -31,6 +31,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 _recordings = tempfile.TemporaryDirectory(prefix="recordings-")
 os.environ["RECORDINGS"] = _recordings.name
 
+# Routers keep what they compile.
+_cache = tempfile.TemporaryDirectory(prefix="cache-")
+os.environ["XDG_CACHE_HOME"] = _cache.name
+
 # A shell lets what it starts in the background ignore Ctrl-C, and children inherit that; tests send it to them.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -42,6 +42,15 @@ def imported(script: str) -> set[str]:
                 "router.carrier.carrier", "router.carrier.sender", *GROUND, *NET,
             },
         ),
+        (
+            "import router.kept.head_start",
+            {
+                "router.carrier", "router.carrier.library", "router.carrier.ring", "router.carrier.threads",
+                "router.carrier.carrier", "router.carrier.sender", "router.carrier.deadmen", "router.carrier.deferrals",
+                "router.carrier.forwarding", "router.carrier.names", "router.carrier.state", "router.inputs",
+                "router.kept", "router.kept.store", "router.kept.head_start", *GROUND, *NET,
+            },
+        ),
     ],
 )  # fmt: skip
 def test_what_a_head_start_uses_imports_little(script: str, ours: set[str]) -> None:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
-from mmap import MAP_PRIVATE, mmap
 from typing import cast
 
+from router.carrier.forwarding import MOST_COUNTERS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
 from router.errors import StartError
-
-MOST_COUNTERS = 1 << 18
-"""Counters of each native thread: their addresses stay the same, so they cannot grow."""
 
 
 class ThreadCounts:
@@ -29,17 +25,9 @@ class ThreadCounts:
             self._add(counters.fresh_counts(), None)
         self.gateways, self.events, self.own = self.lists
 
-    @staticmethod
-    def fixed() -> ctypes.Array[ctypes.c_int64]:
-        """Counts of a native thread: they never move, and take memory only where something was counted."""
-        pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
-        return (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)
-
     def add_thread(self, thread: NativeThread) -> None:
-        """Count what a native thread counts in an array that is `fixed`, by copies that balance."""
-        counts = cast("list[int]", thread.counts)  # the array is only indexed and sliced
-        counts[: self.counters.size] = self.counters.fresh_counts()  # no page fault in the thread
-        self._add(counts, thread.counters)
+        """Count what a native thread counts, by copies that balance."""
+        self._add(cast("list[int]", thread.counts), thread.counters)  # the array is only indexed and sliced
 
     def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
         self.counters.grow(counts)

@@ -17,19 +17,17 @@ from time import monotonic, sleep
 from router import declared as c
 from router.app.counts import ThreadCounts
 from router.carrier.boards import NativeBoards
-from router.carrier.carrier import Carrier
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
-from router.carrier.deadmen import Deadmen, NativeDeadman, replaced
+from router.carrier.deadmen import NativeDeadman, replaced
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import EventReader, EventThread
+from router.carrier.forwarding import Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
-from router.carrier.names import Names
 from router.carrier.outlets import Outlets, Publication
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import where_refused, why_rejected
-from router.carrier.ring import Ring
 from router.carrier.ros_routes import NativeFromRos, Subscription, native_from_ros
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
@@ -37,12 +35,10 @@ from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import StartError
+from router.kept.head_start import GENERATION, HeadStart
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
-
-_PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
-"""Bytes that may wait: messages for topics, received datagrams for observers, and events of a thread."""
 
 _PATIENCE_S = 1.0
 """How long a reload waits for a thread that may be stuck in the middleware."""
@@ -89,29 +85,34 @@ class Plane:
     """Receives, forwards, publishes and brakes. `changed` is called with a route and whether its deadman is tripped."""
 
     def __init__(
-        self, library: ctypes.CDLL, counts: ThreadCounts, reporter: Reporter, changed: Callable[[str, bool], None]
+        self,
+        forwarding: Forwarding,
+        counts: ThreadCounts,
+        reporter: Reporter,
+        changed: Callable[[str, bool], None],
+        head_start: HeadStart | None = None,
     ) -> None:
         self.now: Built | None = None
-        """What runs."""
-        self.library = library
+        """What runs, beside a head start."""
+        self.library = library = forwarding.library
         self.counts = counts
-        self._names = Names()
-        self._generations = count(1)
-        self._is_running = self.has_stopped = False
-        self._deadmen = Deadmen(library, *_counts_and_events(library), self._names)
-        self._client_deadmen = ClientDeadmen(library, *_counts_and_events(library), self._names)
-        waiting = Ring(library, _PUBLISHED)
-        self._publishing = PublishThread(library, waiting, *_counts_and_events(library), self._names)
-        self._carrier = Carrier(library, self._deadmen.address, *_counts_and_events(library), waiting)
+        self._head_start = head_start
+        self._forwarding, self._names = forwarding, forwarding.names
+        self._deadmen, self._carrier = forwarding.deadmen, forwarding.carrier
+        self._generations = count(GENERATION + 1)
+        self._is_running, self.has_stopped = head_start is not None, False
+        size = counts.counters.size
+        self._client_deadmen = ClientDeadmen(library, *counts_and_events(library, size), self._names)
+        self._publishing = PublishThread(library, forwarding.published, *counts_and_events(library, size), self._names)
         self._from_ros = [
-            FromRosThread(library, self._deadmen.address, *_counts_and_events(library), is_urgent=is_urgent)
+            FromRosThread(library, self._deadmen.address, *counts_and_events(library, size), is_urgent=is_urgent)
             for is_urgent in (True, False)
         ]
         # The publish thread before the receive thread: what was published was received, so no less than 0 waits.
         threads = self._deadmen, self._client_deadmen, self._publishing, self._carrier, *self._from_ros
         for thread in threads:
             counts.add_thread(thread)
-        self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
+        self._mirrored = MirrorRing(forwarding.mirrored, self._names)
         reader = EventReader(self._names, self._why_rejected, self._where_refused)
         self._events = EventThread(threads, reader, reporter.report, changed, self._pulse)
 
@@ -131,10 +132,18 @@ class Plane:
 
     # a program
 
+    def first_state(self) -> State:
+        """The state of the first program, which takes over what a head start has opened for it."""
+        return State(self.library, opened=self._head_start.opened if self._head_start else None)
+
     def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
-        """Have deadmen send at the start of the router. That needs sockets only: ROS takes seconds to open."""
+        """Have deadmen send at the start of the router, unless they did so in a head start.
+
+        That needs sockets only: ROS takes seconds to open.
+        """
         for plan in program.deadmen:
-            sent_to = self._deadmen.kept(plan, program.counters, senders, state).start(boottime_ns())
+            deadman = self._deadmen.kept(plan, program.counters, senders, state)
+            sent_to = self._head_start.sent[plan.route] if self._head_start else deadman.start(boottime_ns())
             if sent_to:
                 what = "the deadman has sent its payload, since the router starts"
                 logger.info(what, route=plan.route, to=sent_to)
@@ -164,6 +173,9 @@ class Plane:
             plan.route: self._client_deadmen.kept(plan, counters, opened.publications, state)
             for plan in program.client_deadmen
         }
+        if self._head_start is not None:
+            for topic, publication in opened.publications.items():
+                self._head_start.bind_topic(topic, publication.address)
         self._start_threads(program, from_ros, clients)
         return Built(program, state, native, from_ros, adopted, deadmen, clients)
 
@@ -173,7 +185,8 @@ class Plane:
         Deadmen of clients are served from now on: clients may publish before the program runs.
         """
         if program.publishers:
-            self._publishing.start(_functions_of_rcl(self.library))
+            first = self._head_start.topics if self._head_start is not None else None
+            self._publishing.start(_functions_of_rcl(self.library), first)
         for thread in self._from_ros:
             if from_ros.only(urgent=thread.is_urgent).topics:
                 from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
@@ -210,11 +223,14 @@ class Plane:
             topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
             built.native.arrays.keep(topics)
             self._publishing.change(topics)
-            if earlier is None:
+            if not self._is_running:
                 self._carrier.start(change_to(built.native, built.timers(None, of_topics=False)), built.native)
                 self._is_running = True
             undo.pop_all()
-        if earlier is not None:
+        if earlier is None:
+            if self._head_start is not None:  # it keeps the same: nothing ends, and no deadman is replaced
+                self._carrier.change(change_to(built.native, built.timers(None, of_topics=False)), built.native)
+        else:
             for listener in left:
                 listener.end_input()
             deadmen = replaced(built.deadmen, earlier.deadmen)
@@ -239,7 +255,10 @@ class Plane:
         if late:
             logger.error("a thread is stuck, and what it uses stays open", threads=late)
             return False
-        return self._has_turned() and all(thread.has_passed for thread in self._from_ros)
+        if not self._has_turned() or not all(thread.has_passed for thread in self._from_ros):
+            return False
+        self._head_start = None
+        return True
 
     def _has_turned(self) -> bool:
         """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
@@ -261,8 +280,7 @@ class Plane:
 
     def observe(self, *, is_observed: bool) -> None:
         """Begin or cease to keep received datagrams for `take`."""
-        lost = self.counts.counters.index("mirror_dropped")
-        self._carrier.mirror(self._mirrored.ring if is_observed else None, lost)
+        self._forwarding.mirror(self.counts.counters.index("mirror_dropped") if is_observed else None)
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
         """What was received since the last call, as `recording.mirror.Mirrored`. For one thread."""
@@ -320,11 +338,6 @@ class Plane:
         if self.now is None or self.now.native.generation != generation:
             return ""
         return where_refused(self.now.program.lowered, route, topic, target, place)
-
-
-def _counts_and_events(library: ctypes.CDLL) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:
-    """What a native thread counts in, and writes its events to."""
-    return ThreadCounts.fixed(), Ring(library, _EVENTS)
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from router import inputs
+from router.app.keeping import Keeper
 from router.app.memory import drop_idle_code
 from router.app.process import reloading
 from router.app.runtime import Runtime
@@ -13,6 +15,7 @@ from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked, uncollected
 from router.compiler.lookup import Definitions
+from router.compiler.metrics import Counters
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
 from router.log import fault, logger
@@ -28,14 +31,21 @@ _MOST_NAMED = 12
 class Reloader:
     """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `replaced` is called when another program runs, and everything of the one before is closed.
+    `replaced` is called when another program runs, and everything of the one before is closed. `keeper` keeps it.
     """
 
-    def __init__(self, runtime: Runtime, environ: Mapping[str, str] | None, replaced: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        runtime: Runtime,
+        environ: Mapping[str, str] | None,
+        replaced: Callable[[], None],
+        keeper: Keeper | None = None,
+    ) -> None:
         self._runtime = runtime
         self._counts = runtime.plane.counts
         self._environ = environ
         self._replaced = replaced
+        self._keeper = keeper
         self._is_open = False
         self._one_at_a_time = threading.Lock()
         self._remember(is_good=True)  # the first table, before anybody can scrape
@@ -86,7 +96,8 @@ class Reloader:
         """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
         try:
-            checked = self._check(now)
+            with inputs.recording(self._keeper.asked if self._keeper else None) as read:
+                checked = self._check(now)
             findings = checked.diagnostics
             then = checked.program_in(now.counters.continued())
             if then is None:
@@ -107,6 +118,8 @@ class Reloader:
             why = f"{found.event}: {error!r}"
         else:
             self._notify_replaced()
+            if self._keeper is not None:
+                self._keeper.keep(lambda: checked.program_in(Counters()), read)
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
 

@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING
 
 from router import __version__
 from router.app.counts import ThreadCounts
+from router.app.keeping import Keeper
 from router.app.plane import Plane
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
+from router.carrier.forwarding import Forwarding
 from router.carrier.library import load
 from router.clock import boottime_ns
 from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
+from router.kept.head_start import HeadStart
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
@@ -50,20 +53,29 @@ class Router:
 
     Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, such as `["--ros-args", "-r",
     "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
+    `head_start` runs the same program already, and is taken over; `keeper` keeps what a reload compiles.
     """
 
     def __init__(
-        self, program: Program, ros_args: Sequence[str] = (), environ: Mapping[str, str] | None = None
+        self,
+        program: Program,
+        ros_args: Sequence[str] = (),
+        environ: Mapping[str, str] | None = None,
+        head_start: HeadStart | None = None,
+        keeper: Keeper | None = None,
     ) -> None:
         self.is_ready = False
         self._first = program
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
-        plane = Plane(load(), self._counts, self._reporter, self._deadman_changed)
+        forwarding = head_start.forwarding if head_start else Forwarding(load(), program.counters.size)
+        plane = Plane(forwarding, self._counts, self._reporter, self._deadman_changed, head_start)
         self.mirror = Mirror(plane, self._reporter.failed)
         self._runtime = Runtime(plane, self._reporter, ros_args)
+        if head_start is not None:
+            self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
         self._services = Services(self)
-        self._reloader = Reloader(self._runtime, environ, self._watch)
+        self._reloader = Reloader(self._runtime, environ, self._watch, keeper)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._collector: tuple[Program, CountersCollector] | None = None

@@ -117,7 +117,7 @@ class Runtime:
             undo.callback(sockets.opened.close)
             self._counts.make_room(program.counters)
             now = self.plane.now
-            state = State(self.plane.library, now.state if now else None)
+            state = State(self.plane.library, now.state) if now else self.plane.first_state()
             if now is None:
                 self.plane.start_deadmen(program, sockets.senders, state)
             topics = self._prepare_topics(program, undo)

@@ -125,6 +125,17 @@ class Sockets:
         self._senders: dict[str, tuple[_Destination, NativeSender]] = {}
         self._drops = drops
 
+    def take_over(
+        self, program: Program, listening: Mapping[str, ListeningSocket], senders: Mapping[str, NativeSender]
+    ) -> None:
+        """Own what a head start has opened for a program."""
+        plans = {plan.name: plan for plan in program.listeners}
+        self.listeners = {name: Listener(plans[name], opened=opened) for name, opened in listening.items()}
+        self._bound = {plans[name].bound_to: listener for name, listener in self.listeners.items()}
+        self._senders = {to.name: (_destination(to), senders[to.name]) for to in program.senders}
+        for name, listener in self.listeners.items():
+            self._drops.follow(name, listener.kernel_drops)
+
     def prepare(self, program: Program) -> SocketChange:
         """Open the sockets of `program` that are not open yet. Raises StartError or OSError, with nothing changed."""
         with ExitStack() as opening:

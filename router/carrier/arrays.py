@@ -19,6 +19,8 @@ class Arrays:
     """
 
     blocks: list[Any] = field(default_factory=list)
+    references: list[int] = field(default_factory=list)
+    """Addresses of words that hold a pointer, where the type of C does not say so."""
     _kept: list[object] = field(default_factory=list)
 
     def add(self, made: T) -> T:
@@ -41,8 +43,10 @@ class Arrays:
     def include(self, others: Arrays) -> None:
         """Own all that others own."""
         self.blocks += others.blocks
+        self.references += others.references
         self._kept += others._kept
 
     def clear(self) -> None:
         self.blocks.clear()
+        self.references.clear()
         self._kept.clear()

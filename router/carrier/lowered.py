@@ -77,6 +77,7 @@ def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) 
     for to, value in zip(made, values, strict=True):
         if isinstance(value, bytes):
             to.bytes, to.size = arrays.text(value), len(value)
+            arrays.references.append(ctypes.addressof(to))
         elif isinstance(value, float):
             to.real = value
         else:

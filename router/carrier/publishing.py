@@ -29,14 +29,21 @@ class PublishThread(NativeThread):
         self.ring = ring
         self._names = names
 
-    def start(self, functions: tuple[int, int, int]) -> None:
+    def start(self, functions: tuple[int, int, int], first: c.PublishChange | None = None) -> None:
         """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
 
+        `first` is a change of which messages wait already; it stays the caller's until its generation has passed.
         Raises StartError for a lack of memory, descriptors or threads.
         """
         if self._address:
             return
-        arguments = self.ring.address, self.counts, self.events.address, *functions
+        arguments = (
+            self.ring.address,
+            self.counts,
+            self.events.address,
+            *functions,
+            ctypes.byref(first) if first else None,
+        )
         self._address = int(self._library.publish_open(*arguments) or 0)
         if not self._address:
             raise StartError("the thread that publishes cannot be started")

@@ -17,10 +17,15 @@ class State:
 
     A program's state takes over from that of the `previous` program what has the same key: then both programs use the
     same object, whichever of them runs. A key therefore has to contain everything that its object depends on.
+
+    That of the first program takes over what a head start has opened for it, by place.
     """
 
-    def __init__(self, library: ctypes.CDLL, previous: State | None = None) -> None:
+    def __init__(
+        self, library: ctypes.CDLL, previous: State | None = None, *, opened: dict[Place, int] | None = None
+    ) -> None:
         self._library = library
+        self._opened = {} if opened is None else opened
         self._previous: dict[Hashable, object] = previous._kept if previous else {}
         self._kept: dict[Hashable, object] = {}
 
@@ -35,11 +40,10 @@ class State:
 
         `place` names it within its program, and is the key together with `rest`.
         """
-        return self.keep((place, rest), lambda: wrap(self.opened(place, function, *arguments)))
+        return self.keep((place, rest), lambda: wrap(self._open(place, function, *arguments)))
 
-    def opened(self, place: Place, function: str, *arguments: object) -> int:
-        """Call a function of the library that opens something, and return the address. Raises MemoryError."""
-        return opened(self._library, function, *arguments)
+    def _open(self, place: Place, function: str, *arguments: object) -> int:
+        return self._opened.pop(place, 0) or opened(self._library, function, *arguments)
 
     def forget_previous(self) -> None:
         self._previous = {}

@@ -34,7 +34,7 @@ class TargetStates:
     adopted: list[Adoption] = field(default_factory=list)
     _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan], Sources]] = field(default_factory=list)
     _collects: list[tuple[c.Targets, c.Collect, RoutePlan]] = field(default_factory=list)
-    _bound: Arrays = field(default_factory=Arrays)
+    bound: Arrays = field(default_factory=Arrays)
 
     def add(
         self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan], sources: Sources
@@ -49,7 +49,7 @@ class TargetStates:
     def release(self) -> None:
         """Let go of the state. No message may come before `bind`."""
         self.adopted.clear()
-        self._bound.clear()
+        self.bound.clear()
 
     def bind(self, outlets: Outlets) -> None:
         """Have all targets refer to other state, that of `outlets`."""
@@ -73,19 +73,19 @@ class TargetStates:
                 native.limits = self._by_place(limits)
             if target.deadmen:
                 feeds = outlets.feeds(plan, target)
-                native.feeds, native.feed_count = self._bound.array(c.Feed, feeds), len(feeds)
+                native.feeds, native.feed_count = self.bound.array(c.Feed, feeds), len(feeds)
 
     def _bind_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
         collector = outlets.collector(plan)
         collect.collector = collector.address
-        self._bound.keep(collector)
+        self.bound.keep(collector)
         self.adopted.append(Adoption(collector.address, True, ctypes.addressof(made)))
 
     def _by_place(self, opened: Mapping[int, Native]) -> Any:
-        made = self._bound.add((ctypes.c_void_p * (max(opened) + 1))())
+        made = self.bound.add((ctypes.c_void_p * (max(opened) + 1))())
         for place, each in opened.items():
             made[place] = each.address
-            self._bound.keep(each)
+            self.bound.keep(each)
         return made
 
 

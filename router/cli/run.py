@@ -9,17 +9,22 @@ import argparse
 import signal
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-from router import inputs
+from router import NO_CACHE, inputs
 from router.app import Router, tune_interpreter
+from router.app.keeping import Keeper
 from router.app.process import supervised
+from router.carrier.image import image_of
+from router.carrier.library import library
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, good_table, table_path
 from router.compiler.check import uncollected
 from router.compiler.program import Program
 from router.errors import UsageError
+from router.kept.head_start import BEGUN, Beginning, HeadStart
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log, logger
 from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
@@ -46,6 +51,11 @@ def add_parser(subparsers: Subparsers) -> None:
         "--log-level", choices=LOG_LEVELS, default="info", help="least that is logged (default: %(default)s)"
     )
     parser.add_argument(
+        NO_CACHE,
+        action="store_true",
+        help="compile the table before anything runs; keep nothing for the next start",
+    )
+    parser.add_argument(
         "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARG", help="everything from here on is for ROS"
     )
 
@@ -53,13 +63,45 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
-    parameters = ros_parameters(args.ros_args)
-    environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
-    with uncollected():  # until the router has started
-        program = good_table(_table(args, parameters.get(ROUTES_PATH)), environ)[1]  # a reload can free the rest
+    with ExitStack() as ending, uncollected():  # until the router has started
+        begun = BEGUN[0] if BEGUN else None
+        head_start = _begun(begun)
+        if head_start is not None:
+            ending.callback(head_start.close)
+        with inputs.noted() as asked:
+            parameters = ros_parameters(args.ros_args)
+            environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
+            table = _table(args, parameters.get(ROUTES_PATH))
+        with inputs.recording(asked) as read:
+            program = good_table(table, environ)[1]  # a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.asked))
-        route(program, args.ros_args, environ)
+        if head_start is not None and not _is_of(head_start, program, read):
+            logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
+            ending.close()
+            head_start = None
+        ending.pop_all()  # the router closes it
+        keeper = (
+            Keeper(library(), asked, head_start.inputs if head_start is not None else None)
+            if begun is not None
+            else None
+        )
+        route(program, args.ros_args, environ, head_start, keeper, read)
     return OK
+
+
+def _begun(begun: Beginning | None) -> HeadStart | None:
+    """The head start, if there is one. Log whether there is, and if a kept program is not used, why."""
+    head_start = begun.take() if begun is not None else None
+    if head_start is not None:
+        logger.info("forwarding by the kept program, while the table is compiled", listening=[*head_start.listening])
+    elif begun is not None and begun.why:
+        logger.warning("the kept program is not used: the table is compiled first", why=begun.why)
+    return head_start
+
+
+def _is_of(head_start: HeadStart, program: Program, read: inputs.Inputs) -> bool:
+    """Whether a head start runs a program that was just compiled."""
+    return head_start.inputs == read.plain() and head_start.is_of(*image_of(library(), program))
 
 
 def _table(args: argparse.Namespace, parameter: str | None) -> Path:
@@ -72,13 +114,22 @@ def _table(args: argparse.Namespace, parameter: str | None) -> Path:
     return typed or Path(parameter)
 
 
-def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str]) -> None:
-    """Run a program until SIGINT or SIGTERM. Raises StartError."""
+def route(
+    program: Program,
+    ros_args: Sequence[str],
+    environ: Mapping[str, str],
+    head_start: HeadStart | None = None,
+    keeper: Keeper | None = None,
+    read: inputs.Inputs | None = None,
+) -> None:
+    """Run a program until SIGINT or SIGTERM, and keep it, which was made of what was `read`. Raises StartError."""
     ending = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
-    with Router(program, ["--ros-args", *ros_args], environ) as router:
+    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper) as router:
         tune_interpreter()
         _show_places(router)
+        if keeper is not None and read is not None:
+            keeper.keep(lambda: program, read)
         with supervised(router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:

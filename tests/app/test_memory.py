@@ -17,8 +17,8 @@ import pytest
 from grpc_tools import _protoc_compiler
 
 from router.app import Router
-from router.app.counts import MOST_COUNTERS, ThreadCounts
 from router.app.memory import Mapping, read_only
+from router.carrier.forwarding import MOST_COUNTERS, counts_and_events
 from router.carrier.library import load
 from router.carrier.ring import Ring
 from tests.app.conftest import Site
@@ -37,7 +37,7 @@ def pages_in_memory(array: ctypes.Array[Any]) -> int:
 
 
 def test_counters_that_no_table_has_take_no_memory() -> None:
-    counts = ThreadCounts.fixed()
+    counts, _ = counts_and_events(load(), 1)
     assert len(counts) == MOST_COUNTERS
     counts[0] += 1
     counts[MOST_COUNTERS - 1] += 1

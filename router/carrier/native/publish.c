@@ -139,10 +139,12 @@ static void publish_close(struct publish_thread *thread) {
 
 /* All but the thread itself. NULL for lack of memory. */
 static struct publish_thread *publish_prepare(struct ring *ring, counter *counters, struct ring *events,
-                                              publish_function *publish, error_function *error, reset_function *reset) {
+                                              publish_function *publish, error_function *error, reset_function *reset,
+                                              struct publish_change *first) {
     struct publish_thread *thread = calloc(1, sizeof *thread);
     if (!thread) return NULL;
     thread->ring = ring;
+    thread->changes = first;
     thread->publishing.publish = publish;
     thread->publishing.error = error;
     thread->publishing.reset = reset;
@@ -157,8 +159,8 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
 }
 
 struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
-                                    error_function *error, reset_function *reset) {
-    struct publish_thread *thread = publish_prepare(ring, counters, events, publish, error, reset);
+                                    error_function *error, reset_function *reset, struct publish_change *first) {
+    struct publish_thread *thread = publish_prepare(ring, counters, events, publish, error, reset, first);
     if (!thread || !thread_start(&thread->thread, "publish", run, thread)) return thread;
     publish_close(thread);
     return NULL;

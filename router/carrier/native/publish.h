@@ -13,10 +13,13 @@
 
 struct publish_thread;
 
-/* Start a thread that serves what comes into `ring`, which are messages for topics. It counts in
- * `counters`, and losses go to `events`. NULL for lack of memory, descriptors or threads. */
+struct publish_change;
+
+/* Start a thread that serves what comes into `ring`, which are messages for topics. It counts in `counters`, and losses go
+ * to `events`. `first` is a change of which messages wait in the ring already, or NULL. NULL for lack of memory,
+ * descriptors or threads. */
 struct publish_thread *publish_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
-                                    error_function *error, reset_function *reset);
+                                    error_function *error, reset_function *reset, struct publish_change *first);
 
 /* What a generation changes in the timers of messages that the thread keeps. Belongs to the caller until it has reached it. */
 struct publish_change {

@@ -1,0 +1,53 @@
+"""Keeps what was compiled for the head start of the next process."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from router.compiler.program import Program
+from router.log import fault, logger
+from router.threads import DaemonThread
+
+if TYPE_CHECKING:
+    from router.inputs import Inputs, Plain
+
+
+class Keeper:
+    """Keeps programs, in a thread of its own. `asked` is what was read to know which table to compile.
+
+    `kept` are the inputs of the program that is kept already, if one is.
+    """
+
+    def __init__(self, library: ctypes.CDLL, asked: Inputs, kept: Plain | None = None) -> None:
+        self.asked = asked
+        self._library = library
+        self._kept = kept
+        self._thread = DaemonThread("keep")
+        self._has_failed = False
+
+    def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
+        """Begin to keep a program that was made of what was read, with counters of its own."""
+        if read.plain() != self._kept:
+            self._thread.submit(self._keep, program, read.plain())
+
+    def close(self) -> None:
+        """What is not kept yet is not kept."""
+        self._thread.shutdown()
+
+    def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
+        from router.carrier.image import image_of
+        from router.kept import store
+
+        try:
+            if (compiled := program()) is not None:
+                store.write(read, *image_of(self._library, compiled))
+        except OSError as error:
+            if not self._has_failed:
+                logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
+            self._has_failed = True
+        except Exception as error:  # noqa: BLE001 - a bug, which is logged: the router runs all the same
+            fault(error, "kept it from keeping the compiled program").log()
+        else:
+            self._kept = read
