@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from router.carrier.image import image_of
+from router.carrier.library import library
 from router.compiler import check, check_table
 from tests.tables import ROUTES
 
@@ -38,7 +40,7 @@ def test_collection_goes_on_after_a_mistake_of_ours(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("name", ["rover", "sim", "legacy"])
 def test_every_process_makes_the_same_program(name: str) -> None:
-    """The order of sets differs among processes."""
+    """Also the same image of it, byte for byte. The order of sets differs among processes."""
     made = [
         subprocess.run(
             [sys.executable, "-m", __name__, ROUTES / f"{name}.yaml"],
@@ -73,3 +75,4 @@ if __name__ == "__main__":
         plain([checked.diagnostics, [*program.counters.series()], program.lowered, program.inbound, program.outbound])
     )
     print(plain([program.senders, program.publishers, program.subscriptions, program.deadmen, program.boards]))
+    print(*image_of(library(), program))
