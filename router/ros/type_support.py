@@ -120,9 +120,12 @@ def _snake_case(name: str) -> str:
 
 
 def _described(capsule: object) -> Iterator[tuple[str, Definition]]:
-    """Yield the definitions of the type and those in it, by name."""
+    """Yield the definitions of the type and those in it, by name; nothing where it does not describe itself."""
     address = _capsule_pointer(capsule, _capsule_name(capsule))
-    description = _TypeSupport.from_address(address).description(address).contents
+    describe = _TypeSupport.from_address(address).description
+    if not describe:
+        return
+    description = describe(address).contents
     for found in (description.type, *description.referenced.data[: description.referenced.size]):
         fields = [(str(field.name), _spelled(field.type)) for field in found.fields.data[: found.fields.size]]
         yield str(found.name), tuple(field for field in fields if field[0] != _OF_EMPTY)
