@@ -215,7 +215,8 @@ static void open_stage(struct round *stage) {
     stage->carrier = carrier_open(stage->timers, stage->received, stage->rejections, stage->messages);
     stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
     check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
-    stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget);
+    stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget,
+                                     NULL);
     check(stage->publishing, "the thread starts");
 }
 
