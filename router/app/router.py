@@ -53,7 +53,7 @@ class Router:
 
     Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, such as `["--ros-args", "-r",
     "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
-    `head_start` runs the same program already, and is taken over; `keeper` keeps what a reload compiles.
+    `head_start` runs the same program already, and is taken over; `keeper` keeps what runs for the next start.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class Router:
         if head_start is not None:
             self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
         self._services = Services(self)
+        self._keeper = keeper
         self._reloader = Reloader(self._runtime, environ, self._watch, keeper)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
@@ -111,6 +112,8 @@ class Router:
             published=len(program.publishers),
             subscribed=len(program.subscriptions),
         )
+        if self._keeper is not None:
+            self._keeper.keep(lambda: self._first, self._keeper.read)
         return self
 
     def __exit__(

@@ -80,12 +80,9 @@ def run(args: argparse.Namespace) -> int:
             ending.close()
             head_start = None
         ending.pop_all()  # the router closes it
-        keeper = (
-            Keeper(library(), asked, head_start.inputs if head_start is not None else None)
-            if begun is not None
-            else None
-        )
-        route(program, args.ros_args, environ, head_start, keeper, read)
+        kept = head_start.inputs if head_start is not None else None
+        keeper = Keeper(library(), asked, read, kept) if begun is not None else None
+        route(program, args.ros_args, environ, head_start, keeper)
     return OK
 
 
@@ -120,16 +117,13 @@ def route(
     environ: Mapping[str, str],
     head_start: HeadStart | None = None,
     keeper: Keeper | None = None,
-    read: inputs.Inputs | None = None,
 ) -> None:
-    """Run a program until SIGINT or SIGTERM, and keep it, which was made of what was `read`. Raises StartError."""
+    """Run a program until SIGINT or SIGTERM. Raises StartError."""
     ending = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
     with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper) as router:
         tune_interpreter()
         _show_places(router)
-        if keeper is not None and read is not None:
-            keeper.keep(lambda: program, read)
         with supervised(router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
