@@ -104,7 +104,7 @@ def _begun(begun: Beginning | None) -> HeadStart | None:
     if head_start is not None:
         logger.info("forwarding by the kept program, while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
-        logger.warning("the kept program is not used: the table is compiled first", why=begun.why)
+        logger.info("the kept program is not used: the table is compiled first", why=begun.why)
     return head_start
 
 
