@@ -88,14 +88,15 @@ def _compile_and_route(
         with inputs.recording(asked) as read:
             program = good_table(table, environ)[1]  # a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.asked))
+        start = "kept" if head_start is not None else "refused" if begun is not None and begun.why else "compiled"
         if head_start is not None and not _is_of(head_start, program, read):
             logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
             ending.close()
-            head_start = None
+            head_start, start = None, "replaced"
         ending.pop_all()  # the router closes it
         kept = head_start.inputs if head_start is not None else None
         keeper = Keeper(library(), asked, read, kept) if begun is not None else None
-        route(program, args.ros_args, environ, head_start, keeper)
+        route(program, args.ros_args, environ, head_start, keeper, start)
 
 
 def _begun(begun: Beginning | None) -> HeadStart | None:
@@ -132,14 +133,15 @@ def route(
     environ: Mapping[str, str],
     head_start: HeadStart | None = None,
     keeper: Keeper | None = None,
+    start: str = "compiled",
 ) -> None:
-    """Run a program until SIGINT or SIGTERM. Raises StartError."""
+    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError."""
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
 
     ending = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
-    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper) as router:
+    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start) as router:
         tune_interpreter()
         _show_places(router)
         with supervised(router.feed_watchdog):
