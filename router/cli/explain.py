@@ -23,9 +23,9 @@ _DESCRIPTION = """Show where a route's messages come from and go, what each targ
 mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
 with their places in the table, and with --given what each target gets of one payload. Of a gateway, show what it sends
 how often, and what it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or
-with --live of all that there are. Without a name, say at the end which compiled programs of this table 'router run' has kept
-for its next start, and whether a start with these variables uses them. With --diff, say what one table does otherwise
-than another, and nothing else."""
+with --live of all that there are. Without a name, say at the end which compiled programs of this table 'router run' has
+kept for its next start, and whether a start with these variables uses them. With --diff, say what one table does
+otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -105,7 +105,7 @@ def _kept(table: Path) -> Iterator[str]:
 
     try:
         folder = store.folder()
-        files = [*store.every()] if os.path.isdir(folder) else []
+        files = [*store.every()] if Path(folder).is_dir() else []
     except OSError as error:
         yield f"kept programs cannot be read: {error}"
         return

@@ -101,11 +101,14 @@ def _compile_and_route(
 
 def _begun(begun: Beginning | None) -> HeadStart | None:
     """The head start, if there is one. Log whether there is, and if a kept program is not used, why."""
+    from router.kept.store import CHANGED
+
     head_start = begun.take() if begun is not None else None
     if head_start is not None:
         logger.info("forwarding by the kept program, while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
-        logger.info("the kept program is not used: the table is compiled first", why=begun.why)
+        log = logger.info if begun.why.endswith(CHANGED) else logger.warning
+        log("the kept program is not used: the table is compiled first", why=begun.why)
     return head_start
 
 

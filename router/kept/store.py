@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     Identity: TypeAlias = tuple[tuple[str, ...], str, str]
     """Command line, folder and Python."""
 
+CHANGED = " has changed"
+"""The end of the reason where a table or another input was edited, which is no fault."""
+
 _MOST = 4
 """Files that are kept."""
 _ENDING = ".program"
@@ -93,7 +96,7 @@ def _judged(path: str) -> tuple[Kept | None, str]:
     except _UnusableError as error:
         return None, str(error)
     change = inputs.changed(kept.inputs)
-    return kept, f"{change} has changed" if change else ""
+    return kept, f"{change}{CHANGED}" if change else ""
 
 
 def write(read: Plain, parts: object, image: bytes) -> None:
