@@ -24,6 +24,7 @@ from router.compiler.metrics import (
     RECORD_DROP_REASONS,
     REJECT_REASONS,
     RELOAD_RESULTS,
+    STARTS,
     TOPIC_STATES,
 )
 from router.errors import Code
@@ -115,7 +116,7 @@ def metrics_page() -> str:
         name = f"router_{metric.name}_total" if kind == "counter" else f"router_{metric.name}"
         lines.append(f"| `{name}` | {kind} | {', '.join(metric.exported_labels)} | {metric.help} |")
     lines += [
-        "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
+        "| `router_build_info` | gauge | version, table_sha256, protos_sha256, start | Always 1: what is running. |",
         "",
         fill(_COUNTERS, WIDTH),
         "",
@@ -134,12 +135,13 @@ def metrics_page() -> str:
         *_reasons("router_messages_dropped_total", GATEWAY_DROP_REASONS),
         *_reasons("router_client_messages_dropped_total", CLIENT_DROP_REASONS),
         *_reasons("router_gateway_topics", TOPIC_STATES, "state"),
-        "## Recordings and reloads",
+        "## Recordings, reloads and starts",
         "",
         fill(_OWN, WIDTH),
         "",
         *_reasons("router_record_dropped_total", RECORD_DROP_REASONS),
         *_reasons("router_config_reloads_total", RELOAD_RESULTS, "result"),
+        *_reasons("router_build_info", STARTS, "start"),
         "## Log and time",
         "",
         fill(_LOG, WIDTH),

@@ -32,6 +32,8 @@ _ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
 _CODE = (".py", ".so", ".json", ".html", ".xml")
 _OF_ROS = ("AMENT_", "RMW_", "ROS_")
 _UNSTEADY = "changed while it was read"
+_HAS_FOLDER_OF_COMMAND = not (sys.flags.isolated or getattr(sys.flags, "safe_path", False))
+"""Whether the first of `sys.path` is that folder. It follows from command line and folder, and differs among verbs."""
 
 
 class Inputs:
@@ -237,11 +239,11 @@ def _process() -> Mapping[str, object]:
 
     packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
     return {
-        "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path)),
+        "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path[_HAS_FOLDER_OF_COMMAND:])),
         "the router's C library": CHECKSUM,
         "the router's code": tuple(sorted(each for place in (_PACKAGE, *_SCHEMAS) for each in _stamps(place))),
-        "the variables of ROS": tuple(sorted(each for each in os.environ.items() if each[0].startswith(_OF_ROS))),
-        "the installed packages": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
+        "a variable of ROS": tuple(sorted(each for each in os.environ.items() if each[0].startswith(_OF_ROS))),
+        "an installed package": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
     }
 
 
@@ -277,9 +279,9 @@ _PROBES: Mapping[str, Callable[[str], object]] = {
 _WORDS: Mapping[str, str] = {
     "file": "the file {}",
     "kind": "the file {}",
-    "folder": "the files in the folder {}",
+    "folder": "the folder {}",
     "link": "where the path {} leads",
     "variable": "the variable {}",
-    "names": "the variables that there are",
+    "names": "the set of variables",
     "process": "{}",
 }

@@ -115,9 +115,9 @@ EDITS: dict[str, tuple[Callable[[], object], str]] = {
     "a link to the same files": (link_elsewhere, "protos"),
     "a variable": (lambda: os.environ.update(PORT="5001"), "PORT"),
     "a variable that is empty": (lambda: os.environ.update(PORT=""), "PORT"),
-    "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "the variables of ROS"),
-    "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "the variables of ROS"),
-    "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "the variables of ROS"),
+    "the search path": (lambda: os.environ.update(AMENT_PREFIX_PATH=f"{Path.cwd()}/under"), "a variable of ROS"),
+    "a variable of ROS": (lambda: os.environ.update(ROS_DISTRO="kilted"), "a variable of ROS"),
+    "another middleware": (lambda: os.environ.update(RMW_IMPLEMENTATION="rmw_zenoh_cpp"), "a variable of ROS"),
     "a folder in place of a file": (folder_instead, "base.yaml"),
     "a pipe in place of a file": (
         pipe_instead,

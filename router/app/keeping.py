@@ -15,13 +15,15 @@ if TYPE_CHECKING:
 
 
 class Keeper:
-    """Keeps programs, in a thread of its own. `asked` is what was read to know which table to compile.
+    """Keeps programs, in a thread of its own.
 
-    `kept` are the inputs of the program that is kept already, if one is.
+    `asked` is what was read to know which table to compile, `read` what the first program was made of, and `kept` are
+    the inputs of the program that is kept already, if one is.
     """
 
-    def __init__(self, library: ctypes.CDLL, asked: Inputs, kept: Plain | None = None) -> None:
+    def __init__(self, library: ctypes.CDLL, asked: Inputs, read: Inputs, kept: Plain | None) -> None:
         self.asked = asked
+        self.read = read
         self._library = library
         self._kept = kept
         self._thread = DaemonThread("keep")
@@ -31,10 +33,6 @@ class Keeper:
         """Begin to keep a program that was made of what was read, with counters of its own."""
         if read.plain() != self._kept:
             self._thread.submit(self._keep, program, read.plain())
-
-    def close(self) -> None:
-        """What is not kept yet is not kept."""
-        self._thread.shutdown()
 
     def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
         from router.carrier.image import image_of

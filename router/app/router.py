@@ -53,7 +53,8 @@ class Router:
 
     Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, such as `["--ros-args", "-r",
     "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
-    `head_start` runs the same program already, and is taken over; `keeper` keeps what a reload compiles.
+    `head_start` runs the same program already, and is taken over; `keeper` keeps what runs for the next start. `start`
+    is one of STARTS.
     """
 
     def __init__(
@@ -63,9 +64,11 @@ class Router:
         environ: Mapping[str, str] | None = None,
         head_start: HeadStart | None = None,
         keeper: Keeper | None = None,
+        start: str = "compiled",
     ) -> None:
         self.is_ready = False
         self._first = program
+        self._start = start
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
         forwarding = head_start.forwarding if head_start else Forwarding(load(), program.counters.size)
@@ -75,6 +78,7 @@ class Router:
         if head_start is not None:
             self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
         self._services = Services(self)
+        self._keeper = keeper
         self._reloader = Reloader(self._runtime, environ, self._watch, keeper)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
@@ -111,6 +115,8 @@ class Router:
             published=len(program.publishers),
             subscribed=len(program.subscriptions),
         )
+        if self._keeper is not None:
+            self._keeper.keep(lambda: self._first, self._keeper.read)
         return self
 
     def __exit__(
@@ -227,6 +233,7 @@ class Router:
             "version": __version__,
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
+            "start": self._start,
         }
         # Of this program, whose counters are there before those of the running one are adopted, once nothing is stuck.
         copies = partial(self._counts.copies, program.counters.size)

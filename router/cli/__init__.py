@@ -19,6 +19,7 @@ from typing import NoReturn, TextIO, TypeAlias
 
 from router import __version__
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
+from router.log import ADDRESS_SPACE, address_space  # here, as nothing can be imported once memory is short
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -170,8 +171,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             what = f"router {_verb(arguments)}: router/declared.py was not made of the present headers"
             print(with_help(what, "run 'make setup'"), file=sys.stderr)
             return BAD_TABLE
-        from router.ros.environment import ADDRESS_SPACE, address_space
-
         # Each of them may say that memory could not be had.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
+import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +23,9 @@ _DESCRIPTION = """Show where a route's messages come from and go, what each targ
 mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
 with their places in the table, and with --given what each target gets of one payload. Of a gateway, show what it sends
 how often, and what it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or
-with --live of all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
+with --live of all that there are. Without a name, say at the end which compiled programs of this table 'router run' has
+kept for its next start, and whether a start with these variables uses them. With --diff, say what one table does
+otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -87,7 +94,39 @@ def _explain(args: argparse.Namespace) -> int:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
             print(*ignored_gateway(ignored[name]), sep="\n", end="\n\n")
+    if not args.names:
+        print(*_kept(path), sep="\n")
     return OK
+
+
+def _kept(table: Path) -> Iterator[str]:
+    """What `router run` has kept that was made of this table, also by one that extends it."""
+    from router.kept import store
+
+    try:
+        folder = store.folder()
+        files = [*store.every()] if Path(folder).is_dir() else []
+    except OSError as error:
+        yield f"kept programs cannot be read: {error}"
+        return
+    real, is_any = os.path.realpath(table), False
+    for path, kept, why in files:
+        if kept is None:
+            yield f"{path} is no kept program that a start can use: {why}"
+        elif any(kind == "file" and os.path.realpath(name) == real for kind, name, _ in kept.inputs):
+            is_any = True
+            command, where, python = kept.identity
+            since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(kept.written))
+            yield f"kept for: {shlex.join(command)}"
+            yield f"  in {where}, since {since}"
+            if python != sys.executable:
+                yield f"  of another Python, {python}, whose `router explain` says whether a start uses it"
+            elif why:
+                yield f"  a start does not use it: {why}"
+            else:
+                yield "  a start uses it"
+    if not is_any:
+        yield f"nothing of this table is kept in {folder}: a start compiles it first"
 
 
 def _diff(old: Path, new: Path) -> int:

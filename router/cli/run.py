@@ -11,25 +11,22 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from router import NO_CACHE, inputs
-from router.app import Router, tune_interpreter
-from router.app.keeping import Keeper
-from router.app.process import supervised
-from router.carrier.image import image_of
-from router.carrier.library import library
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, good_table, table_path
-from router.compiler.check import uncollected
-from router.compiler.program import Program
 from router.errors import UsageError
-from router.kept.head_start import BEGUN, Beginning, HeadStart
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log, logger
-from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
-from router.table.model import Gateway, Transport
-from router.tools.udp import reachable
+
+if TYPE_CHECKING:
+    from router.app import Router
+    from router.app.keeping import Keeper
+    from router.compiler.program import Program
+    from router.kept.head_start import Beginning, HeadStart
+    from router.table.model import Gateway
 
 _DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router
 reload'). SIGUSR1: save the last datagrams, where the table keeps them ('record').
@@ -61,56 +58,75 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from router.kept.head_start import BEGUN
+
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
-    with ExitStack() as ending, uncollected():  # until the router has started
-        begun = BEGUN[0] if BEGUN else None
+    begun = BEGUN[0] if BEGUN else None
+    with ExitStack() as ending:
         head_start = _begun(begun)
         if head_start is not None:
             ending.callback(head_start.close)
+        _compile_and_route(args, begun, head_start, ending)
+    return OK
+
+
+def _compile_and_route(
+    args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
+) -> None:
+    """`ending` closes the head start, until the router has it."""
+    from router.app.keeping import Keeper
+    from router.carrier.library import library
+    from router.compiler.check import uncollected
+    from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
+
+    with uncollected():  # until the router has started
         with inputs.noted() as asked:
             parameters = ros_parameters(args.ros_args)
             environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
-            table = _table(args, parameters.get(ROUTES_PATH))
+            table = _table(args, ROUTES_PATH, parameters.get(ROUTES_PATH))
         with inputs.recording(asked) as read:
             program = good_table(table, environ)[1]  # a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.asked))
+        start = "kept" if head_start is not None else "refused" if begun is not None and begun.why else "compiled"
         if head_start is not None and not _is_of(head_start, program, read):
             logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
             ending.close()
-            head_start = None
+            head_start, start = None, "replaced"
         ending.pop_all()  # the router closes it
-        keeper = (
-            Keeper(library(), asked, head_start.inputs if head_start is not None else None)
-            if begun is not None
-            else None
-        )
-        route(program, args.ros_args, environ, head_start, keeper, read)
-    return OK
+        kept = head_start.inputs if head_start is not None else None
+        keeper = Keeper(library(), asked, read, kept) if begun is not None else None
+        route(program, args.ros_args, environ, head_start, keeper, start)
 
 
 def _begun(begun: Beginning | None) -> HeadStart | None:
     """The head start, if there is one. Log whether there is, and if a kept program is not used, why."""
+    from router.kept.store import CHANGED
+
     head_start = begun.take() if begun is not None else None
     if head_start is not None:
         logger.info("forwarding by the kept program, while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
-        logger.warning("the kept program is not used: the table is compiled first", why=begun.why)
+        log = logger.info if begun.why.endswith(CHANGED) else logger.warning
+        log("the kept program is not used: the table is compiled first", why=begun.why)
     return head_start
 
 
 def _is_of(head_start: HeadStart, program: Program, read: inputs.Inputs) -> bool:
     """Whether a head start runs a program that was just compiled."""
+    from router.carrier.image import image_of
+    from router.carrier.library import library
+
     return head_start.inputs == read.plain() and head_start.is_of(*image_of(library(), program))
 
 
-def _table(args: argparse.Namespace, parameter: str | None) -> Path:
-    """Raises UsageError. A parameter is relative to the working directory, as TABLE."""
+def _table(args: argparse.Namespace, name: str, parameter: str | None) -> Path:
+    """Raises UsageError. The parameter of this name is relative to the working directory, as TABLE."""
     if not parameter:
         return table_path(args)
     typed: Path | None = args.subject or args.table
     if typed is not None and inputs.real_path(table_path(args)) != inputs.real_path(parameter):
-        raise UsageError(f"TABLE is {typed}, {ROUTES_PATH} is {parameter}", "name one table")
+        raise UsageError(f"TABLE is {typed}, {name} is {parameter}", "name one table")
     return typed or Path(parameter)
 
 
@@ -120,16 +136,17 @@ def route(
     environ: Mapping[str, str],
     head_start: HeadStart | None = None,
     keeper: Keeper | None = None,
-    read: inputs.Inputs | None = None,
+    start: str = "compiled",
 ) -> None:
-    """Run a program until SIGINT or SIGTERM, and keep it, which was made of what was `read`. Raises StartError."""
+    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError."""
+    from router.app import Router, tune_interpreter
+    from router.app.process import supervised
+
     ending = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
-    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper) as router:
+    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start) as router:
         tune_interpreter()
         _show_places(router)
-        if keeper is not None and read is not None:
-            keeper.keep(lambda: program, read)
         with supervised(router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
@@ -148,6 +165,8 @@ def _show_places(router: Router) -> None:
 
 
 def _places(router: Router) -> Iterator[tuple[str, str]]:
+    from router.tools.udp import reachable
+
     table = router.program.table
     if router.metrics_address is not None:
         yield "status page", f"http://{reachable(router.metrics_address)}/"
@@ -158,6 +177,9 @@ def _places(router: Router) -> Iterator[tuple[str, str]]:
 
 
 def _place(gateway: Gateway) -> str:
+    from router.table.model import Transport
+    from router.tools.udp import reachable
+
     if gateway.zenoh is not None:
         return f"zenoh://{gateway.zenoh.key.value}"
     assert gateway.address is not None  # noqa: S101 - all but Zenoh have one

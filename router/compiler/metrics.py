@@ -182,6 +182,14 @@ RELOAD_RESULTS: Mapping[str, str] = {
 }
 """What became of a reload, with what each means. Unless it is ok, the old table goes on."""
 
+STARTS: Mapping[str, str] = {
+    "kept": "it forwarded by a kept program while the table was compiled",
+    "compiled": "nothing was kept for this command line, or it has `--no-cache`: the table was compiled first",
+    "refused": "a kept program was not used, and the log says why: the table was compiled first",
+    "replaced": "it forwarded by a kept program, which ended when an input was found to have changed meanwhile",
+}
+"""How a router started, with what each means."""
+
 CLIENTS = "clients"
 """The `target` and `source` label of a gateway's clients."""
 

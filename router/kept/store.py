@@ -21,7 +21,16 @@ from router import inputs
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import TypeAlias
+
     from router.inputs import Plain
+
+    Identity: TypeAlias = tuple[tuple[str, ...], str, str]
+    """Command line, folder and Python."""
+
+CHANGED = " has changed"
+"""The end of the reason where a table or another input was edited, which is no fault."""
 
 _MOST = 4
 """Files that are kept."""
@@ -38,12 +47,14 @@ _CHECKSUM = struct.Struct("<I")
 
 
 class Kept:
-    """What is in a file that is whole and whose inputs are unchanged.
+    """What is in a file that is whole. `written`: when, s of the wall clock.
 
     `parts` are plain values. `image` is memory of this process alone, writable, and begins at a page.
     """
 
-    def __init__(self, read: Plain, parts: object, image: mmap.mmap) -> None:
+    def __init__(self, identity: Identity, written: float, read: Plain, parts: object, image: mmap.mmap) -> None:
+        self.identity = identity
+        self.written = written
         self.inputs = read
         self.parts = parts
         self.image = image
@@ -53,19 +64,39 @@ class _UnusableError(Exception):
     """The text says why a file is not used."""
 
 
+_OF_ANOTHER = "it is of another command line, folder or Python"
+
+
 def find() -> tuple[Kept | None, str]:
     """What is kept for this command line, folder and Python; else why it is not used, or "" if nothing is kept."""
     try:
-        kept = _read(_path())
-        if change := inputs.changed(kept.inputs):
-            return None, f"{change} has changed"
+        kept, why = _judged(_path(_identity()))
+        if kept is not None and kept.identity != _identity():
+            return None, _OF_ANOTHER
     except FileNotFoundError:
         return None, ""
-    except _UnusableError as error:
-        return None, str(error)
     except Exception as error:  # noqa: BLE001 - whatever it is, the router starts without the file
         return None, f"it cannot be read: {error!r}"
-    return kept, ""
+    return (None, why) if why else (kept, "")
+
+
+def every() -> Iterator[tuple[str, Kept | None, str]]:
+    """The path of each file, what is in it if it is whole, and why a start does not use it, or ""; newest first.
+
+    Raises OSError.
+    """
+    for _, path in sorted(_files(folder(), _ENDING), reverse=True):
+        yield path, *_judged(path)
+
+
+def _judged(path: str) -> tuple[Kept | None, str]:
+    """What is in a file if it is whole, and why a start does not use it, or "". Raises OSError."""
+    try:
+        kept = _read(path)
+    except _UnusableError as error:
+        return None, str(error)
+    change = inputs.changed(kept.inputs)
+    return kept, f"{change}{CHANGED}" if change else ""
 
 
 def write(read: Plain, parts: object, image: bytes) -> None:
@@ -75,13 +106,13 @@ def write(read: Plain, parts: object, image: bytes) -> None:
     """
     if change := inputs.changed(read):
         raise OSError(f"{change} has changed meanwhile")
-    path = _path()
-    folder = os.path.dirname(path)
-    os.makedirs(folder, mode=0o700, exist_ok=True)
-    if os.stat(folder).st_uid != os.geteuid():
-        raise PermissionError(errno.EPERM, "the folder belongs to another user", folder)
-    os.chmod(folder, 0o700)
-    _remove_unfinished(folder)
+    path = _path(_identity())
+    place = os.path.dirname(path)
+    os.makedirs(place, mode=0o700, exist_ok=True)
+    if os.stat(place).st_uid != os.geteuid():
+        raise PermissionError(errno.EPERM, "the folder belongs to another user", place)
+    os.chmod(place, 0o700)
+    _remove_unfinished(place)
     values = marshal.dumps((_identity(), read, parts))  # type: ignore[arg-type]  # which are plain
     head = _HEAD.pack(_MAGIC, _FORMAT, sys.hexversion, len(values), len(image))
     unfinished = f"{path}.{os.getpid()}-{time.monotonic_ns()}{_UNFINISHED}"
@@ -96,16 +127,17 @@ def write(read: Plain, parts: object, image: bytes) -> None:
         with suppress(OSError):
             os.unlink(unfinished)
         raise
-    _remove_oldest(folder, path)
+    _remove_oldest(place, path)
 
 
-def _path() -> str:
-    """The file for this command line, folder and Python. Raises OSError where there is no place for it."""
-    return os.path.join(_folder(), f"{zlib.crc32(marshal.dumps(_identity())):08x}{_ENDING}")
+def _path(identity: Identity) -> str:
+    """The file for a command line, folder and Python. Raises OSError where there is no place for it."""
+    command, *others = identity
+    return os.path.join(folder(), f"{zlib.crc32(os.fsencode(chr(0).join([*command, *others]))):08x}{_ENDING}")
 
 
-def _folder() -> str:
-    """The service's state directory, or the user's cache."""
+def folder() -> str:
+    """Where the files are: in the service's state directory, or the user's cache. Raises OSError where neither is."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if os.path.isabs(state):
         return os.path.join(state, "kept")
@@ -117,7 +149,7 @@ def _folder() -> str:
     return os.path.join(cache, "rover-router")
 
 
-def _identity() -> tuple[tuple[str, ...], str, str]:
+def _identity() -> Identity:
     return tuple(sys.argv), os.getcwd(), sys.executable
 
 
@@ -142,16 +174,19 @@ def _read(path: str) -> Kept:
             raise _UnusableError("it is no ordinary file")
         _check_owner(status, "it")
         _check_owner(os.stat(os.path.dirname(path)), "its folder")
-        return _parsed(descriptor, status.st_size)
+        kept = _parsed(descriptor, status)
     finally:
         os.close(descriptor)
+    if _path(kept.identity) != path:
+        raise _UnusableError(_OF_ANOTHER)
+    return kept
 
 
-def _parsed(descriptor: int, size: int) -> Kept:
+def _parsed(descriptor: int, status: os.stat_result) -> Kept:
     """What is in an open file. Raises _UnusableError."""
     with open(descriptor, "rb", buffering=0, closefd=False) as stream:
         head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
-        values_size, image_size = _sizes(head, size)
+        values_size, image_size = _sizes(head, status.st_size)
         values = bytearray(values_size)
         image = mmap.mmap(-1, max(image_size, 1), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with memoryview(image) as whole, whole[:image_size] as view:
@@ -160,9 +195,7 @@ def _parsed(descriptor: int, size: int) -> Kept:
     if not is_whole:
         raise _UnusableError("it is damaged")
     identity, read, parts = marshal.loads(values)  # noqa: S302 - this user's Python wrote it
-    if identity != _identity():
-        raise _UnusableError("it is of another command line, folder or Python")
-    return Kept(read, parts, image)
+    return Kept(identity, status.st_mtime, read, parts, image)
 
 
 def _check_owner(status: os.stat_result, what: str) -> None:
@@ -188,26 +221,26 @@ def _sizes(head: bytes, size: int) -> tuple[int, int]:
     return values, image
 
 
-def _remove_unfinished(folder: str) -> None:
+def _remove_unfinished(place: str) -> None:
     """Remove what processes have left that ended while they wrote."""
     now = time.time()
-    for written, path in _files(folder, _UNFINISHED):
+    for written, path in _files(place, _UNFINISHED):
         if abs(now - written) > _STALE:
             with suppress(OSError):
                 os.unlink(path)
 
 
-def _remove_oldest(folder: str, newest: str) -> None:
-    others = sorted((each for each in _files(folder, _ENDING) if each[1] != newest), reverse=True)
+def _remove_oldest(place: str, newest: str) -> None:
+    others = sorted((each for each in _files(place, _ENDING) if each[1] != newest), reverse=True)
     for _, path in others[_MOST - 1 :]:
         with suppress(OSError):
             os.unlink(path)
 
 
-def _files(folder: str, ending: str) -> list[tuple[float, str]]:
+def _files(place: str, ending: str) -> list[tuple[float, str]]:
     """When each file was written, and its path."""
     found = []
-    for entry in os.scandir(folder):
+    for entry in os.scandir(place):
         if entry.name.endswith(ending):
             with suppress(OSError):
                 found.append((entry.stat(follow_symlinks=False).st_mtime, entry.path))

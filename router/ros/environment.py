@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from router.assets import asset, is_installed
 from router.errors import StartError
+from router.log import ADDRESS_SPACE, address_space
 
 LAST_DOMAIN = 232
 """The highest domain for which DDS has port numbers."""
@@ -23,9 +23,6 @@ _TRACING = 8 << 10
 """Bytes there that the tracing library of ROS writes to while it is loaded."""
 _FAST_DDS = 1 << 20
 """Bytes there for a participant's segment and ports: 652 KiB, in full pages. With less, messages are lost silently."""
-
-ADDRESS_SPACE = 1 << 30
-"""Bytes that a router with a few topics maps, of which it uses a tenth; without ROS a fifth of that is enough."""
 
 
 def check_environment(environ: Mapping[str, str]) -> None:
@@ -93,12 +90,6 @@ def uses_shared_memory(environ: Mapping[str, str]) -> bool:
     transports = environ.get("FASTDDS_BUILTIN_TRANSPORTS") or "DEFAULT"
     is_fast_dds = (environ.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
     return is_fast_dds and not transports.startswith(("UDP", "TCP", "NONE"))
-
-
-def address_space() -> int | None:
-    """Bytes that this process may map (`ulimit -v`), or None."""
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def _middlewares(environ: Mapping[str, str]) -> set[str]:

@@ -25,6 +25,8 @@ LAUNCH = 'n=3; for fd in $FDS; do eval "exec $n<&$fd $fd<&-"; n=$((n + 1)); done
 class ServiceManager:
     """`told` are the lines that the routers have sent it, all of them. Its sockets are as rover-router.socket says."""
 
+    module = "router"
+
     def __init__(self, folder: Path, table: Path, *addresses: tuple[str, int], **environment: str) -> None:
         self._folder = folder
         self._table = table
@@ -50,7 +52,7 @@ class ServiceManager:
             "LISTEN_FDS": str(len(descriptors)),
             "LISTEN_FDNAMES": ":".join(["rover-router.socket"] * len(descriptors)),
         }
-        router = (sys.executable, "-m", "router", "run", str(self._table))
+        router = (sys.executable, "-m", self.module, "run", str(self._table))
         with self._log.open("a") as log:
             self.process = subprocess.Popen(
                 ["/bin/bash", "-c", LAUNCH, "launch", *router],

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.payloads import WIRE, sample
-from tests.acceptance.site import BARE, RouterProcess, Site, key, site, total, udp
+from tests.acceptance.site import BARE, RouterProcess, Site, key, site, total, udp, wait_until
 from tests.ports import free_port
 
 TABLE = (
@@ -121,6 +121,7 @@ def test_a_router_that_cannot_reach_the_board_starts_all_the_same(tmp_path: Path
     table.write_text(text.replace("127.0.0.1:", "0.0.0.0:").replace("127.0.0.5:", "0.0.0.0:"))
     router = RouterProcess(tmp_path, table, within=ALONE)
     with router:
+        wait_until(lambda: bool(router.events("the deadman could not send")), "the report")
         [lost] = router.events("the deadman could not send")
         assert (lost["route"], lost["target"], lost["reason"]) == ("manual_drive", "driving_board", "send_error")
         assert router.events(SENT) == []
@@ -131,6 +132,7 @@ def test_that_nobody_listens_yet_is_no_loss_of_the_first_command(place: Site) ->
     address = place.endpoints["driving_board"].getsockname()
     place.endpoints["driving_board"].close()
     with RouterProcess(place.folder, table) as router, udp(*address) as board:
+        wait_until(lambda: bool(router.events("the deadman could not send")), "the report")
         [lost] = router.events("the deadman could not send")
         assert (lost["route"], lost["target"]) == ("manual_drive", "driving_board")
         place.send("basestation", DRIVE)

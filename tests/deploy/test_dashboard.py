@@ -16,7 +16,7 @@ UNITS = {"mps", "Bps", "s", "bytes", "percentunit", "short", "none"}
 """Ids of Grafana's units: messages and bytes per second, seconds, bytes, a share of 1."""
 
 OF_THE_PROCESS = {"process_start_time_seconds", "process_cpu_seconds_total", "process_resident_memory_bytes"}
-BUILD_LABELS = {"version", "table_sha256", "protos_sha256"}
+BUILD_LABELS = {"version", "table_sha256", "protos_sha256", "start"}
 BY_PROMETHEUS = {"instance", "job"}
 
 

@@ -353,7 +353,7 @@ def test_the_service_keeps_them_in_its_state_and_users_in_their_cache(
 ) -> None:
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert store._folder() == folder
+    assert store.folder() == folder
 
 
 def test_without_a_place_nothing_is_found_and_nothing_written(monkeypatch: pytest.MonkeyPatch) -> None:

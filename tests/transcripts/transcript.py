@@ -71,8 +71,9 @@ def folder(path: Path) -> Iterator[None]:
         shutil.copytree(BAD_TABLES / part, path / "bad_tables" / part)
     before = Path.cwd()
     places = (path, *assets._PLACES)
-    with patch.dict(os.environ, _ENVIRONMENT), patch.object(assets, "_PLACES", places):
-        for name in ("ROUTER_TABLE", "RECORDINGS"):
+    environment = {**_ENVIRONMENT, "XDG_CACHE_HOME": f"{path}/cache"}
+    with patch.dict(os.environ, environment), patch.object(assets, "_PLACES", places):
+        for name in ("ROUTER_TABLE", "RECORDINGS", "STATE_DIRECTORY"):
             os.environ.pop(name, None)
         os.chdir(path)
         try:
