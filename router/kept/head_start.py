@@ -230,7 +230,7 @@ def begin() -> None:
 
 def _beginning() -> Beginning:
     kept, why = store.find()
-    if kept is None:
+    if kept is None or (why := store.count_try()):
         return Beginning(None, why)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
