@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 __version__ = "0.1.0"
 
@@ -23,21 +23,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     hold_signals(arguments)
-    if _verb(arguments) != "run":  # which sets up its own process
-        gc.set_threshold(_UNTIL_COLLECTED)
-    elif argv is None and NO_CACHE not in arguments:
-        from router.kept.head_start import begin
+    _open_what_is_closed()
+    with ExitStack() as ending:
+        try:
+            if _verb(arguments) != "run":  # which sets up its own process
+                gc.set_threshold(_UNTIL_COLLECTED)
+            elif argv is None and NO_CACHE not in arguments:
+                from router.kept.head_start import begin
 
-        begin()
-    try:
-        from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
-    except KeyboardInterrupt:
-        return _KEYBOARD_INTERRUPT
-    code = run_verb(arguments)
+                ending.callback(begin().close)  # where the verb fails before it has taken the head start
+            from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
+        except KeyboardInterrupt:
+            return _KEYBOARD_INTERRUPT
+        code = run_verb(arguments)
     if argv is None and _verb(arguments) == "run":
         _exit(code)
     gc.freeze()  # all that is left goes with the process, which would search it for cycles several times
     return code
+
+
+def _open_what_is_closed() -> None:
+    """A standard stream that our caller has closed leads nowhere; its number would be the next socket's otherwise."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: PTH123, SIM115 - for as long as we run
 
 
 def _exit(code: int) -> None:

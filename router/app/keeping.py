@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
+from router.kept import store
 from router.log import fault, logger
 from router.threads import DaemonThread
 
@@ -30,13 +31,14 @@ class Keeper:
         self._has_failed = False
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
-        """Begin to keep a program that was made of what was read, with counters of its own."""
+        """Begin to keep a program that runs, and was made of what was read, with counters of its own."""
         if read.plain() != self._kept:
             self._thread.submit(self._keep, program, read.plain())
+        else:
+            self._thread.submit(store.works)
 
     def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
         from router.carrier.image import image_of
-        from router.kept import store
 
         try:
             if (compiled := program()) is not None:

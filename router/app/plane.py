@@ -125,6 +125,10 @@ class Plane:
         """The topics in whose publishers native threads are now, each with seconds."""
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
+    def tell(self) -> None:
+        """Begin to report events, and that Python is alive. Whoever is told of them is complete by now."""
+        self._events.start()
+
     def _pulse(self) -> None:
         self._carrier.pulse()
         for thread in self._from_ros:
@@ -173,7 +177,7 @@ class Plane:
             plan.route: self._client_deadmen.kept(plan, counters, opened.publications, state)
             for plan in program.client_deadmen
         }
-        if self._head_start is not None:
+        if self._head_start is not None and self.now is None:
             for topic, publication in opened.publications.items():
                 self._head_start.bind_topic(topic, publication.address)
         self._start_threads(program, from_ros, clients)

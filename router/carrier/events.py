@@ -112,23 +112,27 @@ class EventThread:
         """By thread and counter: how much of it was reported, and the last report."""
         self._wakes = [thread.events.watch() for thread in threads]
         self._thread = Thread(self._run, "carrier events")
+
+    def start(self) -> None:
+        """Begin with what has been told by now, as by a head start."""
         self._thread.start()
 
     def close(self) -> None:
         """Read what has been told, and end."""
         self._stopping = True
         os.eventfd_write(self._wakes[0], 1)
-        join_or_leave(self._thread)
+        if self._thread.ident is not None:
+            join_or_leave(self._thread)
 
     def _run(self) -> None:
         poll = select.poll()
         for wake in self._wakes:
             poll.register(wake, select.POLLIN)
         while not self._stopping:
-            for wake, _ in poll.poll(_PULSE_MS):
-                os.eventfd_read(wake)
             self._pulse()
             self._read()
+            for wake, _ in poll.poll(_PULSE_MS):
+                os.eventfd_read(wake)
         self._read()
 
     def _read(self) -> None:

@@ -148,7 +148,6 @@ def with_help(what: str, hint: str = "") -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for the network."""
     arguments = sys.argv[1:] if argv is None else list(argv)
-    _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for terminals without Unicode
@@ -194,13 +193,6 @@ def _leave(*streams: TextIO) -> None:
 def _verb(arguments: Sequence[str]) -> str | None:
     """The first argument, unless it is an option: those before a verb do without one."""
     return arguments[0] if arguments and not arguments[0].startswith("-") else None
-
-
-def _open_what_is_closed() -> None:
-    """A standard stream that our caller has closed leads nowhere; its number would be the next socket's otherwise."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 - for as long as we run
 
 
 def _run(arguments: Sequence[str]) -> int:

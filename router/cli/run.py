@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 def _compile_and_route(
     args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
 ) -> None:
-    """`ending` closes the head start, until the router has it."""
+    """`ending` closes the head start, until `route` does."""
     from router.app.keeping import Keeper
     from router.carrier.library import library
     from router.compiler.check import uncollected
@@ -93,9 +93,9 @@ def _compile_and_route(
             logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
             ending.close()
             head_start, start = None, "replaced"
-        ending.pop_all()  # the router closes it
         kept = head_start.inputs if head_start is not None else None
         keeper = Keeper(library(), asked, read, kept) if begun is not None else None
+        ending.pop_all()
         route(program, args.ros_args, environ, head_start, keeper, start)
 
 
@@ -138,13 +138,21 @@ def route(
     keeper: Keeper | None = None,
     start: str = "compiled",
 ) -> None:
-    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError."""
+    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError.
+
+    The head start is closed in any case.
+    """
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
 
     ending = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
-    with Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start) as router:
+    with ExitStack() as unowned:
+        if head_start is not None:
+            unowned.callback(head_start.close)
+        router = Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start)
+        unowned.pop_all()  # the router closes it
+    with router:
         tune_interpreter()
         _show_places(router)
         with supervised(router.feed_watchdog):

@@ -54,6 +54,7 @@ class HeadStart:
         self.forwarding = Forwarding(self.library, parts["counters"], parts["names"])
         with ExitStack() as undo:
             undo.callback(self._close_sockets)
+            undo.callback(self.forwarding.carrier.close)
             self._open_sockets(parts)
             self._open_what_is_kept(parts)
             self._image = _Image(kept.image, parts, self._symbols(parts))
@@ -218,19 +219,25 @@ class Beginning:
         taken, self.head_start = self.head_start, None
         return taken
 
+    def close(self) -> None:
+        """Close the head start, unless it was taken."""
+        if (left := self.take()) is not None:
+            left.close()
+
 
 BEGUN: list[Beginning] = []
 """What `begin` has begun, at most once in a process."""
 
 
-def begin() -> None:
+def begin() -> Beginning:
     """Begin with the kept program of this command line. From then on SIGINT and SIGTERM wait until they are handled."""
     BEGUN.append(_beginning())
+    return BEGUN[0]
 
 
 def _beginning() -> Beginning:
     kept, why = store.find()
-    if kept is None:
+    if kept is None or (why := store.count_try()):
         return Beginning(None, why)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:

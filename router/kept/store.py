@@ -36,8 +36,11 @@ _MOST = 4
 """Files that are kept."""
 _ENDING = ".program"
 _UNFINISHED = ".new"
+_TRIES = ".tries"
+_MOST_TRIES = 15
+"""Starts with a file, one soon after the other, of which none came to its end; systemd allows 20."""
 _STALE = 60.0
-"""Seconds after which an unfinished file is one that nobody writes any longer."""
+"""Seconds after which an unfinished file is one that nobody writes any longer, and tries are forgotten."""
 
 _MAGIC = b"rover router kept program\n"
 _FORMAT = 1
@@ -127,7 +130,31 @@ def write(read: Plain, parts: object, image: bytes) -> None:
         with suppress(OSError):
             os.unlink(unfinished)
         raise
+    works()
     _remove_oldest(place, path)
+
+
+def count_try() -> str:
+    """Count a start with what is kept. Return why there is none: it may be what ended the process each time."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    with suppress(OSError):  # where nothing can be written, nothing is counted
+        descriptor = os.open(_path(_identity()) + _TRIES, flags, 0o600)
+        try:
+            status = os.fstat(descriptor)
+            if abs(time.time() - status.st_mtime) > _STALE:
+                os.ftruncate(descriptor, 0)
+            elif status.st_size >= _MOST_TRIES:
+                return f"the last {_MOST_TRIES} routers that began with it did not start"
+            os.write(descriptor, b".")
+        finally:
+            os.close(descriptor)
+    return ""
+
+
+def works() -> None:
+    """Forget the tries: a router has started with what is kept."""
+    with suppress(OSError):
+        os.unlink(_path(_identity()) + _TRIES)
 
 
 def _path(identity: Identity) -> str:
@@ -233,8 +260,9 @@ def _remove_unfinished(place: str) -> None:
 def _remove_oldest(place: str, newest: str) -> None:
     others = sorted((each for each in _files(place, _ENDING) if each[1] != newest), reverse=True)
     for _, path in others[_MOST - 1 :]:
-        with suppress(OSError):
-            os.unlink(path)
+        for each in (path, path + _TRIES):
+            with suppress(OSError):
+                os.unlink(each)
 
 
 def _files(place: str, ending: str) -> list[tuple[float, str]]:

@@ -134,6 +134,10 @@ class Rover:
         folder = self.folder / "state" / "kept"
         return sorted(folder.glob("*.program"))
 
+    def tries(self) -> list[Path]:
+        """What counts the starts with a kept program that have not come to their end."""
+        return sorted(self.folder.glob("state/kept/*.tries"))
+
     def keep(self, **environment: str) -> None:
         """Starts a router and kills it once its program is kept. What it sent is received."""
         before = self._versions()
@@ -512,7 +516,6 @@ def test_a_file_that_is_not_as_it_was_written_is_not_used(kept: Rover, damage: C
             assert not kept.is_served
             router.started()
             [told] = router.events("the kept program is not used: the table is compiled first")
-            assert told["level"] == "warning"
             assert told["why"]
             assert kept.heard() == BRAKE
     finally:
@@ -524,6 +527,26 @@ def test_a_file_that_is_not_as_it_was_written_is_not_used(kept: Rover, damage: C
         (path.parent.parent / "aside").unlink(missing_ok=True)
         kept.site.waiting()
     assert_used(kept)
+
+
+def test_a_file_with_which_routers_die_is_used_no_more_until_one_has_started(rover: Rover) -> None:
+    rover.keep()
+    used, has_ended = 0, False
+    while not has_ended:
+        with rover.router(gated=True) as router:
+            if rover.is_served:
+                used += 1
+                continue
+            router.started()
+            assert len(router.events("the kept program is not used: the table is compiled first")) == 1
+            wait_until(lambda: not rover.tries(), "the kept program")
+            has_ended = True
+    assert 0 < used < 20  # as often as systemd tries
+    with rover.router(gated=True) as router:
+        assert rover.is_served
+        assert rover.tries()
+        router.started()
+        wait_until(lambda: not rover.tries(), "the end of trying")
 
 
 def test_a_file_of_another_table_in_its_place_is_not_used(kept: Rover, tmp_path: Path) -> None:
@@ -554,6 +577,8 @@ def test_a_folder_that_cannot_be_written_to_costs_a_line_and_no_more(rover: Rove
 
 def assert_used(rover: Rover) -> None:
     """So that the test before has not only shown that nothing is ever used."""
+    for path in rover.tries():  # tests have many in a minute
+        path.unlink()
     with rover.router(gated=True):
         assert rover.is_served
         assert rover.heard() == BRAKE

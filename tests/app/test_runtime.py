@@ -322,6 +322,7 @@ def test_metrics_are_served_while_it_runs(site: Site) -> None:
     [build] = [labels for name, *labels in samples if name == "router_build_info"]
     assert router.program.table.sha256 in build
     assert router.program.protos_sha256 in build
+    assert "compiled" in build
 
 
 def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

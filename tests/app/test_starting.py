@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
+import urllib.request
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from itertools import dropwhile
@@ -20,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from router.ros.environment import SHM, obstacles, uses_shared_memory
+from tests.acceptance.site import wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS, ROUTES
 
@@ -162,6 +164,46 @@ def test_the_log_says_where_to_look(table: Path) -> None:
     assert places["status page"] == f"http://{pages['http']}/"
     assert places["Foxglove"] == f"ws://{pages['foxglove']}"
     end(process)
+
+
+def test_the_metrics_say_how_it_started(table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    address = f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+    table.write_text(f'http: {{address: "{address}"}}\n{table.read_text()}')
+    folder = tmp_path / "halting"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(HALTING)
+
+    def started(*arguments: str, edit: str = "") -> str:
+        """How a start ends whose table is edited when its head start, if it has one, has begun."""
+        process = start(MODULE, "run", table, *arguments, path=str(folder))
+        assert process.stdin
+        assert process.stdout
+        assert process.stdout.readline() == "importing\n"
+        table.write_text(table.read_text() + edit)
+        process.stdin.write("\n")
+        process.stdin.flush()
+        wait_for_start(process)
+        with urllib.request.urlopen(f"http://{address}/metrics", timeout=10) as answer:
+            [how] = re.findall(r'^router_build_info{.*start="(\w+)"', answer.read().decode(), re.MULTILINE)
+        wait_until(lambda: "--no-cache" in arguments or how_explained() == "  a start uses it", "a kept program")
+        end(process)
+        return str(how)
+
+    def how_explained() -> str:
+        environment = {**os.environ, "PYTHONPATH": f"{folder}:{ROOT}"}
+        command = [sys.executable, *MODULE, "explain", "-t", str(table)]
+        said = subprocess.check_output(command, env=environment, stdin=subprocess.DEVNULL, text=True)
+        return said.splitlines()[-1]
+
+    assert started("--no-cache") == "compiled"
+    assert started() == "compiled"
+    assert started() == "kept"
+    assert started(edit="# a comment\n") == "replaced"
+    table.write_text(f"{table.read_text()}# another one\n")
+    assert started() == "refused"
+    assert started() == "kept"
 
 
 def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> None:

@@ -236,6 +236,28 @@ def test_a_program_whose_inputs_changed_since_they_were_read_is_not_kept(
     only(cache)
 
 
+def test_one_that_no_router_has_started_with_is_tried_a_few_times_a_minute(cache: Path) -> None:
+    why = f"the last {store._MOST_TRIES} routers that began with it did not start"
+
+    def try_too_often() -> None:
+        assert [store.count_try() for _ in range(store._MOST_TRIES + 2)] == [*[""] * store._MOST_TRIES, why, why]
+
+    keep()
+    path = only(cache)
+    try_too_often()
+    store.works()
+    try_too_often()
+    os.utime(f"{path}{store._TRIES}", (0, 0))
+    try_too_often()
+    keep()
+    assert only(cache) == path
+
+
+def test_where_nothing_can_be_written_tries_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/sys")
+    assert {store.count_try() for _ in range(store._MOST_TRIES + 1)} == {""}
+
+
 def test_at_most_four_are_kept_and_the_oldest_go(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths: list[Path] = []
     for number in range(6):

@@ -1,0 +1,145 @@
+"""A head start in this process, by the image of a program that was compiled here, and how a router takes it over."""
+
+from __future__ import annotations
+
+import marshal
+import os
+import subprocess
+import sys
+import time
+from mmap import mmap
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from router.app import Router
+from router.app import router as whole
+from router.app.runtime import Runtime
+from router.carrier import events
+from router.carrier.image import image_of
+from router.carrier.library import library
+from router.cli import run
+from router.compiler.program import Program
+from router.kept import head_start as beginnings
+from router.kept.head_start import Beginning, HeadStart
+from router.kept.store import Kept
+from tests.acceptance.site import wait_until
+from tests.app.conftest import BRAKE, DRIVE, Site, site
+
+__all__ = ["site"]
+
+DRIVING = """\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman: {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 1h}
+"""
+TRIPPED = "commands stopped coming: the deadman sends in their place"
+ROOT = Path(__file__).parents[2]
+
+
+def head_start(program: Program) -> HeadStart:
+    parts, image = image_of(library(), program)
+    memory = mmap(-1, len(image))
+    memory[:] = image
+    return HeadStart(Kept(((), "", ""), 0.0, (), marshal.loads(marshal.dumps(parts)), memory))  # noqa: S302 - written here
+
+
+def test_a_deadman_that_trips_while_the_router_is_made_is_told_once_it_is_complete(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = site.program(DRIVING)
+    begun = head_start(program)
+    assert site.basestation.recv(1000) == BRAKE
+
+    class Slow(Runtime):
+        def __init__(self, *arguments: object) -> None:
+            site.send(DRIVE)
+            assert [site.basestation.recv(1000) for _ in range(2)] == [DRIVE, BRAKE]
+            time.sleep(0.1)  # for a thread that would tell it now
+            super().__init__(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(whole, "Runtime", Slow)
+    with capture_logs() as logged, Router(program, head_start=begun):
+        wait_until(lambda: TRIPPED in [entry["event"] for entry in logged], "the report")
+
+
+def test_what_was_told_before_the_router_was_made_is_read_at_once(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "_PULSE_MS", 3_600_000)
+    program = site.program(DRIVING)
+    begun = head_start(program)
+    assert site.basestation.recv(1000) == BRAKE
+    site.send(DRIVE)
+    assert [site.basestation.recv(1000) for _ in range(2)] == [DRIVE, BRAKE]
+    time.sleep(0.1)  # it is told after it was sent
+    with capture_logs() as logged, Router(program, head_start=begun) as router:
+        wait_until(lambda: TRIPPED in [entry["event"] for entry in logged], "the report")
+        assert router.total("deadman_trips") == 1
+
+
+def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = site.program(DRIVING.replace("20ms", "1h"))
+    begun = head_start(program)
+    assert site.basestation.recv(1000) == BRAKE
+    site.send(DRIVE)
+    assert site.basestation.recv(1000) == DRIVE
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(whole, "Plane", fail)
+    with pytest.raises(MemoryError):
+        run.route(program, [], os.environ, begun)
+    assert site.basestation.recv(1000) == BRAKE
+
+
+def test_what_fails_before_the_verb_runs_leaves_the_board_halted(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    import router
+
+    program = site.program(DRIVING.replace("20ms", "1h"))
+    begun = head_start(program)
+    assert site.basestation.recv(1000) == BRAKE
+    site.send(DRIVE)
+    assert site.basestation.recv(1000) == DRIVE
+    monkeypatch.setattr(beginnings, "begin", lambda: Beginning(begun))
+    monkeypatch.setattr(sys, "argv", ["router", "run"])
+    monkeypatch.setitem(sys.modules, "router.cli", None)
+    with pytest.raises(ImportError):
+        router.main()
+    assert site.basestation.recv(1000) == BRAKE
+
+
+def test_sockets_of_a_head_start_are_no_standard_streams() -> None:
+    script = """\
+import os, sys
+from router.kept import head_start
+def begin():
+    os.write(1, os.readlink("/proc/self/fd/2").encode())
+    raise KeyboardInterrupt
+head_start.begin = begin
+sys.argv = ["router", "run"]
+import router
+sys.exit(router.main())
+"""
+    command = ["sh", "-c", f"exec {sys.executable} -c '{script.replace(chr(39), '')}' 2>&-"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, os.devnull)
+
+
+def test_topics_of_a_head_start_are_bound_once(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While messages of the head start wait, a reload that fails closes the publishers that it has opened."""
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    topic = """\
+  ph_info:
+    source: sensor_board
+    topics:
+      - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
+"""
+    program = site.program(topic)
+    begun, bound = head_start(program), []
+    monkeypatch.setattr(begun, "bind_topic", lambda *arguments: bound.append(arguments))
+    with Router(program, head_start=begun) as router:
+        site.write(topic.replace("queue_depth: 10", "queue_depth: 11"))
+        assert router.reload().ok
+    assert len(bound) == 1
