@@ -164,6 +164,22 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
     assert all(of_image.received[name] for name in ("driving_board", "basestation", "tool"))
 
 
+def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    path, ports = table(tmp_path)
+    checked = check_table(path)
+    assert checked.program
+    begun = head_start(checked.program)
+    assert {kind for kind, *_ in begun.opened} == {"deadman", "limit", "pacer", "deferral", "collect"}
+    with Router(checked.program, head_start=begun) as router, udp(SOURCES["tool"], ports["tool"]) as tool:
+        assert begun.opened == {}
+        assert router.reload().ok
+        datagram = sample("ph_info", _filled(WIRE.envelope.cases["ph_info"])).datagram
+        with udp(SOURCES["basestation"], ports["basestation"]) as basestation:
+            tool.sendto(datagram, (LISTENERS["exact"], ports["exact"]))
+            assert basestation.recv(2000) == datagram
+
+
 def _has_received(carrier: Carrier, program: Program, datagrams: int) -> bool:
     counts = carrier.counters(program.counters.size)
     return datagrams <= sum(counts[at] for series, at in program.counters.series() if series.metric == _RECEIVED)
