@@ -284,10 +284,14 @@ def test_a_start_after_the_socket_was_stopped_too_begins_with_nothing(running: M
 
 def test_a_killed_router_comes_back(running: Machine) -> None:
     before = running.show("MainPID")
+    running.wait_for("ls /var/lib/rover-router/kept/*.program")
     running.shell("systemctl kill --signal=KILL --kill-whom=main rover-router")
     running.wait_for(
         f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
     )
+    assert 'start="kept"' in running.shell(f"{METRICS} | grep ^router_build_info")
+    [kept] = running.shell("stat -c '%U %a' /var/lib/rover-router/kept").splitlines()
+    assert kept == "rover-router 700"
 
 
 def test_a_loop_of_crashes_ends(running: Machine) -> None:
