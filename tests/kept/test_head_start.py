@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import marshal
 import os
+import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from mmap import mmap
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def head_start(program: Program) -> HeadStart:
     memory = mmap(-1, len(image))
     memory[:] = image
     return HeadStart(Kept(((), "", ""), 0.0, (), marshal.loads(marshal.dumps(parts)), memory))  # noqa: S302 - written here
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """What runs as `router run` blocks signals for good."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def test_a_deadman_that_trips_while_the_router_is_made_is_told_once_it_is_complete(
