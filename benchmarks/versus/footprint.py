@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import cast
 
 from benchmarks.versus.contenders import Ports, Router, datagrams
@@ -50,12 +51,12 @@ def start_and_reload(trial: Trial) -> Metrics:
             with _working(trial, ports) as (_, metrics):
                 table.write_text(f"{text}# changed\n", encoding="utf-8")
                 os.utime(table, (time.time() - 60,) * 2)  # or the reload waits until it rests
-                began = time.monotonic()
+                asked, began = time.time(), time.monotonic()
                 answer = post(f"http://127.0.0.1:{ports.metrics}", "/-/reload", RELOAD_SECONDS)
                 metrics["reload_s"] = round(time.monotonic() - began, 4)
                 if not answer.ok:
                     raise SystemExit(f"the reload failed: {answer.body}")
-                time.sleep(trial.pace.settle)
+                _wait_until_kept(asked)
             with _working(trial, ports) as (_, again):
                 pass
         finally:
@@ -73,6 +74,16 @@ def _keeping(trial: Trial) -> Iterator[Ports]:
             yield Ports.free()
         finally:
             os.environ["STATE_DIRECTORY"] = before
+
+
+def _wait_until_kept(since: float) -> None:
+    """Returns when a program has been kept since then."""
+    deadline = time.monotonic() + START_SECONDS
+    folder = Path(os.environ["STATE_DIRECTORY"], "kept")
+    while not any(path.stat().st_mtime > since for path in folder.glob("*.program")):
+        if time.monotonic() > deadline:
+            raise SystemExit("no program was kept")
+        time.sleep(0.01)
 
 
 @contextmanager

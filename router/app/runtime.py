@@ -173,7 +173,8 @@ class Runtime:
         """Close what all threads have passed, in this reload and in those before."""
         self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
-            if earlier is None or self.plane.has_passed():
+            is_first = earlier is None and not change.sockets.moves  # a head start sends by what those leave
+            if is_first or self.plane.has_passed():
                 last_first.callback(self._counts.replace, change.program.counters)
                 last_first.callback(self._close_unfinished)
             else:

@@ -34,6 +34,7 @@ reload'). SIGUSR1: save the last datagrams, where the table keeps them ('record'
 Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
 _PARAMETERS = """The ROS parameter routes_path chooses the table as well. Any other is a variable of the table in lower
 case, and wins over the environment."""
+_ENDING = frozenset({signal.SIGINT, signal.SIGTERM})
 _EXAMPLES = (
     "router run",
     "router run routes/sim.yaml",
@@ -93,6 +94,8 @@ def _compile_and_route(
             logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
             ending.close()
             head_start, start = None, "replaced"
+        if signal.sigpending() & _ENDING:  # held back since the head start began, which `ending` closes
+            return
         kept = head_start.inputs if head_start is not None else None
         keeper = Keeper(library(), asked, read, kept) if begun is not None else None
         ending.pop_all()
@@ -145,8 +148,7 @@ def route(
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
 
-    ending = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*_ENDING, signal.SIGHUP, signal.SIGUSR1})
     with ExitStack() as unowned:
         if head_start is not None:
             unowned.callback(head_start.close)
@@ -156,10 +158,10 @@ def route(
         tune_interpreter()
         _show_places(router)
         with supervised(router.feed_watchdog):
-            _serve_signals(router, ending)
-        for number in ending:
+            _serve_signals(router, _ENDING)
+        for number in _ENDING:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
 
 
 def _show_places(router: Router) -> None:

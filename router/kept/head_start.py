@@ -50,7 +50,7 @@ class HeadStart:
         self.opened: dict[tuple[str | None, ...], int] = {}
         self.sent: dict[str, list[str]] = {}
         parts: Mapping[str, Any] = kept.parts  # type: ignore[assignment]  # those of carrier/image.py
-        self._kept = kept.parts, bytes(kept.image)
+        self._kept: tuple[object, bytes] | None = (kept.parts, bytes(kept.image))
         self.forwarding = Forwarding(self.library, parts["counters"], parts["names"])
         with ExitStack() as undo:
             undo.callback(self._close_sockets)
@@ -79,8 +79,9 @@ class HeadStart:
         self._close_sockets()
 
     def is_of(self, parts: object, image: bytes) -> bool:
-        """Whether it runs the program that has these parts and this image."""
-        return self._kept == (parts, image)
+        """Whether it runs the program that has these parts and this image. To be called once."""
+        kept, self._kept = self._kept, None
+        return kept == (parts, image)
 
     def bind_topic(self, topic: str, publisher: int) -> None:
         """Have messages for a topic published by a publisher, before the thread that publishes runs."""

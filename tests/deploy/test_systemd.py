@@ -284,10 +284,14 @@ def test_a_start_after_the_socket_was_stopped_too_begins_with_nothing(running: M
 
 def test_a_killed_router_comes_back(running: Machine) -> None:
     before = running.show("MainPID")
+    running.wait_for("ls /var/lib/rover-router/kept/*.program")
     running.shell("systemctl kill --signal=KILL --kill-whom=main rover-router")
     running.wait_for(
-        f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
+        f"[ $(systemctl show -P MainPID rover-router) != {before} ] && systemctl is-active -q rover-router"
     )
+    assert 'start="kept"' in running.shell(f"{METRICS} | grep ^router_build_info")
+    [kept] = running.shell("stat -c '%U %a' /var/lib/rover-router/kept").splitlines()
+    assert kept == "rover-router 700"
 
 
 def test_a_loop_of_crashes_ends(running: Machine) -> None:
@@ -315,7 +319,7 @@ def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_what_pytho
     assert running.show("MainPID") == before  # as it is fed, it lives
     running.shell(f"kill -STOP {before}")
     running.wait_for(
-        f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
+        f"[ $(systemctl show -P MainPID rover-router) != {before} ] && systemctl is-active -q rover-router"
     )
     running.shell("rm /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload")
     assert "Watchdog timeout" in running.journal()

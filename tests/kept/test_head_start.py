@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import marshal
 import os
+import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Collection, Iterator
 from mmap import mmap
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from structlog.testing import capture_logs
 
 from router.app import Router
 from router.app import router as whole
+from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.carrier import events
 from router.carrier.image import image_of
@@ -24,6 +28,7 @@ from router.compiler.program import Program
 from router.kept import head_start as beginnings
 from router.kept.head_start import Beginning, HeadStart
 from router.kept.store import Kept
+from router.net.sockets import ListeningSocket, open_sending
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, site
 
@@ -44,6 +49,14 @@ def head_start(program: Program) -> HeadStart:
     memory = mmap(-1, len(image))
     memory[:] = image
     return HeadStart(Kept(((), "", ""), 0.0, (), marshal.loads(marshal.dumps(parts)), memory))  # noqa: S302 - written here
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """What runs as `router run` blocks signals for good."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def test_a_deadman_that_trips_while_the_router_is_made_is_told_once_it_is_complete(
@@ -125,6 +138,32 @@ sys.exit(router.main())
     command = ["sh", "-c", f"exec {sys.executable} -c '{script.replace(chr(39), '')}' 2>&-"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (130, os.devnull)
+
+
+def test_a_socket_that_a_head_start_sends_by_is_closed_once_no_thread_uses_it(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = site.program(DRIVING)
+
+    def open_elsewhere(
+        source: ListeningSocket | None, every: Collection[ListeningSocket] = (), *, is_board: bool = False
+    ) -> socket.socket:
+        if source is not None:
+            raise OSError("the port of the listener cannot be shared")
+        return open_sending(None, every, is_board=is_board)
+
+    monkeypatch.setattr(beginnings, "open_sending", open_elsewhere)
+    begun = head_start(program)
+    left, was_open = begun.senders["basestation"].socket, []
+
+    class Observed(Plane):
+        def has_passed(self) -> bool:
+            was_open.append(left.fileno() >= 0)
+            return super().has_passed()
+
+    monkeypatch.setattr(whole, "Plane", Observed)
+    with Router(program, head_start=begun):
+        assert (was_open, left.fileno()) == ([True], -1)
 
 
 def test_topics_of_a_head_start_are_bound_once(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
