@@ -60,7 +60,7 @@ class Wire:
         if not datagram:
             raise DecodeError("empty")
         if len(datagram) > MAX_DATAGRAM:
-            raise DecodeError(f"truncated: {len(datagram)} bytes, the router takes {MAX_DATAGRAM}")
+            raise DecodeError(f"truncated: {len(datagram)} bytes; the limit is {MAX_DATAGRAM}")
         whole = restored(datagram)
         try:
             outer = self.envelope.message_class.FromString(whole)
@@ -76,7 +76,7 @@ class Wire:
 def wire_of_table(table: RouteTable) -> Wire:
     """The envelope that the table names. Raises TableError, and UsageError where it names none."""
     if table.envelope is None:
-        raise UsageError(f"{shown_path(table.path)} has no 'envelope': there are no datagrams to build or to read")
+        raise UsageError(f"{shown_path(table.path)} has no 'envelope', so there are no datagrams to build or parse")
     settings = table.envelope
     return Wire(
         find_envelope(load_protos(settings.protos, settings.message, settings.lock, settings.exclude), settings.oneof)
@@ -130,14 +130,14 @@ def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tupl
         return "no_payload", ""
     # A payload case among the unknown fields has the wrong wire type.
     if known := [number for number in numbers if number in cases]:
-        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is no message here")
+        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is not a message")
     return "unknown_case", f"field {numbers[0]}"
 
 
 def _why_malformed(envelope: Envelope, datagram: bytes, what: str = "") -> str:
     """Say what is wrong, and what most likely causes it: firmware that frames an envelope, or sends none."""
     cause = _framing(envelope, datagram) or _bare_payload(envelope, datagram)
-    return "; ".join(filter(None, (what or f"no {envelope.name}", cause)))
+    return "; ".join(filter(None, (what or f"does not parse as {envelope.name}", cause)))
 
 
 _CHECKSUMS = (1, 2, 4)
@@ -148,10 +148,10 @@ def _framing(envelope: Envelope, datagram: bytes) -> str:
     """What stands before or behind an envelope that is complete."""
     for size, length in _lengths(datagram):
         if length == len(datagram) - size and _has_payload(envelope, datagram[size:]):
-            return f"its own length ({_bytes(size)}) stands before it: send the envelope alone"
+            return f"a length ({_bytes(size)}) precedes the envelope: send the envelope alone"
     for size in _CHECKSUMS:
         if _has_payload(envelope, datagram[:-size]):
-            return f"{_bytes(size)} stand behind it, as a checksum would: send the envelope alone"
+            return f"{_bytes(size)} after the envelope look like a checksum: send the envelope alone"
     return ""
 
 

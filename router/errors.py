@@ -59,78 +59,84 @@ class Code(enum.Enum):
         return code
 
     # the text
-    BAD_FILE = ("bad-file", "A file cannot be read, or holds something else than it should.")
+    BAD_FILE = ("bad-file", "A file cannot be read, or does not contain what it should.")
     BAD_YAML = (
         "bad-yaml",
-        "The table is not YAML, or uses YAML that tables do not have (tags, merge keys, several documents).",
+        "The table is not YAML, or uses YAML that tables do not support (tags, merge keys, several documents).",
     )
     DUPLICATE_KEY = ("duplicate-key", "A mapping has the same key twice.")
     AMBIGUOUS_SCALAR = (
         "ambiguous-scalar",
-        "A plain word or number that YAML parsers read differently (`on`, `0777`, `12:30`).",
+        "A plain word or number that YAML parsers interpret differently (`on`, `0777`, `12:30`).",
     )
-    UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has no value in the environment, and no default.")
-    BAD_EXTENDS = ("bad-extends", "The table that `extends` names is missing, or extends this one.")
+    UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has neither a value in the environment nor a default.")
+    BAD_EXTENDS = ("bad-extends", "The table named by `extends` is missing, or extends this one.")
     # the shape
-    UNKNOWN_KEY = ("unknown-key", "A key that this place does not have.")
-    MISSING_KEY = ("missing-key", "A key that this place must have.")
-    WRONG_TYPE = ("wrong-type", "A value of another kind than the key takes.")
-    BAD_VALUE = ("bad-value", "A value of the right kind that makes no sense here.")
+    UNKNOWN_KEY = ("unknown-key", "A key that is not allowed here.")
+    MISSING_KEY = ("missing-key", "A required key is missing.")
+    WRONG_TYPE = ("wrong-type", "A value of the wrong type for its key.")
+    BAD_VALUE = ("bad-value", "A value of the right type that makes no sense here.")
     BAD_ADDRESS = ("bad-address", "Not an IPv4 address with a port.")
-    UNKNOWN_QOS_VALUE = ("unknown-qos-value", "A word that is no setting of ROS QoS.")
+    UNKNOWN_QOS_VALUE = ("unknown-qos-value", "Not a ROS QoS setting.")
     # the wire definitions
-    BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
+    BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares something that cannot be routed.")
     UNUSED_PROTO = ("unused-proto", "A `.proto` file that the envelope does not import is broken, or clashes.")
-    UNUSED_OPTION = ("unused-option", "A line of an `.options` file names nothing in its `.proto` file.")
+    UNUSED_OPTION = ("unused-option", "A line of an `.options` file matches nothing in its `.proto` file.")
     WIRE_NUMBER_CONFLICT = (
         "wire-number-conflict",
         "A field number was reused, renumbered, retyped or renamed, or the envelope is another message.",
     )
-    DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have one name.")
+    DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have the same name.")
     NOT_LOCKED = ("not-locked", "`envelope.lock.json` does not record this yet: run `router schema lock`.")
     # the names
-    UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
+    UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that is not in the envelope.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
-    UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
-    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that `listen` does not have.")
-    UNUSED_LISTENER = ("unused-listener", "A listener that no endpoint which sends is believed by.")
+    UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that is not in `endpoints`.")
+    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that is not in `listen`.")
+    UNUSED_LISTENER = ("unused-listener", "A listener that accepts none of the sending endpoints.")
     ADDRESS_CLASH = (
         "address-clash",
-        "Two want one local address or Zenoh key, or two endpoints could not be told apart.",
+        "Two local addresses or Zenoh keys are the same, or two endpoints cannot be told apart.",
     )
-    OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to find others, beyond the table's `networks`.")
+    OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to discover others, outside the table's `networks`.")
     FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or this router.")
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
     TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes or gateways give one topic different types.")
-    UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
+    UNKNOWN_ROS_TYPE = ("unknown-ros-type", "Neither an installed package nor `schemas/` defines this interface.")
     UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
-    UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "An enum, or a ROS type's constants, have no such name.")
-    MISSING_ENUM_VALUE = ("missing-enum-value", "A `map` without `else` that leaves out values.")
+    UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "Not a value of the enum, or not a constant of the ROS type.")
+    MISSING_ENUM_VALUE = ("missing-enum-value", "A `map` without `else` that does not cover every value.")
     QOS_CONFLICT = (
         "qos-conflict",
-        "QoS settings that contradict each other, or that keep publisher and subscriber apart.",
+        "QoS settings that contradict each other, or that keep publisher and subscription from connecting.",
     )
-    BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this: no fixed size, too large, or not finite.")
-    NO_TARGET = ("no-target", "A route that goes nowhere.")
-    SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
-    NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")
-    DOUBTFUL_DEADMAN = ("doubtful-deadman", "A deadman that may not serve its purpose, such as one that waits 500 s.")
+    BOARD_PAYLOAD = (
+        "board-payload",
+        "A payload that a board's firmware cannot decode: no fixed size, too large, or not finite.",
+    )
+    NO_TARGET = ("no-target", "A route without destinations or topics.")
+    SOURCE_CLASH = ("source-clash", "Two routes of one payload case have the same source.")
+    NO_DEADMAN = ("no-deadman", "Nothing stops the board when its commands stop arriving.")
+    DOUBTFUL_DEADMAN = (
+        "doubtful-deadman",
+        "A deadman that may not serve its purpose, for example with a timeout of 500 s.",
+    )
     # the mapping
-    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two fields that exclude each other.")
+    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two members of one oneof.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
-    EXPRESSION_SYNTAX = ("expression-syntax", "Not an expression.")
+    EXPRESSION_SYNTAX = ("expression-syntax", "Not a valid expression.")
     CUT_EXPRESSION = (
         "cut-expression",
-        "A comment that is only a number, or an operator with a word, behind an expression.",
+        "A comment that looks like the rest of the expression before it.",
     )
-    FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")
+    FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python syntax that expressions do not support.")
     UNKNOWN_FUNCTION = ("unknown-function", "A function that is not listed in [functions](functions.md).")
     WRONG_ARGUMENTS = ("wrong-arguments", "A call with too many, too few or unsuitable arguments.")
     TYPE_MISMATCH = (
         "type-mismatch",
-        "A value of a type that does not fill this field, or that an operator does not take.",
+        "A value whose type does not fit the field or the operator.",
     )
-    LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could lose something without saying so.")
+    LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could silently lose information.")
     OUT_OF_RANGE = ("out-of-range", "A value that can never fit.")
     TOO_LARGE = ("too-large", "An expression or mapping that is too large for the router.")
 

@@ -47,14 +47,14 @@ def _assign(message: Any, kind: MessageType, path: str, text: str) -> None:
         field, index = _step(kind, step, path)
         inner = field.type.element if isinstance(field.type, List) else field.type
         if not isinstance(inner, MessageType):
-            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, it has no fields")
+            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, which has no fields")
         message = _inner_message(message, field, index, path)
         kind = inner
     field, index = _step(kind, last, path)
     if isinstance(field.type, List):
         _assign_element(getattr(message, field.name), field.type, index, path, text)
     elif index is not None:
-        raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+        raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
     elif isinstance(field.type, MessageType) and not text:
         getattr(message, field.name).SetInParent()
     else:
@@ -79,11 +79,11 @@ def _inner_message(message: Any, field: Field, index: int | None, path: str) -> 
     member = getattr(message, field.name)
     if not isinstance(field.type, List):
         if index is not None:
-            raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+            raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
         member.SetInParent()
         return member
     if index is None:
-        raise UsageError(f"{path}: {field.name} is a list", f"say which element, such as {field.name}[0]")
+        raise UsageError(f"{path}: {field.name} is a list", f"name an element, such as {field.name}[0]")
     _extend(member, field.type, index, path)
     return member[index]
 

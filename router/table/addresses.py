@@ -70,14 +70,14 @@ def parse_remote(text: str) -> Address:
 
 
 def not_one_machine(address: Address) -> BadAddressError:
-    return BadAddressError(f"{address.host} is not the address of one machine", _NO_MULTICAST)
+    return BadAddressError(f"{address.host} is not the address of a single machine", _NO_MULTICAST)
 
 
 def parse_local(text: str) -> Address:
     """An address that this machine can have, or 0.0.0.0 for all that it has. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) >= 224:
-        raise BadAddressError(f"{address.host} is not an address that this machine can have", _NO_MULTICAST)
+        raise BadAddressError(f"{address.host} cannot be an address of this machine", _NO_MULTICAST)
     return address
 
 
@@ -100,7 +100,7 @@ def _is_octet(text: str) -> bool:
 
 def _bad_host(host: str) -> BadAddressError:
     if not _NUMBERS.fullmatch(host):
-        hint = "addresses are IPv4 literals such as 192.168.0.30; names are not looked up"
+        hint = "addresses are IPv4 literals such as 192.168.0.30; host names are not resolved"
         return BadAddressError(f"'{host}' is not an IPv4 address", hint)
     parts = host.split(".")
     if len(parts) != 4:
@@ -151,14 +151,14 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
         address = parse_address(locator["address"] if locator else node.text)
     except BadAddressError:
         if is_locator:  # a host name, IPv6, a path; other addresses have this finding already
-            what = f"'{node.text}' under '{key}' of {name} has no IPv4 address that could lie in {networks}"
+            what = f"'{node.text}' under '{key}' of {name} has no IPv4 address to compare with {networks}"
             remedy = _remedy(path, "tcp/127.0.0.1:7447", networks, is_extended)
             yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, remedy)
         return
     host = ipaddress.IPv4Address(address.host)
     if any(host in network for network in networks.members):
         return
-    which = "all networks of this machine, which is more than" if address.host == "0.0.0.0" else "outside"
+    which = "which includes more than" if address.host == "0.0.0.0" else "outside"
     what = f"'{key}' of {name} is {address}, {which} {networks}"
     nearest = f"{_moved(host, networks.members[0])}:{address.port}"
     example = f"{locator['protocol']}{nearest}{locator['rest']}" if locator else nearest
@@ -173,8 +173,8 @@ def _moved(host: ipaddress.IPv4Address, network: ipaddress.IPv4Network) -> ipadd
 
 def _remedy(path: Path, example: str, networks: Networks, is_extended: bool) -> str:
     if not is_extended:
-        return f"write one that lies there, such as {example}"
+        return f"write an address inside them, such as {example}"
     said = f"[{example}]" if "zenoh" in path[3:] else example
     for key in reversed(path):
         said = f"{key}: {said}" if key == path[0] else f"{{{key}: {said}}}"
-    return f"give it one in {networks.span.file}, such as {said}"
+    return f"override it in {networks.span.file}, for example with {said}"

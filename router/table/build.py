@@ -257,7 +257,7 @@ def _own_protos(span: SourceSpan) -> Path:
     try:
         return asset("protos")
     except FileNotFoundError as error:
-        what = "'envelope' names no protos, and this router has none of its own"
+        what = "'envelope' has no 'protos', and this installation includes none"
         raise InvalidValueError(span, Code.MISSING_KEY, what, "add `protos: FOLDER`") from error
 
 
@@ -293,8 +293,9 @@ def _network(node: Node) -> IPv4Network:
     try:
         return IPv4Network(written.value)
     except ValueError as error:  # not its form, which the schema has checked
-        what = f"{written.value} is a host of the network {IPv4Network(written.value, strict=False)}"
-        raise InvalidValueError(written.span, Code.BAD_VALUE, what, "write the network") from error
+        hint = f"write {IPv4Network(written.value, strict=False)}"
+        what = f"{written.value} is the address of a host, not of a network"
+        raise InvalidValueError(written.span, Code.BAD_VALUE, what, hint) from error
 
 
 # routes
@@ -386,7 +387,7 @@ def _with_timeout(deadman: Entry) -> MappingNode:
     """The settings of a deadman. Its timeout is a key that there must be, here or in the table's defaults."""
     settings = mapping(deadman.value)
     if settings.get("timeout") is None:
-        hint = "say it here, or for all deadmen: `defaults: {deadman: {timeout: 500ms}}`"
+        hint = "set it here, or for all deadmen with `defaults: {deadman: {timeout: 500ms}}`"
         what = "'deadman' lacks the key 'timeout'"
         raise InvalidValueError(deadman.key.span, Code.MISSING_KEY, what, hint)
     return settings
@@ -487,7 +488,7 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
     path = beside(written.value, written.span)
     try:
         if inputs.exists(path) and not inputs.is_file(path):
-            raise OSError(0, "it is no ordinary file")
+            raise OSError(0, "it is not a regular file")
         return ZenohConfig(written.span, inputs.read_text(path), path)
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"

@@ -61,9 +61,9 @@ class _Composer:
             elif isinstance(event, yaml.AliasEvent):
                 self._alias(event)
             elif isinstance(event, yaml.DocumentStartEvent) and self._root is not None:
-                raise self._fatal(self._span(event), "a second document begins here", "a table is one document")
+                raise self._fatal(self._span(event), "a second document begins here", "write one document per file")
         if self._root is None or (isinstance(self._root, ScalarNode) and not self._root.text):
-            raise self._fatal(SourceSpan(self._source.file), "the file holds no table", "begin with 'version: 1'")
+            raise self._fatal(SourceSpan(self._source.file), "the file contains no table", "start with 'version: 1'")
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
@@ -95,7 +95,7 @@ class _Composer:
     def _begin(self, event: yaml.CollectionStartEvent) -> None:
         span = self._span(event)
         if len(self._open) == MAX_DEPTH:
-            raise self._fatal(span, f"this is nested more than {MAX_DEPTH} deep", "")
+            raise self._fatal(span, f"this is nested more than {MAX_DEPTH} levels deep", "")
         if event.anchor is not None:
             self._anchors.pop(event.anchor, None)
         self._open.append(_Collection(event, span, self._has_tag(event, span)))
@@ -103,7 +103,8 @@ class _Composer:
     def _alias(self, event: yaml.AliasEvent) -> None:
         if event.anchor not in self._anchors:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
-            what = f"the alias '*{event.anchor}' " + ("stands inside what it repeats" if recursive else "has no anchor")
+            problem = "is inside the value that it repeats" if recursive else "has no anchor"
+            what = f"the alias '*{event.anchor}' {problem}"
             raise self._fatal(self._span(event), what, "" if recursive else "quote text that begins with '*'")
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
@@ -118,7 +119,7 @@ class _Composer:
         parent.children.append(node)
         parent.size += size
         if parent.size > MAX_NODES:
-            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, aliases written out", "")
+            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, counting aliases in full", "")
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)
@@ -133,17 +134,17 @@ class _Composer:
             broken |= bool(problems)
             place = TextPlace(span)
         if unusable := unusable_character(text):
-            broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
+            broken |= self._report(span, f"the text contains the character {unusable[1]}", "")
         if not event.style and text[-1:] == "," and " " not in text and self._open_bracket() is None:
             broken |= self._report(
-                span, f"'{text}' ends with a ','", "remove it: only within brackets does ',' separate"
+                span, f"'{text}' ends with a ','", "remove it: ',' separates values only inside brackets"
             )
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
             # A variable by its name: its value may be secret.
-            what = f"'{event.value}' is {found.meaning} to some YAML readers and something else to others"
-            hint = (f"{found.remedy}, or, for text, " if found.remedy else "") + f'quote it: "{event.value}"'
+            what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
+            hint = (f"{found.remedy}; for text, " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)
@@ -174,20 +175,20 @@ class _Composer:
             if not isinstance(key, ScalarNode):
                 broken = self._report(
                     key.span,
-                    "a key must be a word, not a mapping or a sequence",
+                    "a key must be a word, not a mapping or a list",
                     "quote text that begins with '{' or '['",
                 )
             elif blank := foreign_blank(key.text):
                 broken = self._report(
-                    key.span, f"the character {blank} stands in this key", "remove it, or write an ordinary space"
+                    key.span, f"this key contains the character {blank}", "remove it, or write an ordinary space"
                 )
             elif key.text == "<<" and key.value == "<<":
-                broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
+                broken = self._report(key.span, "tables do not support merge keys ('<<')", "write out the keys")
             elif key.text in entries and key.text in rests:
                 continue  # what the comma cut off has a finding already
             elif key.text in entries:
                 first = entries[key.text].key.span
-                what = f"the key '{key.text}' is already in this mapping, at line {first.line}"
+                what = f"the key '{key.text}' is already in this mapping, on line {first.line}"
                 self._findings.append(Diagnostic(key.span, Code.DUPLICATE_KEY, what, "remove one of the two"))
             else:
                 entries[key.text] = Entry(key, value)
@@ -209,11 +210,11 @@ class _Composer:
         from router.table.mistakes import exclamation
 
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
-        hint = "remove it; quotes make a value text"
+        hint = "remove it; to make a value text, quote it"
         if (found := exclamation(self._source, span.line - 1)) is not None:
             self._findings.append(found)
             return True
-        return self._report(span, f"the tag '{name}' has no place in a table", hint)
+        return self._report(span, f"tables do not support the tag '{name}'", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
         """Add a finding; True, because what has one is broken."""
@@ -236,11 +237,11 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
 
 
 _KEY_SLIPS = (
-    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "this ':' is one too many", "remove it"),
+    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "unexpected ':'", "remove it"),
     (
         re.compile(r"(?P<slip>-)(?P<key>[A-Za-z_][\w.]*)"),
         "a space is missing after '-'",
-        "begin items of a list with '- '; a key has no '-'",
+        "start list items with '- '; a key has no '-'",
     ),
 )
 """What a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""

@@ -53,18 +53,18 @@ _ELSEWHERE = {
 """Keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
 _IN_OTHER_WORDS = (
-    ("address", ADDRESS_PARTS, "an address is IP and port in one: `address: 192.168.0.30:8`"),
-    ("ignore", ("enabled", "enable", "disabled", "active"), "what is out of use has the one key `ignore: why`"),
-    ("endpoint", ("topic", "topics"), "a ROS topic is a key of the route: `topic: NAME`"),
-    ("queue_depth", ("endpoint",), "an endpoint is named alone: `source: NAME`"),
+    ("address", ADDRESS_PARTS, "write the IP address and port together: `address: 192.168.0.30:8`"),
+    ("ignore", ("enabled", "enable", "disabled", "active"), "to disable it, write only `ignore: why`"),
+    ("endpoint", ("topic", "topics"), "write a ROS topic as a key of the route: `topic: NAME`"),
+    ("queue_depth", ("endpoint",), "name an endpoint directly: `source: NAME`"),
     ("qos", ("latched", "latch", "transient_local"), "write `qos: {durability: transient_local}`"),
     ("qos", ("reliable", "best_effort"), "write `qos: {reliability: best_effort}` or `reliable`"),
     ("websocket", ("type", "kind", "address", "port"), "write its kind and address, such as {websocket: 0.0.0.0:8765}"),
     ("package", ("timeout", "repeat"), "write `deadman: {timeout: 500ms, repeat: 100ms}`"),
-    ("repeat", ("send", "at_start"), "each deadman says that for itself"),
-    ("at", ("wait", "sleep", "delay", "after"), "say when it is, since the beginning of the test: `at: 500ms`"),
-    ("extends", ("description", "name", "title"), "what is for people stands in a comment: `# ...`"),
-    ("source", ("description", "comment", "note"), "what is for people stands in a comment: `# ...`"),
+    ("repeat", ("send", "at_start"), "set it in each deadman"),
+    ("at", ("wait", "sleep", "delay", "after"), "write the time since the start of the test: `at: 500ms`"),
+    ("extends", ("description", "name", "title"), "write descriptions as comments: `# ...`"),
+    ("source", ("description", "comment", "note"), "write descriptions as comments: `# ...`"),
 )
 """A known key, the keys that people write beside it by mistake, and the hint for these."""
 CLOSE = 0.7
@@ -94,10 +94,10 @@ def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
     key, written = before[0], before[1].value
     is_nothing = isinstance(entry.value, ScalarNode) and entry.value.value is None
     if is_nothing and isinstance(written, ScalarNode) and key in _IN_WORDS:
-        return f"quote text that has ',' in it: `{key}: \"{written.text}, {name}\"`"
+        return f"quote text that contains ',': `{key}: \"{written.text}, {name}\"`"
     is_below = entry.key.span.line > before[1].key.span.line and not is_nothing
     if key in NAME_FIELDS and isinstance(written, MappingNode) and is_below:
-        return f"indent it like the keys of '{key}', if it is one of them"
+        return f"if it is a key of '{key}', indent it like the others"
     return ""
 
 
@@ -114,7 +114,7 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
     if key := meant(name, known):
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
-        return f"a payload case stands under 'send': `send: {{{name}: ...}}`"
+        return f"put a payload case under 'send': `send: {{{name}: ...}}`"
     if owners := _owners(name, path):
         return owners
     if path[:1] == ("routes",) and (key := _NAMED.get(str(path[-1]))):
@@ -136,7 +136,7 @@ def _owners(name: str, path: Path) -> str:
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
     owners += ["the table itself"] if name in keys_of(table_schema()) else []
-    return f"that is a key of: {', '.join(owners)}" if owners else ""
+    return f"it belongs in: {', '.join(owners)}" if owners else ""
 
 
 def for_value(error: SchemaError) -> str:
@@ -200,7 +200,7 @@ def for_type(error: SchemaError, tree: Node) -> str:
     if error.is_list_in_list:
         rows = to_data(node_at(tree, error.path[:-1]))
         count = sum(len(row) if isinstance(row, list) else 1 for row in rows) if isinstance(rows, list) else 0
-        return f"write one list of {count}, row after row"
+        return f"write one list of {count} values, row by row"
     return _written_otherwise(error, name, value)
 
 
@@ -212,13 +212,13 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
         return f"a ':' is missing, write `{first.rstrip('=')}: {rest.lstrip('= ')}`"
     if "object" in error.limit:
         is_case = error.path[:-1] == ("routes",)
-        return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
+        return "indent its keys below it" + (", or write {ignore: why}" if is_case else "")
     siblings = node_at(tree, error.path[:-1])
     if isinstance(siblings, MappingNode) and (number := _decimal(siblings, name)):
-        return f"a decimal number has a point: {number}"
+        return f"write decimal numbers with a point: {number}"
     if isinstance(siblings, MappingNode) and MAP in siblings.entries:
-        return f"say what it becomes: `{name}: VALUE`"
-    return "a field that is left out keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
+        return f"add its value: `{name}: VALUE`"
+    return "remove it: an omitted field keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
 
 
 def _decimal(siblings: MappingNode, name: str) -> str:
@@ -258,7 +258,7 @@ def without_case(fields: Mapping[str, object]) -> str:
     written = [f"{name}: {shown}" for name, value in fields.items() if (shown := _in_flow(value)) is not None]
     if len(written) < len(fields):
         return ""
-    return f"below 'send' stands a payload case, and below that its fields: `send: {{CASE: {{{', '.join(written)}}}}}`"
+    return f"put a payload case under 'send', and its fields under that: `send: {{CASE: {{{', '.join(written)}}}}}`"
 
 
 def _is_of(kinds: str | list[str], value: object) -> bool:
@@ -269,9 +269,9 @@ def _is_of(kinds: str | list[str], value: object) -> bool:
 
 def _for_collection(error: SchemaError, value: object) -> str:
     if isinstance(value, dict) and error.limit == "array":
-        return "begin each of its items with '-'"
+        return "start each item with '-'"
     if isinstance(value, list) and error.path in _BY_NAME:
-        return "write a name and ':' in place of each '-'"
+        return "replace each '-' with a name and ':'"
     return ""
 
 

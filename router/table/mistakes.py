@@ -28,8 +28,8 @@ class _Advice(NamedTuple):
     at_start: bool = False
 
 
-_TAB = _Advice("a tab indents this line", "indent with spaces")
-_OPEN_QUOTE = _Advice("this quote is not closed in its line", at_start=True)
+_TAB = _Advice("this line is indented with a tab", "indent with spaces")
+_OPEN_QUOTE = _Advice("this quote is not closed on its line", at_start=True)
 _NO_KEY_ENDS = "could not find expected ':'"
 _NO_KEY = "did not find expected key"
 _NO_DASH = "did not find expected '-' indicator"
@@ -39,8 +39,8 @@ _NOT_CLOSED = {
     "did not find expected ',' or '}'": ("{", "}"),
 }
 _BETWEEN_KEYS = (_NO_KEY, _NO_DASH, _NO_DOCUMENT)
-_ITEM_AMONG_KEYS = "an item of a list stands among keys"
-_QUOTE_COLONS = "quote text that has ': ' in it"
+_ITEM_AMONG_KEYS = "a list item stands among the keys of a mapping"
+_QUOTE_COLONS = "quote text that contains ': '"
 _ADVICE = {
     **{
         problem: _Advice(f"this '{opening}' is not closed by a '{closing}', or a ',' is missing inside", at_start=True)
@@ -49,23 +49,23 @@ _ADVICE = {
     "found unexpected end of stream": _OPEN_QUOTE,
     "found unexpected document indicator": _OPEN_QUOTE,
     "found unknown escape character": _Advice(
-        "this backslash sequence does not exist", "single quotes take backslashes as they are"
+        "unknown backslash sequence", "use single quotes, which keep backslashes as they are"
     ),
     "mapping values are not allowed in this context": _Advice(
-        "a ':' cannot stand here", f"{_QUOTE_COLONS}; keys of a mapping begin on lines of their own"
+        "a ':' is not allowed here", f"{_QUOTE_COLONS}; start each key of a mapping on its own line"
     ),
-    "found unexpected ':'": _Advice("a ':' cannot stand here", "remove it, or quote text that has it"),
-    _NO_KEY: _Advice("no key begins here", "quote text that has special characters in it"),
+    "found unexpected ':'": _Advice("a ':' is not allowed here", "remove it, or quote the text that contains it"),
+    _NO_KEY: _Advice("a key is expected here", "quote text that contains special characters"),
     _NO_DASH: _Advice(
-        "this line does not begin with '-' as its neighbours do",
-        "begin an item with '- ', or indent what belongs to the item above",
+        "this line does not start with '-' as its neighbours do",
+        "start an item with '- ', or indent what belongs to the item above",
     ),
     "block sequence entries are not allowed in this context": _Advice(
-        "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
+        "a list item cannot start here", "start each list item on its own line"
     ),
     "did not find expected node content": _Advice("a value is missing here"),
-    _NO_DOCUMENT: _Advice("this line is indented less than the first key", "indent keys of one mapping alike"),
-    "found incompatible YAML document": _Advice("this is a YAML version that is not understood", "remove the line"),
+    _NO_DOCUMENT: _Advice("this line is indented less than the first key", "indent all keys of a mapping equally"),
+    "found incompatible YAML document": _Advice("this YAML version is not supported", "remove the line"),
 }
 _NO_BEGINNING = (
     "found character that cannot start any token",
@@ -78,23 +78,23 @@ _NO_BEGINNING = (
 """Problems with the sign that a value begins with. The last three are found behind it."""
 _UNBEGUN = {
     ",": _Advice("a value is missing before this ','", "remove the ','"),
-    "-": _Advice("an item in brackets does not begin with '-'", "remove the '-', or the brackets"),
+    "-": _Advice("an item in brackets does not start with '-'", "remove the '-', or the brackets"),
 }
-_COMMENT_SIGN = _Advice("a comment begins with '#'", "write '#' in its place")
+_COMMENT_SIGN = _Advice("a comment starts with '#'", "replace this with '#'")
 _SLIPS = (
     (
         re.compile(r"(<{7}|={7}|>{7}|\|{7})(?: |$)"),
-        _Advice("a merge conflict is not resolved", "keep one version, and remove '<<<<<<<', '=======' and '>>>>>>>'"),
+        _Advice("unresolved merge conflict", "keep one version, and remove '<<<<<<<', '=======' and '>>>>>>>'"),
     ),
     (re.compile(r" *(//|/\*|--(?!\S))"), _COMMENT_SIGN),
-    (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "begin items of a list with '- '")),
+    (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "start list items with '- '")),
 )
 """What begins a line only by mistake. YAML often fails no earlier than in the next line."""
 _AFTER_VALUE = (
     (re.compile(r"//|/\*|--(?!\S)"), _COMMENT_SIGN),
     (
         re.compile(r"""(?<=["'])\w"""),
-        _Advice("the quoted text ends before this", "put quotes of the other kind around the text"),
+        _Advice("the quoted text ends before this", "put the other kind of quotes around the text"),
     ),
     (
         re.compile(r"[-+*/%<>=!&|.(?]|(?:if|else|and|or|in|is|not)\b"),
@@ -155,7 +155,7 @@ def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnos
 
 
 _EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?=[ ,}\]]|$))))")
-_NO_EXCLAMATION = "a value cannot begin with '!'"
+_NO_EXCLAMATION = "a value cannot start with '!'"
 
 
 def exclamation(source: Source, line: int) -> Diagnostic | None:
@@ -190,8 +190,9 @@ def _slip(source: Source, line: int) -> Diagnostic | None:
         if match := _FOREIGN.search(text):
             character = match[match.lastgroup or 0]
             plain = unicodedata.normalize("NFKC", character.translate(_ASCII))
-            what = f"the character U+{ord(character):04X} ({unicodedata.name(character, '').lower()}) cannot stand here"
-            hint = f"write '{plain}' in its place" if plain.isascii() else "remove it"
+            name = unicodedata.name(character, "").lower()
+            what = f"the character U+{ord(character):04X} ({name}) is not allowed here"
+            hint = f"replace it with '{plain}'" if plain.isascii() else "remove it"
             return _finding(source, number, match.start(match.lastgroup or 0), _Advice(what, hint))
     return None
 
@@ -203,9 +204,9 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
     if character == "\t":
         return _TAB
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
-        return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
+        return _Advice(f"a '{character}' is not allowed inside a word here", "quote text that contains brackets")
     if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
-        return _ADVICE[problem]._replace(hint=f"YAML gets no further than line {line + 1}")
+        return _ADVICE[problem]._replace(hint=f"parsing stops at line {line + 1}")
     if character == ":" and (advice := _colon(problem, before, written[column + 1 :])):
         return advice
     begun = start.column if start and start.line == line else column
@@ -215,8 +216,8 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
         return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
     if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
         keys = _keys_at(source, start.line)
-        what = f"this line is indented like the '-' above, and the keys of that item by {keys}"
-        return _Advice(what, f"indent it by {keys} spaces, or remove the '-' in line {start.line + 1}")
+        what = f"this line is indented like the '-' above, but the keys of that item by {keys}"
+        return _Advice(what, f"indent it by {keys} spaces, or remove the '-' on line {start.line + 1}")
     if problem in _NOT_CLOSED or (problem in _BETWEEN_KEYS and before.strip()):
         return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])
     passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
@@ -225,19 +226,19 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
 
 def _colon(problem: str, before: str, after: str) -> _Advice | None:
     if " ? " in before:
-        return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
+        return _Advice("a ':' is not allowed here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
     if problem in _NOT_CLOSED and (said := _IN_WORDS.search(before)):
         rest = re.match(r"[^,}\]]*", after)
         text = f"{said['text']}:{rest[0] if rest else ''}".replace('"', "'").rstrip()
-        return _Advice("a ':' cannot stand here", f'{_QUOTE_COLONS}: `{said["key"]}: "{text}"`')
+        return _Advice("a ':' is not allowed here", f'{_QUOTE_COLONS}: `{said["key"]}: "{text}"`')
     if problem in _NOT_CLOSED and (words := _WITHOUT_COMMA.search(before)):
         return _Advice(f"a ',' is missing before '{words[2]}'", f"write `{words[1]}, {words[2]}:`")
     if problem in _NOT_CLOSED:
-        return _Advice("a ':' cannot stand here", f"{_QUOTE_COLONS}, or put braces around the inner mapping")
+        return _Advice("a ':' is not allowed here", f"{_QUOTE_COLONS}, or put braces around the inner mapping")
     if after[:1] in ("[", "{"):
         return _Advice("a space is missing after ':'", f"write `: {after[:1]}`")
     if before.rstrip().endswith(":") or (_SEPARATOR.search(before) and not _HIDDEN.sub("", after).strip()):
-        return _Advice("this ':' is one too many", "remove it")
+        return _Advice("unexpected ':'", "remove it")
     return None
 
 
@@ -247,7 +248,7 @@ def _no_beginning(written: str, column: int) -> _Advice:
     if written[:column].rstrip()[-1:] in {*"\"'])}"}:
         return _behind_value(written, column, "")._replace(at_start=True)
     return _UNBEGUN.get(character) or _Advice(
-        f"a value cannot begin with '{character}'", "put quotes around the value", at_start=True
+        f"a value cannot start with '{character}'", "put quotes around the value", at_start=True
     )
 
 
@@ -258,10 +259,10 @@ def _behind_value(written: str, column: int, closing: str) -> _Advice:
         if pattern.match(written, column):
             return advice
     if closing:
-        hint = f"write '{closing}' in its place, or remove it" if character in ("]", "}") else ""
+        hint = f"replace it with '{closing}', or remove it" if character in ("]", "}") else ""
         return _Advice(f"a ',' or '{closing}' is missing before this", hint)
     if character and character in ")]},;":
-        return _Advice(f"this '{character}' is one too many", "remove it")
+        return _Advice(f"unexpected '{character}'", "remove it")
     if not _SEPARATOR.search(written[:column]):
         return _Advice("a ':' is missing before this")
     return _Advice("the value ends before this", "put quotes around the whole value")
@@ -297,7 +298,7 @@ def _without_colon(source: Source, line: int) -> Diagnostic:
         return Diagnostic(span, Code.BAD_YAML, "a space is missing after ':'", f"write `{_spaced(text.strip())}`")
     column = _keys_at(source, line)
     words = _WITHOUT_COLON.fullmatch(_text(source, line)[column:])
-    hint = "indent text that goes on from the line above; begin a comment with '#'"
+    hint = "indent text that continues the line above; start a comment with '#'"
     if words:
         value = words[2] or words[3] or ("true" if words[1] == "auto" else "")
         hint = f"write `{words[1]}: {value}`" if value else f"write `{words[1]}:`"
@@ -362,7 +363,7 @@ def _too_shallow(source: Source, line: int) -> Diagnostic | None:
 
 def _indented(source: Source, line: int, what: str) -> Diagnostic:
     own = _indent(source.lines[line])
-    hint = "indent the keys of one mapping alike, and the items of one list"
+    hint = "indent all keys of a mapping equally, and all items of a list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
 
 
@@ -415,8 +416,8 @@ def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagn
         span = node.span
         comment = lines[span.file][span.line - 1][span.end_column - 1 :] if node.place.is_whole_line else ""
         if _REST.fullmatch(comment):
-            what = f"the comment '{comment.strip()}' is no part of the expression before it"
-            hint = "write an operator in place of '#', or say in the comment what it is about"
+            what = f"the comment '{comment.strip()}' is not part of the expression before it"
+            hint = "replace '#' with an operator, or add words to the comment"
             yield Diagnostic(span, Code.CUT_EXPRESSION, what, hint)
 
 

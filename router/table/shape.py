@@ -38,13 +38,13 @@ _NAMED_PARTS = {
 }
 """Mappings whose keys are names, and what each of these is."""
 _HINTS_FOR_MISSING = {
-    "source": "say who sends it: an endpoint, or {topic: NAME} for ROS; or say 'ignore: why'",
-    "transport": "or say 'ignore: why'",
-    "version": "begin with 'version: 1'",
-    "receive": "what its client publishes has to arrive somewhere",
+    "source": "name who sends it: an endpoint, or {topic: NAME} for ROS; or write 'ignore: why'",
+    "transport": "add it, or write 'ignore: why'",
+    "version": "start with 'version: 1'",
+    "receive": "add the local address that receives what its client publishes",
 }
 _BELONG_TOGETHER = ("envelope", "listen", "routes")
-_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
+_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with only 'gateways' needs none of them"
 
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
@@ -213,7 +213,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
     if keyword == "maxProperties":
         hint = hints.without_case(error.value) if path[-1] == "send" and isinstance(error.value, dict) else ""
-        return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it", hint)
+        return Diagnostic(span, code, f"{name} {_expected(error)}, and nothing else", hint)
     hint = hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")
@@ -293,7 +293,7 @@ def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
 def _repeated(error: SchemaError, tree: Node) -> Diagnostic:
     items = error.value if isinstance(error.value, list) else []
     index = next(index for index, item in enumerate(items) if item in items[:index])
-    what = f"{shown(items[index])} stands in {subject(error.path)} twice"
+    what = f"{subject(error.path)} contains {shown(items[index])} twice"
     return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what)
 
 

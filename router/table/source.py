@@ -53,7 +53,7 @@ def read_source(path: Path) -> Source:
         offset, name = unusable
         line = len(_LINE_END.split(text[:offset])) - 1
         column = offset - max(text.rfind("\n", 0, offset), text.rfind("\r", 0, offset)) - 1
-        what = f"the character {name} has no place in a table"
+        what = f"tables cannot contain the character {name}"
         raise TableError.of(source.span(line, column, line, column + 1), Code.BAD_YAML, what)
     return source
 
@@ -78,7 +78,7 @@ def _read(path: Path, file: str) -> bytes:
         if inputs.is_dir(path):
             what = "this is a folder, not a route table"
         elif inputs.exists(path) and not inputs.is_file(path):
-            what = "this is no ordinary file"
+            what = "this is not a regular file"
         else:
             data = inputs.read_bytes(path, MAX_BYTES + 1)
             if len(data) <= MAX_BYTES:
@@ -89,7 +89,7 @@ def _read(path: Path, file: str) -> bytes:
         if isinstance(error, FileNotFoundError) and (near := nearest_path(path)):
             hint = f"did you mean '{shown_path(near)}'?"
         elif isinstance(error, FileNotFoundError) and not path.is_absolute():
-            hint = f"paths are relative to the working directory, here {Path.cwd()}"
+            hint = f"paths are relative to the working directory, {Path.cwd()}"
             if is_installed(asset("routes")):
                 hint += "; `router init` writes example tables there"
     except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
@@ -139,7 +139,7 @@ def fill(text: str, environ: Mapping[str, str]) -> tuple[str, list[Problem]]:
         match = _REFERENCE.match(text, start)
         position = match.end() if match else _end_of_bad_reference(text, start)
         filled = _value(match, environ) if match else Problem(
-            start, position, Code.BAD_VALUE, f"'{text[start:position]}' is no variable", _USAGE
+            start, position, Code.BAD_VALUE, f"'{text[start:position]}' is not a variable", _USAGE
         )  # fmt: skip
         if isinstance(filled, Problem):
             problems.append(filled)
@@ -156,12 +156,12 @@ def _value(match: re.Match[str], environ: Mapping[str, str]) -> str | Problem:
         near = nearest(name, environ)
         hint = f"did you mean '{near}'? " if near else ""
         hint += f"set it, or give it a default: ${{{name}:-value}}"
-        hint += f"; an expression names a field as `{name}`" if name.islower() else ""
+        hint += f"; in an expression, name a field as `{name}`" if name.islower() else ""
         return Problem(match.start(), match.end(), Code.UNDEFINED_VARIABLE, f"the variable '{name}' is not set", hint)
     filled = value or default or ""
     if _OPENING in filled:
-        what = f"the value of the variable '{name}' holds '${{', and values are not searched for variables"
-        return Problem(match.start(), match.end(), Code.BAD_VALUE, what, "put the final text into the variable")
+        what = f"the value of the variable '{name}' contains '${{', but values are not expanded again"
+        return Problem(match.start(), match.end(), Code.BAD_VALUE, what, "set the variable to the final text")
     return filled
 
 

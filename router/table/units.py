@@ -147,7 +147,7 @@ def parse_period(text: str) -> int:
     """`500ms` as nanoseconds, of a gateway that ticks."""
     period = parse_duration(text)
     if period < MIN_PERIOD:
-        raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; 'each' sends every message")
+        raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; to send every message, write 'each'")
     return period
 
 
@@ -187,7 +187,7 @@ def _meaning(text: str, *units: str) -> str:
 def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> int:
     match = _QUANTITY.fullmatch(text)
     if not match or match[3] not in units:
-        raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}{_meaning(text, *units)}")
+        raise ValueError(f"'{text}' is not a number with one of the units {', '.join(units)}{_meaning(text, *units)}")
     fraction = match[2] or ""
     amount, rest = divmod(int(match[1] + fraction) * units[match[3]], int("1" + "0" * len(fraction)))
     if rest:
