@@ -1,6 +1,6 @@
-"""Addresses of a table: IPv4 literals with a port, read strictly, and the `networks` that all of them must lie in.
+"""Addresses of a table: strict parsing of IPv4 literals with a port, and the check that they lie in `networks`.
 
-Names are never looked up: a table means the same on every machine.
+Host names are never resolved, so a table means the same on every machine.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _NO_MULTICAST = "broadcast and multicast are not supported"
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
 LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
-"""Zenoh's: tcp/192.168.0.10:7447. What may follow the address is no address of another machine."""
+"""A Zenoh locator: tcp/192.168.0.10:7447. The part after the address cannot name another machine."""
 
 
 class BadAddressError(ValueError):
-    """Why a text is no address, and what to do about it."""
+    """A text is not an address. `what` says why, `hint` what to do about it."""
 
     def __init__(self, what: str, hint: str = _EXAMPLE) -> None:
         super().__init__(what)
@@ -46,7 +46,7 @@ class BadAddressError(ValueError):
 
 
 def parse_address(text: str) -> Address:
-    """The address that the text names. Raises BadAddressError."""
+    """Parse an address. Raises BadAddressError."""
     host, colon, port = text.rpartition(":")
     if not colon or _is_ipv4(port):
         raise BadAddressError(f"'{text}' has no port")
@@ -62,7 +62,7 @@ def parse_address(text: str) -> Address:
 
 
 def parse_remote(text: str) -> Address:
-    """The address of one machine, to send to. Raises BadAddressError."""
+    """Parse the address of a single machine, as a destination. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) == 0 or _first(address) >= 224:
         raise not_one_machine(address)
@@ -74,7 +74,7 @@ def not_one_machine(address: Address) -> BadAddressError:
 
 
 def parse_local(text: str) -> Address:
-    """An address that this machine can have, or 0.0.0.0 for all that it has. Raises BadAddressError."""
+    """Parse an address of this machine, or 0.0.0.0 for all of them. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) >= 224:
         raise BadAddressError(f"{address.host} cannot be an address of this machine", _NO_MULTICAST)
@@ -118,11 +118,11 @@ ADDRESSES: tuple[Path, ...] = (
     *(("gateways", "*", "transport", name) for name in ("udp", "tcp", "websocket")),
     *(("gateways", "*", "transport", "zenoh", name, "*") for name in ("connect", "listen")),
 )
-"""Where addresses stand in a table; `*` is any name, or any item of a list."""
+"""Paths of all addresses in a table; `*` is any name, or any item of a list."""
 
 
 def outside_findings(root: MappingNode, networks: Networks, files: Sequence[str]) -> Iterator[Diagnostic]:
-    """`files` are those of the table, each before the one that it extends."""
+    """Yield findings for addresses outside `networks`. `files` are the table's, each before the one that it extends."""
     extended = files[files.index(networks.span.file) + 1 :]
     for pattern in ADDRESSES:
         for path, node in _found(root, pattern, ()):
@@ -166,7 +166,7 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
 
 
 def _moved(host: ipaddress.IPv4Address, network: ipaddress.IPv4Network) -> ipaddress.IPv4Address:
-    """The host of this number in a network; of number 0, which is no host, the first."""
+    """Return the address in a network with the host part of `host`; for host part 0, the first host."""
     number = int(host) & int(network.hostmask)
     return network.network_address + (number or min(1, network.num_addresses - 1))
 

@@ -1,7 +1,7 @@
 """YAML text to nodes: PyYAML's parser events, composed without recursion and with bounds.
 
-Plain scalars follow the core schema of YAML 1.2. What cannot be parsed is raised as TableError, in words that say what
-to do, at the line that has the mistake. What is merely wrong becomes a finding, and its node is marked broken.
+Plain scalars follow the core schema of YAML 1.2. Text that cannot be parsed raises TableError, which points at the
+mistake and says what to do. Other problems become findings, and their nodes are marked broken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's where this P
 
 @dataclass(slots=True)
 class _Collection:
-    """A mapping or sequence that is not closed yet. A mapping's children are key, value, key, value."""
+    """A mapping or sequence that is still open. A mapping's children are key, value, key, value."""
 
     event: yaml.CollectionStartEvent
     span: SourceSpan
@@ -36,7 +36,7 @@ class _Collection:
 
 
 def compose(source: Source, environ: Mapping[str, str], findings: list[Diagnostic]) -> Node:
-    """The one document of the text. Findings that leave a tree are appended to `findings`."""
+    """Compose the only document of the text. Non-fatal findings are appended to `findings`."""
     return _Composer(source, environ, findings).compose()
 
 
@@ -67,7 +67,7 @@ class _Composer:
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
-        last: yaml.Event | None = None  # that is written: an unclosed quote is taken for a key without a value
+        last: yaml.Event | None = None  # with text: an unclosed quote is parsed as a key without a value
         try:
             for event in yaml.parse(self._source.text, Loader=LOADER):
                 if not isinstance(event, yaml.ScalarEvent) or event.value or event.style:
@@ -81,14 +81,14 @@ class _Composer:
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
     def _open_quote(self, event: yaml.Event | None) -> SourceSpan | None:
-        """Where a quoted scalar over several lines begins, if that is what was read last."""
+        """Return where a multi-line quoted scalar begins, if that is the last event."""
         if not isinstance(event, yaml.ScalarEvent) or event.style not in ("'", '"'):
             return None
         line, column, end_line, _ = _marks(event)
         return self._source.span(line, column, line, column + 1) if end_line > line else None
 
     def _open_bracket(self) -> SourceSpan | None:
-        """Where the innermost '[' or '{' stands that is not closed yet."""
+        """Return the position of the innermost open '[' or '{'."""
         flow = [collection for collection in self._open if collection.event.flow_style]
         return flow[-1].span if flow else None
 
@@ -142,7 +142,7 @@ class _Composer:
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
-            # A variable by its name: its value may be secret.
+            # Shows a variable by name, since its value may be secret.
             what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
             hint = (f"{found.remedy}; for text, " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
@@ -185,7 +185,7 @@ class _Composer:
             elif key.text == "<<" and key.value == "<<":
                 broken = self._report(key.span, "tables do not support merge keys ('<<')", "write out the keys")
             elif key.text in entries and key.text in rests:
-                continue  # what the comma cut off has a finding already
+                continue  # already has a finding
             elif key.text in entries:
                 first = entries[key.text].key.span
                 what = f"the key '{key.text}' is already in this mapping, on line {first.line}"
@@ -195,7 +195,7 @@ class _Composer:
         return MappingNode(collection.span, entries, broken)
 
     def _without_slip(self, key: Node) -> Node:
-        """The key that is meant, with a finding if it is another one."""
+        """Return the key that is meant, and report a finding if it is misspelt."""
         if isinstance(key, ScalarNode) and key.place.is_whole_line:
             for pattern, what, hint in _KEY_SLIPS:
                 if match := pattern.fullmatch(key.text):
@@ -217,7 +217,7 @@ class _Composer:
         return self._report(span, f"tables do not support the tag '{name}'", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
-        """Add a finding; True, because what has one is broken."""
+        """Add a finding. Return True, the value of `broken` for its node."""
         self._findings.append(Diagnostic(span, Code.BAD_YAML, what, hint))
         return True
 
@@ -229,7 +229,7 @@ class _Composer:
 
 
 def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
-    """Line and column of the first character and of the one after the last, from 0."""
+    """Return line and column of the first character and of the end, from 0."""
     start, end = event.start_mark, event.end_mark
     if start is None or end is None:
         raise TypeError("the parser sets marks on every event")
@@ -244,7 +244,7 @@ _KEY_SLIPS = (
         "start list items with '- '; a key has no '-'",
     ),
 )
-"""What a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
+"""Characters that a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
 
 # Plain scalars
 
@@ -253,20 +253,20 @@ _WORDS: dict[str, Plain] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
-_INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python refuses to read far longer ones
+_INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python does not parse far longer ones
 _HEX = re.compile(r"0x[0-9a-fA-F]{1,300}")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
 
 class Surprise(NamedTuple):
-    """What some YAML readers take a scalar for, and how to say what one means."""
+    """How some YAML parsers interpret a scalar, and how to write it unambiguously."""
 
     meaning: str
     remedy: str
 
 
 _NUMBERS = frozenset("0123456789+-.")
-"""What a number begins with, and what nearly all other scalars do not."""
+"""First characters of numbers; nearly all other scalars begin differently."""
 _TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
 _OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
 _BINARY = Surprise("a binary number", "write a decimal number")
@@ -290,7 +290,7 @@ _NUMBER_SURPRISES = (
 
 
 def resolve(text: str) -> Plain:
-    """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` and `1e999` stay text."""
+    """Return the value of a plain scalar. Tables have no infinities or NaN: `.inf` and `1e999` stay text."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] not in _NUMBERS:
@@ -305,7 +305,7 @@ def resolve(text: str) -> Plain:
 
 
 def surprise(text: str) -> Surprise | None:
-    """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
+    """Return how YAML 1.1 interprets a plain scalar differently from YAML 1.2; None if it does not."""
     if text[:1] not in _NUMBERS:
         return _WORD_SURPRISES.get(text)
     return next((found for pattern, found in _NUMBER_SURPRISES if pattern.fullmatch(text)), None)

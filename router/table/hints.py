@@ -1,4 +1,4 @@
-"""Hints for keys and values that do not fit the schema: what people write by mistake, and what they mean."""
+"""Hints for keys and values that do not fit the schema: common mistakes, and what is meant by them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.table.source import in_braces
 from router.table.units import meant_quantity
 
 NAME_FIELDS = ("fields", "send")
-"""Keys under which the names of fields stand, each with an expression."""
+"""Keys whose mappings contain field names, each with an expression."""
 _ELSEWHERE = {
     "topic": ("name", "ros"),
     "endpoint": ("name", "to", "destination"),
@@ -50,7 +50,7 @@ _ELSEWHERE = {
     "from": ("source", "sender"),
     "case": ("payload", "type"),
 }
-"""Keys, with their names in other programs."""
+"""Our keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
 _IN_OTHER_WORDS = (
     ("address", ADDRESS_PARTS, "write the IP address and port together: `address: 192.168.0.30:8`"),
@@ -66,13 +66,13 @@ _IN_OTHER_WORDS = (
     ("extends", ("description", "name", "title"), "write descriptions as comments: `# ...`"),
     ("source", ("description", "comment", "note"), "write descriptions as comments: `# ...`"),
 )
-"""A known key, the keys that people write beside it by mistake, and the hint for these."""
+"""A known key, keys that people write beside it by mistake, and the hint for them."""
 CLOSE = 0.7
-"""The similarity of a misspelt key to the one that is suggested: `period` does not suggest `schema_period`."""
+"""Similarity required of a suggested key: `schema_period` is not suggested for `period`."""
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:
-    """The key among `known` that a misspelt one stands for."""
+    """Return the key among `known` that a misspelt one stands for, or None."""
     known = list(known)
     if ":" in name or in_other_words(name, known):
         return None
@@ -84,11 +84,11 @@ def in_other_words(name: str, known: Iterable[str]) -> str:
 
 
 _IN_WORDS = ("none", "ignore", "because")
-"""Keys whose value is a reason in words."""
+"""Keys whose value is a reason in prose."""
 
 
 def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
-    """A hint for a key that goes on with the words before it, or stands below fields and may be one of them."""
+    """Return a hint for a key that continues the text before it, or that may belong to the fields above it."""
     if before is None:
         return ""
     key, written = before[0], before[1].value
@@ -102,11 +102,11 @@ def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
 
 
 _NAMED = {"topics": "topic", "destinations": "endpoint"}
-"""Lists whose items are mappings, not keys of one, and the key that names an item."""
+"""Lists of mappings that people write as one mapping, and the key that names an item."""
 
 
 def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
-    """What to do about a key with this value that the mapping at `path` does not have."""
+    """Return a hint for an unknown key, with this value, of the mapping at `path`."""
     if words := in_other_words(name, known):
         return words
     if ":" in name:
@@ -124,9 +124,9 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
 
 
 def _owners(name: str, path: Path) -> str:
-    """A hint for a key that belongs elsewhere in a table; empty if there is no such key.
+    """Return a hint for a key that belongs elsewhere in a table; empty if there is no such key.
 
-    Definitions of the same name as the one at `path` are skipped: deadmen are of two kinds.
+    Skips definitions of the same name as the one at `path`: there are two kinds of deadmen.
     """
     definitions = table_schema()["definitions"]
     others = (*map(str, path[-1:]), "defaults")
@@ -140,7 +140,7 @@ def _owners(name: str, path: Path) -> str:
 
 
 def for_value(error: SchemaError) -> str:
-    """A hint that says which value was meant, where that is clear."""
+    """Return a hint with the value that was meant, if that is clear."""
     value = str(error.value)
     if error.keyword == "pattern":
         pattern = error.limit
@@ -158,7 +158,7 @@ def for_value(error: SchemaError) -> str:
 
 
 _OPTIONAL = ("ttl", "age", "max_rate")
-"""Limits of which there are none where the key is missing."""
+"""Limits that do not apply if the key is missing."""
 _QOS_WORDS = {
     "reliable": "reliability: reliable",
     "best_effort": "reliability: best_effort",
@@ -166,7 +166,7 @@ _QOS_WORDS = {
     "latched": "durability: transient_local",
     "keep_all": "history: keep_all",
 }
-"""Words that are no profile, and the key that they belong to."""
+"""Words that are not a profile, and the setting that they stand for."""
 _LOCAL = "{{address: {0}}}"
 _INSTEAD: Mapping[Path, str] = {
     ("listen",): "{{rover: {{address: {0}}}}}",
@@ -181,7 +181,7 @@ _INSTEAD: Mapping[Path, str] = {
     ("gateways", "*", "topics"): "{{include: [{0}]}}",
     ("gateways", "*", "inbound", "*"): "{{topic: {0}, type: TYPE}}",
 }
-"""Mappings, and what to write in place of the one value that stands there."""
+"""Mappings that people write as a single value, and what to write instead."""
 
 
 _BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gateways",))
@@ -189,7 +189,7 @@ _BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gatewa
 
 
 def for_type(error: SchemaError, tree: Node) -> str:
-    """What to do about a value of the wrong type, where that is clear."""
+    """Return a hint for a value of the wrong type, if the remedy is clear."""
     name, value = str(error.path[-1]) if error.path else "", error.value
     if value is None:
         return _for_nothing(error, tree, name)
@@ -222,7 +222,7 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
 
 
 def _decimal(siblings: MappingNode, name: str) -> str:
-    """`1.5` for `{x: y + 1,5}`, where `name` is what stands behind the ','; empty for anything else."""
+    """Return `1.5` for `{x: y + 1,5}`, where `name` is the part after the ','; empty for anything else."""
     names = list(siblings.entries)
     before = siblings.get(names[names.index(name) - 1]) if names.index(name) else None
     whole = re.search(r"(?<![\w.])\d+$", before.text) if isinstance(before, ScalarNode) else None
@@ -231,7 +231,7 @@ def _decimal(siblings: MappingNode, name: str) -> str:
 
 
 def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
-    """The value in the form that its key takes."""
+    """Return a hint with the value in the form that its key takes."""
     if isinstance(value, str) and _is_of(error.limit, resolve(value)):
         return f"write it without quotes: {value}"
     if hint := _for_collection(error, value):
@@ -254,7 +254,7 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
 
 
 def without_case(fields: Mapping[str, object]) -> str:
-    """A hint for fields that stand below `send` of a deadman, without their payload case; empty for anything else."""
+    """Return a hint for fields directly below `send` of a deadman, without a payload case; empty for anything else."""
     written = [f"{name}: {shown}" for name, value in fields.items() if (shown := _in_flow(value)) is not None]
     if len(written) < len(fields):
         return ""
@@ -280,7 +280,7 @@ def _is_at(path: Path, place: Path) -> bool:
 
 
 def _in_flow(value: object) -> str | None:
-    """A scalar, or the scalars of a list, as they stand within brackets; None for anything else."""
+    """Return a scalar, or the scalars of a list, as written inside brackets; None for anything else."""
     if isinstance(value, list):
         items = [_in_flow(item) for item in value]
         return None if None in items or not items else ", ".join(item for item in items if item)
@@ -290,5 +290,5 @@ def _in_flow(value: object) -> str | None:
 
 
 def as_variable(text: str) -> str:
-    """A hint for a variable that is written as in a shell."""
+    """Return a hint for a variable that is written as in a shell; empty for anything else."""
     return f'write "{in_braces(text)}"' if in_braces(text) != text else ""

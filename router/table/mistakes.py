@@ -1,7 +1,7 @@
-"""Mistakes in writing YAML, in words that say what to do, at the line that has the mistake.
+"""Findings for mistakes in YAML, at the line with the mistake, with a remedy.
 
-Some make the text no YAML (`explain`). One is YAML and means something else than it seems to: a comment that looks like
-the rest of an expression, as in `x # 1000` (`cut_findings`).
+`explain` handles syntax errors. `cut_findings` handles one mistake that is valid YAML: a comment that looks like the
+rest of an expression, as in `x # 1000`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from router.table.source import Source
 
 
 class _Advice(NamedTuple):
-    """What is wrong and what to do. With `at_start` the place is where the construct begins."""
+    """What is wrong and what to do. With `at_start`, the finding points at the beginning of the construct."""
 
     what: str
     hint: str = ""
@@ -75,7 +75,7 @@ _NO_BEGINNING = (
     "did not find expected alphabetic or numeric character",
     "did not find expected whitespace or line break",
 )
-"""Problems with the sign that a value begins with. The last three are found behind it."""
+"""Problems with the first character of a value. The last three are detected after it."""
 _UNBEGUN = {
     ",": _Advice("a value is missing before this ','", "remove the ','"),
     "-": _Advice("an item in brackets does not start with '-'", "remove the '-', or the brackets"),
@@ -89,7 +89,7 @@ _SLIPS = (
     (re.compile(r" *(//|/\*|--(?!\S))"), _COMMENT_SIGN),
     (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "start list items with '- '")),
 )
-"""What begins a line only by mistake. YAML often fails no earlier than in the next line."""
+"""Beginnings of lines that are always mistakes. YAML often fails only on the next line."""
 _AFTER_VALUE = (
     (re.compile(r"//|/\*|--(?!\S)"), _COMMENT_SIGN),
     (
@@ -101,30 +101,30 @@ _AFTER_VALUE = (
         _Advice("the value ends before this", "quote the whole expression, as in \"'gps_' + str(index)\""),
     ),
 )
-"""What stands behind a value that is quoted or in brackets as if it went on."""
+"""Text after a quoted or bracketed value that looks like a continuation of it."""
 _FOREIGN = re.compile(
     r"(?:^|[-:,?{}\[\]])\s*?(?P<at_start>[^\S \t]|[\u200b-\u200d\u2060\u2013\u2014\u2018-\u201f])"
     r"|(?<=[!-~])(?P<inside>[\uff0c\uff1a\uff1b\uff3b\uff3d\uff5b\uff5d])"
 )
-"""Blanks, quotes and dashes of word processors where a value or key begins; wide signs after plain characters."""
+"""Typographic spaces, quotes and dashes where a value or key begins; full-width signs after ASCII characters."""
 _ASCII = str.maketrans("\u2013\u2014\u2018\u2019\u201c\u201d", "--''\"\"")
 _HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t]))#.*""")
 _SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
 _WITHOUT_COLON = re.compile(r"(?!(?:if|else|and|or|not|in)\b)([\w./]+)(?: *[=:]>? *(.+)| +(\S+))?")
 _IN_WORDS = re.compile(r"[{,] *(?P<key>none|ignore|because): +(?P<text>[^\"',{}\[\]:][^,{}\[\]]*)$")
-"""A reason in words, which has a ':' in it."""
+"""A reason in prose that contains a ':'."""
 _WITHOUT_COMMA = re.compile(r"[:,{\[] *([^\s,;:]+);? +([\w.]+) *$")
 
 
 def explain(
     error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None, open_bracket: SourceSpan | None
 ) -> Diagnostic:
-    """The finding for one syntax error.
+    """Return the finding for a syntax error.
 
-    `open_quote` is where the quoted scalar before the error begins, if it goes over several lines: then
-    its closing quote is most likely the next one's opening quote. `open_bracket` is the innermost
-    bracket around the error: where the text ends within it, it lacks its counterpart.
+    `open_quote` is the start of the quoted scalar before the error, if it spans several lines: its closing quote is
+    then most likely the opening quote of the next one. `open_bracket` is the innermost bracket around the error. If the
+    text ends inside it, its closing bracket is missing.
     """
     line = error.problem_mark.line if error.problem_mark else 0
     column = error.problem_mark.column if error.problem_mark else 0
@@ -159,7 +159,7 @@ _NO_EXCLAMATION = "a value cannot start with '!'"
 
 
 def exclamation(source: Source, line: int) -> Diagnostic | None:
-    """The finding for `!(a > b)`, as other languages write `not`."""
+    """Return a finding for `!(a > b)`, which is `not` in other languages; None without."""
     for number in (line, *_line_before(source, line)):
         text = source.lines[number] if number < len(source.lines) else ""
         if match := _EXCLAMATION.search(text):
@@ -171,7 +171,7 @@ def exclamation(source: Source, line: int) -> Diagnostic | None:
 
 
 def _closing(text: str, start: int) -> int:
-    """Where the bracket that is open at `start` is closed; the end of the text if it is not."""
+    """Return where the bracket that is open at `start` closes; the end of the text if it does not."""
     opened = 1
     for at, character in enumerate(text[start:], start):
         opened += (character == "(") - (character == ")")
@@ -181,7 +181,7 @@ def _closing(text: str, start: int) -> int:
 
 
 def _slip(source: Source, line: int) -> Diagnostic | None:
-    """The finding for what has no place in the line, or in the one before it, and makes YAML fail."""
+    """Return a finding for text in the line, or in the one before it, that YAML does not allow; None without."""
     for number in (*_line_before(source, line), line):
         text = _text(source, number)
         for pattern, advice in _SLIPS:
@@ -243,7 +243,7 @@ def _colon(problem: str, before: str, after: str) -> _Advice | None:
 
 
 def _no_beginning(written: str, column: int) -> _Advice:
-    """For the first character of a value, and for one behind a value that could begin another one."""
+    """Return advice for the first character of a value, or for one after a value that could begin another."""
     character = written[column]
     if written[:column].rstrip()[-1:] in {*"\"'])}"}:
         return _behind_value(written, column, "")._replace(at_start=True)
@@ -253,7 +253,7 @@ def _no_beginning(written: str, column: int) -> _Advice:
 
 
 def _behind_value(written: str, column: int, closing: str) -> _Advice:
-    """For what follows a value, where only the end of the line, or ',' or `closing`, can."""
+    """Return advice for text after a value, where only the end of the line, ',' or `closing` is allowed."""
     character = written[column : column + 1]
     for pattern, advice in _AFTER_VALUE:
         if pattern.match(written, column):
@@ -269,19 +269,19 @@ def _behind_value(written: str, column: int, closing: str) -> _Advice:
 
 
 def _is_only_item(source: Source, first: int, line: int) -> bool:
-    """Whether the list that begins in line `first` has one item, a mapping, and `line` is a key beside it."""
+    """Return whether the list that begins on line `first` has one item, a mapping, and `line` is a key beside it."""
     dash = f"{' ' * _indent(source.lines[line])}-"
     items = [text for text in source.lines[first:line] if text.startswith(dash)]
     return len(items) == 1 and bool(_SEPARATOR.search(_text(source, first)))
 
 
 def _line_before(source: Source, line: int) -> list[int]:
-    """The last line before it that has more than a comment; empty if there is none."""
+    """Return the last line before `line` that has more than a comment; empty if there is none."""
     return next(([number] for number in reversed(range(line)) if _text(source, number)), [])
 
 
 def _bare_line(source: Source, line: int) -> int | None:
-    """The line, or the one before it, that lacks the ': ' which makes it a key."""
+    """Return the line, or the one before it, if it lacks the ': ' of a key; else None."""
     for number in (line, *_line_before(source, line)):
         text = _text(source, number)
         is_above = number < line and _keys_at(source, number) == _keys_at(source, line)
@@ -311,7 +311,7 @@ def _spaced(text: str) -> str:
 
 
 def _neighbours(source: Source, line: int) -> list[int]:
-    """How far the keys and items above that could go on in this line are indented; empty if it is one of them."""
+    """Return the indentations at which this line could continue the keys and items above; empty if it has one."""
     if line >= len(source.lines):
         return []
     own, open_at = _indent(source.lines[line]), list[int]()
@@ -336,9 +336,9 @@ _KEY = re.compile(r"[ -]*([\w.]+):(?: |$)")
 
 
 def _too_shallow(source: Source, line: int) -> Diagnostic | None:
-    """The finding for a key above that left its mapping, so that this line, one of its mapping's, has no place.
+    """Return a finding for a key above that is indented too little, so that this line is misplaced; None without.
 
-    That a mapping of that depth has no such key tells it from a line that is indented too far.
+    If a mapping of that depth can have such a key, this line is indented too far instead.
     """
     own = _indent(source.lines[line]) if line < len(source.lines) else 0
     above = [number for number in reversed(range(line)) if _text(source, number)]
@@ -368,7 +368,7 @@ def _indented(source: Source, line: int, what: str) -> Diagnostic:
 
 
 def _odd_line_above(source: Source, line: int) -> int | None:
-    """The one line that is indented by a space more or less than this line and the next one; None without."""
+    """Return the only line above that is indented one space more or less than this line and the next; None without."""
     own = _indent(source.lines[line])
     written = [(number, _indent(text)) for number, text in enumerate(source.lines) if _text(source, number)]
     if own != next((indent for number, indent in written if number > line and indent <= own), None):
@@ -385,14 +385,14 @@ def _odd_line_above(source: Source, line: int) -> int | None:
 
 
 def _text(source: Source, line: int) -> str:
-    """The line without its comment, and with quotes in place of quoted text; empty where there is nothing else."""
+    """Return the line without its comment, with quotes in place of quoted text; empty if nothing else is left."""
     text = source.lines[line] if line < len(source.lines) else ""
     text = _HIDDEN.sub(lambda match: '"' * len(match[1] or ""), text).rstrip(" \t")
     return text if text.strip(" ") else ""
 
 
 def _keys_at(source: Source, line: int) -> int:
-    """How far in the first key of a line stands; the dash of an item counts as indentation."""
+    """Return the column of the first key of a line; the dash of an item counts as indentation."""
     text = source.lines[line]
     return len(text) - len(text.lstrip(" -"))
 
@@ -405,12 +405,12 @@ def _indent(text: str) -> int:
 
 
 _EXPRESSIONS = ("fields", "send", "when", "for_each", "by", "count", "order")
-"""Keys of routes below which expressions stand."""
+"""Keys of routes whose values are expressions."""
 _REST = re.compile(r"\s+#\s*(?:[-+*/%<>]\s*\w[\w.]*|\d+(?:\.\d*)?(?:e-?\d+)?)\s*")
 
 
 def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagnostic]:
-    """A warning for each expression of the routes before a comment that is only a number, or an operator and a word."""
+    """Yield a warning for each expression before a comment that is only a number, or an operator and a word."""
     lines = {source.file: source.lines for source in sources}
     for node in _expressions(root.get("routes"), is_expression=False):
         span = node.span

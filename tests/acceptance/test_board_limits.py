@@ -1,4 +1,4 @@
-"""What a board cannot decode, or must not get, is not sent to it and feeds no deadman; one with nanopb says the same."""
+"""What a board cannot take, or must not get, is not sent to it and feeds no deadman; one with nanopb says the same."""
 
 from __future__ import annotations
 

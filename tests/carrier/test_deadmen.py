@@ -47,7 +47,7 @@ PLAN = DeadmanPlan("drive", 500, 100, (("wheels", b"brake"), ("arm", b"hold")))
 
 
 class Outlet:
-    """An endpoint in memory, which uses the address of its `struct sender` as a NativeSender has."""
+    """An endpoint in memory, which has the address of its `struct sender` as a NativeSender has."""
 
     def __init__(self, library: ctypes.CDLL, stack: ExitStack) -> None:
         pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -16,7 +16,7 @@ TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a board cannot decode a datagram: TOO_LARGE or NON_FINITE, and in words."""
+    """Why a board cannot take a datagram: TOO_LARGE or NON_FINITE, and in words."""
 
     reason: str
     text: str
