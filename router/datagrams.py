@@ -1,4 +1,4 @@
-"""Datagrams built from payloads and taken apart, one by one: for tools and messages, not for the running routes."""
+"""Building and parsing of single datagrams, for tools and log messages. Routes do not use it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Peer = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A payload and its case. `zeros` were put back at the end of the datagram; negative: taken off."""
+    """A payload and its case. `zeros` is the number of trailing zeros restored, or removed if negative."""
 
     case: PayloadCase
     message: Message
@@ -45,7 +45,7 @@ class Wire:
         return self.envelope.cases[name]
 
     def encode(self, case: PayloadCase, payload: Message) -> bytes:
-        """The exact encoding of an envelope that holds this payload."""
+        """Return the exact encoding of an envelope with this payload."""
         outer = self.envelope.message_class()
         inner = getattr(outer, case.name)
         inner.SetInParent()
@@ -53,14 +53,14 @@ class Wire:
         return outer.SerializeToString()
 
     def decode(self, datagram: bytes) -> Decoded:
-        """Take a datagram apart as a listener with `framing: zero_trimmed` does.
+        """Parse a datagram as a listener with `framing: zero_trimmed` does.
 
-        Raises DecodeError, which begins with the reason that the router counts such a datagram under.
+        Raises DecodeError, which begins with the reason under which the router counts such a datagram.
         """
         if not datagram:
             raise DecodeError("empty")
         if len(datagram) > MAX_DATAGRAM:
-            raise DecodeError(f"truncated: {len(datagram)} bytes, the router takes {MAX_DATAGRAM}")
+            raise DecodeError(f"truncated: {len(datagram)} bytes; the limit is {MAX_DATAGRAM}")
         whole = restored(datagram)
         try:
             outer = self.envelope.message_class.FromString(whole)
@@ -74,9 +74,9 @@ class Wire:
 
 
 def wire_of_table(table: RouteTable) -> Wire:
-    """The envelope that the table names. Raises TableError, and UsageError where it names none."""
+    """Return the envelope of the table. Raises TableError, and UsageError if the table has none."""
     if table.envelope is None:
-        raise UsageError(f"{shown_path(table.path)} has no 'envelope': there are no datagrams to build or to read")
+        raise UsageError(f"{shown_path(table.path)} has no 'envelope', so there are no datagrams to build or parse")
     settings = table.envelope
     return Wire(
         find_envelope(load_protos(settings.protos, settings.message, settings.lock, settings.exclude), settings.oneof)
@@ -91,9 +91,9 @@ def wire_of_protos(root: Path) -> Wire:
 
 
 def framed(exact: bytes, trim: bool, pad: int) -> bytes:
-    """A datagram as boards may send it: without its trailing zeros, then filled with zeros up to `pad` bytes.
+    """Return a datagram as boards may send it: without trailing zeros, then padded with zeros to `pad` bytes.
 
-    Raises UsageError for one that is longer than `pad`.
+    Raises UsageError if it is longer than `pad`.
     """
     sent = exact.rstrip(b"\0") if trim else exact
     if pad and len(sent) > pad:
@@ -102,9 +102,9 @@ def framed(exact: bytes, trim: bool, pad: int) -> bytes:
 
 
 def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool) -> str:
-    """Say in words what is wrong with a datagram of `length` bytes, of which `data` may be the beginning.
+    """Describe what is wrong with a datagram of `length` bytes; `data` may be only its beginning.
 
-    `repairs`: the listener puts back zeros. Of a datagram with a payload, return its case: no route takes that.
+    `repairs`: the listener restores zeros. For a datagram with a payload, return its case: no route accepts it.
     """
     if length > MAX_DATAGRAM:
         return f"{length} bytes"
@@ -130,33 +130,33 @@ def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tupl
         return "no_payload", ""
     # A payload case among the unknown fields has the wrong wire type.
     if known := [number for number in numbers if number in cases]:
-        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is no message here")
+        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is not a message")
     return "unknown_case", f"field {numbers[0]}"
 
 
 def _why_malformed(envelope: Envelope, datagram: bytes, what: str = "") -> str:
-    """Say what is wrong, and what most likely causes it: firmware that frames an envelope, or sends none."""
+    """Describe what is wrong, and its likely cause: firmware that frames an envelope, or sends none."""
     cause = _framing(envelope, datagram) or _bare_payload(envelope, datagram)
-    return "; ".join(filter(None, (what or f"no {envelope.name}", cause)))
+    return "; ".join(filter(None, (what or f"does not parse as {envelope.name}", cause)))
 
 
 _CHECKSUMS = (1, 2, 4)
-"""Bytes of what serial protocols send behind a message."""
+"""Sizes in bytes of checksums that serial protocols append to a message."""
 
 
 def _framing(envelope: Envelope, datagram: bytes) -> str:
-    """What stands before or behind an envelope that is complete."""
+    """Describe a length or a checksum around a complete envelope; empty if there is none."""
     for size, length in _lengths(datagram):
         if length == len(datagram) - size and _has_payload(envelope, datagram[size:]):
-            return f"its own length ({_bytes(size)}) stands before it: send the envelope alone"
+            return f"a length ({_bytes(size)}) precedes the envelope: send the envelope alone"
     for size in _CHECKSUMS:
         if _has_payload(envelope, datagram[:-size]):
-            return f"{_bytes(size)} stand behind it, as a checksum would: send the envelope alone"
+            return f"{_bytes(size)} after the envelope look like a checksum: send the envelope alone"
     return ""
 
 
 def _lengths(datagram: bytes) -> Iterator[tuple[int, int]]:
-    """The numbers that a datagram may begin with, each behind the bytes that it takes."""
+    """Yield the lengths that a datagram may begin with, each as (bytes that it occupies, value)."""
     try:
         length, size = read_varint(datagram, 0)
     except IndexError:
@@ -173,7 +173,7 @@ def _has_payload(envelope: Envelope, data: bytes) -> bool:
 
 
 def _bare_payload(envelope: Envelope, datagram: bytes) -> str:
-    """The payload cases that a datagram may be without its envelope."""
+    """Name the payload cases that a datagram without an envelope may be; empty if there are none."""
     cases = [case.name for case in envelope.cases.values() if _parsed(case.message_class, datagram)]
     if not cases:
         return ""
@@ -185,7 +185,7 @@ _MOST_NAMED = 3
 
 
 def _parsed(message_class: MessageClass, data: bytes) -> Message | None:
-    """The message, if it has fields and knows them all."""
+    """Parse a message; None unless it has fields and all of them are known."""
     try:
         message = message_class.FromString(data)
     except ProtobufError:

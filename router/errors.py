@@ -1,4 +1,4 @@
-"""What can be wrong, and where: source spans, diagnostics with a closed list of codes, the exceptions."""
+"""Source spans, diagnostics with a closed list of codes, and exceptions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, order=True)
 class SourceSpan:
-    """A stretch of one line of a file that a person wrote.
+    """Part of one line of a source file.
 
-    `line` and `column` count from 1; `end_column` is exclusive. What covers several lines is blamed on
-    its first. A span without a place in the file (a file that cannot be read) has line 1, column 1.
+    `line` and `column` count from 1; `end_column` is exclusive. A finding about several lines points at the first.
+    A span without a position, for example of an unreadable file, has line 1, column 1.
     """
 
     file: str
@@ -30,13 +30,13 @@ class SourceSpan:
         return f"{self.file}:{self.line}:{self.column}"
 
     def part(self, start: int, end: int) -> SourceSpan:
-        """The characters `start` to `end` (from 0, `end` exclusive) of this span."""
+        """Return the span of the characters `start` to `end` (from 0, `end` exclusive) of this one."""
         return SourceSpan(self.file, self.line, self.column + start, self.column + max(end, start + 1))
 
 
 @dataclass(frozen=True, slots=True)
 class Located(Generic[T]):
-    """A value and the place that it was read from."""
+    """A value and its position in the source."""
 
     value: T
     span: SourceSpan
@@ -48,7 +48,7 @@ class Severity(enum.Enum):
 
 
 class Code(enum.Enum):
-    """Every kind of finding. Tests match the code, people read the sentence; the list is closed."""
+    """A kind of finding. The list is closed: tests match the code, people read the message."""
 
     meaning: str
 
@@ -59,78 +59,84 @@ class Code(enum.Enum):
         return code
 
     # the text
-    BAD_FILE = ("bad-file", "A file cannot be read, or holds something else than it should.")
+    BAD_FILE = ("bad-file", "A file cannot be read, or does not contain what it should.")
     BAD_YAML = (
         "bad-yaml",
-        "The table is not YAML, or uses YAML that tables do not have (tags, merge keys, several documents).",
+        "The table is not YAML, or uses YAML that tables do not support (tags, merge keys, several documents).",
     )
     DUPLICATE_KEY = ("duplicate-key", "A mapping has the same key twice.")
     AMBIGUOUS_SCALAR = (
         "ambiguous-scalar",
-        "A plain word or number that YAML parsers read differently (`on`, `0777`, `12:30`).",
+        "A plain word or number that YAML parsers interpret differently (`on`, `0777`, `12:30`).",
     )
-    UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has no value in the environment, and no default.")
-    BAD_EXTENDS = ("bad-extends", "The table that `extends` names is missing, or extends this one.")
+    UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has neither a value in the environment nor a default.")
+    BAD_EXTENDS = ("bad-extends", "The table named by `extends` is missing, or extends this one.")
     # the shape
-    UNKNOWN_KEY = ("unknown-key", "A key that this place does not have.")
-    MISSING_KEY = ("missing-key", "A key that this place must have.")
-    WRONG_TYPE = ("wrong-type", "A value of another kind than the key takes.")
-    BAD_VALUE = ("bad-value", "A value of the right kind that makes no sense here.")
+    UNKNOWN_KEY = ("unknown-key", "A key that is not allowed here.")
+    MISSING_KEY = ("missing-key", "A required key is missing.")
+    WRONG_TYPE = ("wrong-type", "A value of the wrong type for its key.")
+    BAD_VALUE = ("bad-value", "A value of the right type that makes no sense here.")
     BAD_ADDRESS = ("bad-address", "Not an IPv4 address with a port.")
-    UNKNOWN_QOS_VALUE = ("unknown-qos-value", "A word that is no setting of ROS QoS.")
+    UNKNOWN_QOS_VALUE = ("unknown-qos-value", "Not a ROS QoS setting.")
     # the wire definitions
-    BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
+    BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares something that cannot be routed.")
     UNUSED_PROTO = ("unused-proto", "A `.proto` file that the envelope does not import is broken, or clashes.")
-    UNUSED_OPTION = ("unused-option", "A line of an `.options` file names nothing in its `.proto` file.")
+    UNUSED_OPTION = ("unused-option", "A line of an `.options` file matches nothing in its `.proto` file.")
     WIRE_NUMBER_CONFLICT = (
         "wire-number-conflict",
         "A field number was reused, renumbered, retyped or renamed, or the envelope is another message.",
     )
-    DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have one name.")
+    DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have the same name.")
     NOT_LOCKED = ("not-locked", "`envelope.lock.json` does not record this yet: run `router schema lock`.")
     # the names
-    UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
+    UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that is not in the envelope.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
-    UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
-    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that `listen` does not have.")
-    UNUSED_LISTENER = ("unused-listener", "A listener that no endpoint which sends is believed by.")
+    UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that is not in `endpoints`.")
+    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that is not in `listen`.")
+    UNUSED_LISTENER = ("unused-listener", "A listener that accepts none of the sending endpoints.")
     ADDRESS_CLASH = (
         "address-clash",
-        "Two want one local address or Zenoh key, or two endpoints could not be told apart.",
+        "Two local addresses or Zenoh keys are the same, or two endpoints cannot be told apart.",
     )
-    OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to find others, beyond the table's `networks`.")
+    OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to discover others, outside the table's `networks`.")
     FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or this router.")
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
     TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes or gateways give one topic different types.")
-    UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
+    UNKNOWN_ROS_TYPE = ("unknown-ros-type", "Neither an installed package nor `schemas/` defines this interface.")
     UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
-    UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "An enum, or a ROS type's constants, have no such name.")
-    MISSING_ENUM_VALUE = ("missing-enum-value", "A `map` without `else` that leaves out values.")
+    UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "Not a value of the enum, or not a constant of the ROS type.")
+    MISSING_ENUM_VALUE = ("missing-enum-value", "A `map` without `else` that does not cover every value.")
     QOS_CONFLICT = (
         "qos-conflict",
-        "QoS settings that contradict each other, or that keep publisher and subscriber apart.",
+        "QoS settings that contradict each other, or that keep publisher and subscription from connecting.",
     )
-    BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this: no fixed size, too large, or not finite.")
-    NO_TARGET = ("no-target", "A route that goes nowhere.")
-    SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
-    NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")
-    DOUBTFUL_DEADMAN = ("doubtful-deadman", "A deadman that may not serve its purpose, such as one that waits 500 s.")
+    BOARD_PAYLOAD = (
+        "board-payload",
+        "A payload that a board's firmware cannot decode: no fixed size, too large, or not finite.",
+    )
+    NO_TARGET = ("no-target", "A route without destinations or topics.")
+    SOURCE_CLASH = ("source-clash", "Two routes of one payload case have the same source.")
+    NO_DEADMAN = ("no-deadman", "Nothing stops the board when its commands stop arriving.")
+    DOUBTFUL_DEADMAN = (
+        "doubtful-deadman",
+        "A deadman that may not serve its purpose, for example with a timeout of 500 s.",
+    )
     # the mapping
-    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two fields that exclude each other.")
+    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two members of one oneof.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
-    EXPRESSION_SYNTAX = ("expression-syntax", "Not an expression.")
+    EXPRESSION_SYNTAX = ("expression-syntax", "Not a valid expression.")
     CUT_EXPRESSION = (
         "cut-expression",
-        "A comment that is only a number, or an operator with a word, behind an expression.",
+        "A comment that looks like the rest of the expression before it.",
     )
-    FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")
+    FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python syntax that expressions do not support.")
     UNKNOWN_FUNCTION = ("unknown-function", "A function that is not listed in [functions](functions.md).")
     WRONG_ARGUMENTS = ("wrong-arguments", "A call with too many, too few or unsuitable arguments.")
     TYPE_MISMATCH = (
         "type-mismatch",
-        "A value of a type that does not fill this field, or that an operator does not take.",
+        "A value whose type does not fit the field or the operator.",
     )
-    LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could lose something without saying so.")
+    LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could silently lose information.")
     OUT_OF_RANGE = ("out-of-range", "A value that can never fit.")
     TOO_LARGE = ("too-large", "An expression or mapping that is too large for the router.")
 
@@ -155,7 +161,7 @@ _WARNINGS = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One finding: where, of which kind, what is wrong, and what to do about it."""
+    """A finding: its position and kind, what is wrong, and what to do about it."""
 
     span: SourceSpan
     code: Code
@@ -173,11 +179,11 @@ class Diagnostic:
 
 
 class RouterError(Exception):
-    """The root of everything that this package raises on purpose."""
+    """Base class of all exceptions that this package raises on purpose."""
 
 
 class TableError(RouterError):
-    """The route table, or what it refers to, is wrong; carries every finding."""
+    """The route table, or something that it refers to, is invalid. Carries all findings."""
 
     def __init__(self, diagnostics: Sequence[Diagnostic]) -> None:
         super().__init__("\n".join(map(str, diagnostics)))
@@ -185,12 +191,12 @@ class TableError(RouterError):
 
     @classmethod
     def of(cls, span: SourceSpan, code: Code, message: str, hint: str = "") -> TableError:
-        """The error with one finding."""
+        """Return an error with one finding."""
         return cls([Diagnostic(span, code, message, hint)])
 
 
 class FindingError(RouterError):
-    """Ends the check of one part of a table with what is wrong in it."""
+    """Ends the check of one part of a table with a finding."""
 
     def __init__(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
         self.diagnostic = Diagnostic(span, code, message, hint)
@@ -198,7 +204,7 @@ class FindingError(RouterError):
 
 
 class OperatorError(RouterError):
-    """What an operator can see to: `what` is one line that says what is wrong and why, `hint` what to do about it."""
+    """An error that an operator can fix: `what` says in one line what is wrong and why, `hint` what to do about it."""
 
     def __init__(self, what: str, hint: str = "") -> None:
         super().__init__(what, hint)
@@ -211,7 +217,7 @@ class OperatorError(RouterError):
 
 
 class UsageError(OperatorError):
-    """What the operator asked for cannot be done."""
+    """The operator's request cannot be carried out."""
 
 
 class StartError(OperatorError):
@@ -219,7 +225,7 @@ class StartError(OperatorError):
 
 
 class DecodeError(RouterError):
-    """The sender's fault: a datagram that is no envelope, or a payload that is no such message."""
+    """Invalid data from a sender: a datagram that is not an envelope, or a payload that is not of its type."""
 
 
 class MappingError(RouterError):
@@ -227,15 +233,15 @@ class MappingError(RouterError):
 
 
 class NonFiniteError(MappingError):
-    """NaN or an infinity where the target can only hold a finite value."""
+    """NaN or infinity where the target can only hold a finite value."""
 
 
 class TransportError(OperatorError):
-    """The network's fault: a datagram or a ROS message could not be handed over."""
+    """A network failure: a datagram or a ROS message could not be handed over."""
 
 
 def shown_path(path: Path) -> str:
-    """How findings name a file: relative to the working directory where it is below it."""
+    """Return a path as findings show it: relative to the working directory if it is inside that."""
     absolute = path.absolute()
     try:
         return str(absolute.relative_to(Path.cwd()))
@@ -244,7 +250,7 @@ def shown_path(path: Path) -> str:
 
 
 def nearest_path(path: Path) -> Path | None:
-    """The file or folder beside a path that is not there which it most likely stands for."""
+    """Return the file or folder that a missing path most likely stands for: a sibling with a similar name, or None."""
     try:
         near = nearest(path.name, (other.name for other in path.parent.iterdir() if other != path))
     except OSError:
@@ -258,16 +264,16 @@ def plural(count: int, noun: str) -> str:
 
 
 def did_you_mean_file(written: str, path: Path) -> str:
-    """A hint for `path` that is not there, in the words of who wrote it; empty where none beside it is near."""
+    """Return a hint for a missing `path`, spelled like `written`; empty if no sibling has a similar name."""
     near = nearest_path(path)
     return f"did you mean '{written.removesuffix(path.name)}{near.name}'?" if near else ""
 
 
 def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
-    """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal.
+    """Return the known name that `name` most likely stands for, or None. With a `closeness` of 1 they must be equal.
 
-    The same words in another order are near. What all known names begin with does not count: `MODE_X` is not near
-    `MODE_A`.
+    Names with the same words in another order are similar. A prefix that all known names share does not count:
+    `MODE_X` is not similar to `MODE_A`.
     """
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
     words = sorted(name.lower().split("_"))
@@ -287,20 +293,20 @@ def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | No
 
 
 _HALF = 0.5
-"""Likeness from which on the ends of names with a common start are near: in `MODE_OM` one of two letters is right."""
+"""Similarity required of names without a shared prefix: in `MODE_OM`, one of two letters is right."""
 _SHORTEST = 3
-"""Letters with which a name begins that stand for all of it."""
+"""Length from which the beginning of a name can stand for all of it."""
 
 
 def _likeness(known: str, wanted: str) -> float:
-    """From 0 to 1: what both have in common, and a little more if they begin alike or have the same letters."""
+    """Return the similarity, 0 to 1, slightly raised if both begin alike or have the same letters."""
     ratio = difflib.SequenceMatcher(a=known, b=wanted).ratio()
     alike = next((at for at, pair in enumerate(zip(known, wanted, strict=False)) if len({*pair}) > 1), len(wanted))
     return ratio + (1 - ratio) * (min(alike, 4) * 0.1 + (sorted(known) == sorted(wanted)) * 0.1)
 
 
 def _common_start(names: Collection[str]) -> str:
-    """The whole words that several names all begin with, such as `board_mode_`; empty if there are none."""
+    """Return the whole words that all of several names begin with, such as `board_mode_`; empty if there are none."""
     if len(names) <= 1:
         return ""
     first, last = min(names), max(names)
@@ -321,7 +327,7 @@ def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str
 
 
 MOST_MEANT = 3
-"""Of the names that a hint offers."""
+"""Maximum number of names in a hint."""
 
 
 def one_of(names: Sequence[str]) -> str:

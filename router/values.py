@@ -1,7 +1,7 @@
-"""Values of message fields as text, for all verbs: `field=value` words parsed, values printed.
+"""Parsing and printing of message fields as `field=value` words, for all verbs.
 
-Words are what `router send` takes and what `tap`, `listen` and `sim` print; for protobuf messages the two are inverse.
-Every source of values is first brought into a `Tree`, which `words` prints.
+`router send` parses these words; `tap`, `listen` and `sim` print them. For protobuf messages the two are inverse.
+To print them, values of any source are first converted to a `Tree`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from router.types.protobuf import PayloadCase
 
 
 def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
-    """A payload with these `field=value` words set. Raises UsageError."""
+    """Return a payload with these `field=value` words applied. Raises UsageError."""
     message = case.message_class()
     set_fields(message, case.type, assignments)
     return message
@@ -47,14 +47,14 @@ def _assign(message: Any, kind: MessageType, path: str, text: str) -> None:
         field, index = _step(kind, step, path)
         inner = field.type.element if isinstance(field.type, List) else field.type
         if not isinstance(inner, MessageType):
-            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, it has no fields")
+            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, which has no fields")
         message = _inner_message(message, field, index, path)
         kind = inner
     field, index = _step(kind, last, path)
     if isinstance(field.type, List):
         _assign_element(getattr(message, field.name), field.type, index, path, text)
     elif index is not None:
-        raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+        raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
     elif isinstance(field.type, MessageType) and not text:
         getattr(message, field.name).SetInParent()
     else:
@@ -79,11 +79,11 @@ def _inner_message(message: Any, field: Field, index: int | None, path: str) -> 
     member = getattr(message, field.name)
     if not isinstance(field.type, List):
         if index is not None:
-            raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+            raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
         member.SetInParent()
         return member
     if index is None:
-        raise UsageError(f"{path}: {field.name} is a list", f"say which element, such as {field.name}[0]")
+        raise UsageError(f"{path}: {field.name} is a list", f"name an element, such as {field.name}[0]")
     _extend(member, field.type, index, path)
     return member[index]
 
@@ -99,14 +99,14 @@ def _assign_element(values: Any, kind: List, index: int | None, path: str, text:
 
 
 LARGEST_LIST = 65_507
-"""Elements; no list is longer than the largest datagram has bytes."""
+"""Elements: no list is longer than the bytes of the largest datagram."""
 
 ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Enum: 0, Float: 0.0, String: "", Bytes: b""}
-"""What a scalar is that nothing has set."""
+"""The value of a scalar that is not set."""
 
 
 def _extend(values: Any, kind: List, index: int, path: str) -> None:
-    """Make the list long enough for `index`, with zeros."""
+    """Extend the list with zeros up to `index`."""
     bound = kind.length if kind.length is not None else kind.bound
     limit = LARGEST_LIST if bound is None else bound
     if index >= limit:
@@ -124,7 +124,7 @@ _ENUM_RANGE = Int(32, signed=True)
 
 
 def parse(kind: Type, text: str, path: str) -> object:
-    """The text as a value of a scalar type. `path` names the field in errors. Raises UsageError."""
+    """Parse a value of a scalar type. `path` names the field in errors. Raises UsageError."""
     match kind:
         case Bool():
             if text.lower() not in _TRUTH:
@@ -169,7 +169,7 @@ def _parse_float(kind: Float, text: str, path: str) -> float:
 
 
 def _parse_enum(kind: Enum, text: str, path: str) -> int:
-    """A name, qualified or not (`SensorState.SENSOR_ERROR`), or any int32: protobuf enums are open."""
+    """Parse a name, qualified or not (`SensorState.SENSOR_ERROR`), or any int32: protobuf enums are open."""
     values = dict(kind.values)
     name = text.removeprefix(f"{kind.name}.").removeprefix(f"{kind.name.rpartition('.')[2]}.")
     if name in values:
@@ -197,7 +197,7 @@ Tree = Union[str, Mapping[str, "Tree"]]
 
 
 def words(tree: Tree, path: str = "") -> Iterator[str]:
-    """`path=value` for each text in the tree, and `path=` for an empty message."""
+    """Yield `path=value` for each text in the tree, and `path=` for an empty message."""
     if isinstance(tree, str):
         yield f"{path}={tree}"
     elif tree or not path:
@@ -231,7 +231,7 @@ def scalar_text(value: Any, kind: Type, digits: int | None = None) -> str:
 
 
 def plain_text(value: object, bits: int = 64, digits: int | None = None) -> str:
-    """A scalar of which only the Python type is known. `bits` is the width of a float, `digits` as in float_text."""
+    """Print a scalar by its Python type. `bits` is the width of a float, `digits` as in float_text."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -246,9 +246,9 @@ def plain_text(value: object, bits: int = 64, digits: int | None = None) -> str:
 
 
 def float_text(value: float, bits: int, digits: int | None = None) -> str:
-    """The shortest decimal that reads back as the same float of this width.
+    """Return the shortest decimal that parses as the same float of this width.
 
-    With `digits`, rounded to that many, and to twice as many for 64 bits: a degree of latitude has 111 km.
+    With `digits`, round to that many, and to twice as many for 64 bits: a degree of latitude has 111 km.
     """
     if digits is not None:
         return f"{value:.{digits * bits // 32}g}"
@@ -272,12 +272,12 @@ def age_text(seconds: float | None) -> str:
 
 
 def rate_text(rate: float) -> str:
-    """Per second, in at most four characters up to 9999."""
+    """Print a rate per second, in at most four characters up to 9999."""
     return f"{rate:.1f}" if 0 < rate < 9.95 else f"{rate:.0f}"
 
 
 def shortened(name: str, letters: int) -> str:
-    """A name with its middle left out where it is too long: what names differ in is mostly at an end."""
+    """Cut the middle out of a name that is too long: names mostly differ at their ends."""
     if len(name) <= letters:
         return name
     kept = letters - 1
@@ -285,7 +285,7 @@ def shortened(name: str, letters: int) -> str:
 
 
 def protobuf_tree(message: Any, kind: MessageType, digits: int | None = None) -> Mapping[str, Tree]:
-    """The fields of a protobuf message that are not their default. Lists are whole, each element a member: `x[0]`."""
+    """Return the fields of a protobuf message without defaults. Each element of a list is a member: `x[0]`."""
     tree: dict[str, Tree] = {}
     for field in kind.fields:
         value = getattr(message, field.name)
@@ -305,16 +305,16 @@ def _protobuf_value(value: Any, kind: Type, digits: int | None) -> Tree:
 
 
 def _is_negative_zero(value: Any) -> bool:
-    """Protobuf writes -0.0 although it equals the default."""
+    """Return whether a value is -0.0, which protobuf writes although it equals the default."""
     return isinstance(value, float) and math.copysign(1.0, value) < 0
 
 
 SHOWN_ELEMENTS = 8
-"""Of a list in a ROS message; a picture has a million."""
+"""Elements shown of a list in a ROS message; an image has a million."""
 
 
 def ros_tree(message: Any) -> Mapping[str, Tree]:
-    """The fields of an rclpy message that are not zero or empty; of lists the first elements."""
+    """Return the fields of an rclpy message that are not zero or empty, and the first elements of lists."""
     tree: dict[str, Tree] = {}
     for name, spelled in message.get_fields_and_field_types().items():
         value = getattr(message, name)
@@ -335,7 +335,7 @@ def ros_tree(message: Any) -> Mapping[str, Tree]:
 
 
 def _ros_value(value: Any, spelled: str) -> Any:
-    """`spelled` is the type of the field in rclpy's words: `float`, `sequence<double, 5>`, `uint8[4]`."""
+    """Convert a value; `spelled` is the field's type as rclpy spells it: `float`, `sequence<double, 5>`, `uint8[4]`."""
     if _is_ros_message(value):
         return ros_tree(value)
     octet = value[0] if isinstance(value, bytes) else value
@@ -343,7 +343,7 @@ def _ros_value(value: Any, spelled: str) -> Any:
 
 
 def ros_json(value: Any) -> Any:
-    """An rclpy message as a dict, an array as a list; numbers that JSON lacks as in protobuf's JSON mapping."""
+    """Return an rclpy message as a dict, an array as a list; NaN and infinities as in protobuf's JSON mapping."""
     if _is_ros_message(value):
         return {name: ros_json(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if _is_array(value):
@@ -358,7 +358,7 @@ def _is_ros_message(value: Any) -> bool:
 
 
 def _is_array(value: Any) -> bool:
-    """A list, an array.array or a numpy array."""
+    """Return whether the value is a list, an array.array or a numpy array."""
     return hasattr(value, "__len__") and not isinstance(value, (str, bytes))
 
 

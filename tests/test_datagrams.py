@@ -48,9 +48,9 @@ def test_padding_never_cuts() -> None:
     ("datagram", "problem"),
     [
         ("", "empty"),
-        ("ffff", "malformed: no PBEnvelope"),
+        ("ffff", "malformed: does not parse as PBEnvelope"),
         ("1a00", "unknown_case: field 3"),
-        ("1001", "malformed: field 2 is no message here; it may be the payload 'every_kind' without its envelope"),
+        ("1001", "malformed: field 2 is not a message; it may be the payload 'every_kind' without its envelope"),
         ("0000", "no_payload"),
     ],
 )
@@ -67,10 +67,10 @@ ALONE = "send the envelope alone"
 @pytest.mark.parametrize(
     ("datagram", "cause"),
     [
-        (b"\x07" + ENVELOPE, f"its own length (1 byte) stands before it: {ALONE}"),
-        (b"\x00\x07" + ENVELOPE, f"its own length (2 bytes) stands before it: {ALONE}"),
-        (b"\x07\x00\x00\x00" + ENVELOPE, f"its own length (4 bytes) stands before it: {ALONE}"),
-        (ENVELOPE + b"\x1f\x2f", f"2 bytes stand behind it, as a checksum would: {ALONE}"),
+        (b"\x07" + ENVELOPE, f"a length (1 byte) precedes the envelope: {ALONE}"),
+        (b"\x00\x07" + ENVELOPE, f"a length (2 bytes) precedes the envelope: {ALONE}"),
+        (b"\x07\x00\x00\x00" + ENVELOPE, f"a length (4 bytes) precedes the envelope: {ALONE}"),
+        (ENVELOPE + b"\x1f\x2f", f"2 bytes after the envelope look like a checksum: {ALONE}"),
         (ENVELOPE[2:], "it may be the payload 'plain' without its envelope"),
         (b'{"value": 1.0}', ""),
     ],
@@ -84,7 +84,7 @@ def test_what_firmware_does_with_an_envelope_is_recognised(wire: Wire, datagram:
 
 def test_a_part_of_a_datagram_is_not_taken_for_another_one(wire: Wire) -> None:
     whole = ENVELOPE[2:] * 9
-    assert why_rejected(wire.envelope, whole[:5], len(whole), repairs=True) == "field 1 is no message here"
+    assert why_rejected(wire.envelope, whole[:5], len(whole), repairs=True) == "field 1 is not a message"
 
 
 def test_a_datagram_that_the_router_would_not_take_is_not_decoded(wire: Wire) -> None:

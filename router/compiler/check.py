@@ -140,8 +140,8 @@ def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Ite
     for name, limits in boards.items():
         messages, lists = sizes[id(limits.fields)]
         if messages > MOST_MESSAGES or lists > MOST_LISTS:
-            what = f"an envelope for '{name}' has {messages:,} places of messages and {lists:,} of repeated fields"
-            hint = f"the router takes {MOST_MESSAGES:,} and {MOST_LISTS:,}: make it another kind of endpoint"
+            what = f"the envelope for '{name}' has {messages:,} nested messages and {lists:,} repeated fields"
+            hint = f"the limits are {MOST_MESSAGES:,} and {MOST_LISTS:,}: make it another kind of endpoint"
             yield Diagnostic(table.endpoints[name].span, Code.TOO_LARGE, what, hint)
 
 

@@ -77,7 +77,7 @@ def _to_message(value: tree.Node, target: MessageType, scope: Scope) -> Plan:
         (only,) = target.fields
         return Record(target, ((only, convert(value, only.type, scope)),), value.span)
     if isinstance(value.kind, (IntKind, FloatKind)) and target.name in STAMP_TYPES:
-        raise mismatch(value, target, "time_from_milliseconds(x) and time_from_seconds(x) make a time of a number")
+        raise mismatch(value, target, "convert it with time_from_seconds(x) or time_from_milliseconds(x)")
     raise mismatch(value, target, "map its fields one by one")
 
 
@@ -148,10 +148,10 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
             raise
         if isinstance(target, MessageType):
             both = f"{element.kind} and {target}"
-            hint = f"elements are filled by name, as they are: {both} need fields of one name and type"
+            hint = f"elements are filled by field name: {both} need fields of the same name and type"
         else:
-            hint = "write the elements, as in [x[0].y, x[1].y]"
-        raise ExpressionError(found.span, found.code, f"an element: {found.message}", hint) from error
+            hint = "write the elements one by one, as in [x[0].y, x[1].y]"
+        raise ExpressionError(found.span, found.code, f"element: {found.message}", hint) from error
 
 
 def _want_length(value: tree.Node, target: List, length: int) -> None:
@@ -190,14 +190,14 @@ def _want_finite(value: tree.Node, target: Type) -> None:
     """Raise ExpressionError if `nan` or `inf` would fill what is no float."""
     literal = tree.constant_of(value)
     if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
-        hint = f"text has quotes of its own: \"'{literal}'\"" if isinstance(target, String) else ""
-        message = f"{literal} does not fill {target}"
+        hint = f"text needs its own quotes: \"'{literal}'\"" if isinstance(target, String) else ""
+        message = f"cannot assign {literal} to {target}"
         raise ExpressionError(
-            value.span, Code.TYPE_MISMATCH, message, hint or "only a float field holds it: write a value"
+            value.span, Code.TYPE_MISMATCH, message, hint or "only a float field can hold it: write a value"
         )
 
 
-_OF_LIST = "; min(x), max(x), sum(x) and len(x) make a number of a list"
+_OF_LIST = "; min(x), max(x), sum(x) and len(x) turn a list into a number"
 
 
 def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
@@ -206,7 +206,7 @@ def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
         hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
     if not isinstance(target, (List, MessageType)):
         hint = hint or fields_hint(value.kind)
-    return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
+    return ExpressionError(value.span, Code.TYPE_MISMATCH, f"cannot assign {value.kind} to {target}", hint)
 
 
 def _to_bool(value: tree.Node, target: Bool) -> tree.Node:
@@ -224,12 +224,12 @@ def _to_int(value: tree.Node, target: Int) -> tree.Node:
         case IntKind() as kind:
             return _fit(value, kind, _range(target))
         case FloatKind():
-            hint = "say how: round() or trunc()"
+            hint = "convert it with round() or trunc()"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a float does not fit {target}", hint)
         case BoolKind():
-            raise mismatch(value, target, "int() makes a number of a bool")
+            raise mismatch(value, target, "convert a bool with int()")
         case TimeKind():
-            raise mismatch(value, target, "round(seconds(...)) makes a number of a time")
+            raise mismatch(value, target, "convert a time with round(seconds(...))")
         case _:
             raise mismatch(value, target)
 
@@ -254,10 +254,10 @@ def _fit(value: tree.Node, kind: IntKind, limits: IntKind) -> tree.Node:
         return value
     what = f"{value.kind} does not fit {limits}"
     if kind.high < limits.low or kind.low > limits.high:
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, what, f"it holds {limits.low}..{limits.high}")
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, what, f"its range is {limits.low}..{limits.high}")
     if kind.is_rounded:
         return fitted(value, limits)
-    raise ExpressionError(value.span, Code.LOSSY_CONVERSION, what, "say how: clamp() or wrap()")
+    raise ExpressionError(value.span, Code.LOSSY_CONVERSION, what, "limit it with clamp() or wrap()")
 
 
 def _to_float(value: tree.Node, target: Float) -> tree.Node:
@@ -268,18 +268,18 @@ def _to_float(value: tree.Node, target: Float) -> tree.Node:
             if target.bits == 32 and isinstance(literal, float) and FLOAT32_END <= abs(literal) < math.inf:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{literal!r} does not fit float32")
             if bits > target.bits:
-                hint = "float32() says that losing digits is meant"
+                hint = "to accept the loss of digits, use float32()"
                 raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)
             return value
         case IntKind() as kind:
             if kind.is_rounded or IntKind(-limit, limit).holds(kind):
                 return value
-            hint = f"float{target.bits}() says that losing digits is meant"
+            hint = f"to accept the loss of digits, use float{target.bits}()"
             raise ExpressionError(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
         case EnumKind() | BoolKind():
-            raise mismatch(value, target, "int() makes a number of it")
+            raise mismatch(value, target, "convert it with int()")
         case TimeKind():
-            raise mismatch(value, target, "seconds() makes a number of a time")
+            raise mismatch(value, target, "convert a time with seconds()")
         case _:
             raise mismatch(value, target)
 
@@ -287,11 +287,11 @@ def _to_float(value: tree.Node, target: Float) -> tree.Node:
 def _to_string(value: tree.Node, target: String) -> tree.Node:
     if not isinstance(value.kind, StringKind):
         is_float = isinstance(value.kind, FloatKind)
-        hint = "str() makes text of it" if isinstance(value.kind, (IntKind, EnumKind, BoolKind)) else ""
-        raise mismatch(value, target, "text(x, 2) makes text of it" if is_float else hint)
+        hint = "convert it with str()" if isinstance(value.kind, (IntKind, EnumKind, BoolKind)) else ""
+        raise mismatch(value, target, "convert it with text(x, 2)" if is_float else hint)
     if target.wide:
-        hint = "leave it out, and it keeps its default; or declare it as a string"
-        raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions do not fill a wstring", hint)
+        hint = "omit it to keep its default, or declare it as a string"
+        raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions cannot fill a wstring", hint)
     literal = tree.constant_of(value)
     if isinstance(literal, str):
         _want_text(value, literal, target)
@@ -306,7 +306,9 @@ def _want_text(value: tree.Node, text: str, target: String) -> None:
     try:
         length = len(text.encode())
     except UnicodeEncodeError as error:
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is no character") from None
+        raise ExpressionError(
+            value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is not a character"
+        ) from None
     if "\0" in text:
         raise ExpressionError(value.span, Code.OUT_OF_RANGE, "a string cannot hold a NUL")
     if target.bound is not None and length > target.bound:
@@ -335,7 +337,7 @@ def _member(value: tree.Node, target: Enum) -> tree.Node:
     if literal is None:
         return tree.Call(EnumKind(target), value.span, "member", (value,))
     if literal not in dict(target.values).values():
-        hint = f"it is closed: name one of its values, as {target.name}.{target.values[0][0]}"
+        hint = f"the enum is closed: name one of its values, such as {target.name}.{target.values[0][0]}"
         raise ExpressionError(value.span, Code.UNKNOWN_ENUM_VALUE, f"'{target}' has no value {literal}", hint)
     return value
 

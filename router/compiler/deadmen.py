@@ -69,8 +69,8 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
     for destination in route.destinations:
         name = destination.endpoint.value
         if route.no_deadman is None and name in lookup.boards:
-            message = f"nothing stops '{name}' when '{route.case.value}' stops coming"
-            hint = "say `deadman: {timeout: 500ms, send: {CASE: {FIELD: VALUE}}}`, or `deadman: {none: why}`"
+            message = f"nothing stops '{name}' when '{route.case.value}' stops arriving"
+            hint = "write `deadman: {timeout: 500ms, send: {CASE: {FIELD: VALUE}}}`, or `deadman: {none: why}`"
             lookup.report(destination.endpoint.span, Code.NO_DEADMAN, message, hint)
             return
 
@@ -78,8 +78,8 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
 def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if not route.destinations:
         if route.topics:
-            message = f"'{route.case.value}' goes to no destination, so there are no commands that could stop coming"
-            lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
+            message = f"'{route.case.value}' has no destinations, so there are no commands to watch"
+            lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "use a deadman only in a route with destinations")
         return
     rates = [destination.max_rate for destination in feeding(route, deadman)]
     limited = [rate for rate in rates if rate is not None]
@@ -99,14 +99,14 @@ def timing_findings(
     `max_rate` (Hz) limits all its commands.
     """
     if max_rate is not None and deadman.timeout.value * max_rate <= NS_PER_SECOND:
-        message = f"it would trip between commands that `max_rate` holds down to {max_rate:g} Hz"
-        yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
+        message = f"it would trip between commands, which `max_rate` limits to {max_rate:g} Hz"
+        yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "raise the timeout, or max_rate")
     if deadman.repeat.value < SHORTEST_REPEAT:
-        message = f"more than 100 {sends} per second would flood who gets them"
-        yield Diagnostic(deadman.repeat.span, Code.BAD_VALUE, message, "repeat it every 10ms at most")
+        message = f"more than 100 {sends} per second would flood the receivers"
+        yield Diagnostic(deadman.repeat.span, Code.BAD_VALUE, message, "set it to 10ms or more")
     if deadman.because is None:
         for span, message, hint in _doubtful_times(deadman, ttl):
-            yield Diagnostic(span, Code.DOUBTFUL_DEADMAN, message, f"{hint}, or say `because: why`")
+            yield Diagnostic(span, Code.DOUBTFUL_DEADMAN, message, f"{hint}, or add `because: why`")
 
 
 def _doubtful_times(
@@ -118,18 +118,18 @@ def _doubtful_times(
     if timeout.value > LONGEST_TIMEOUT:
         yield (
             timeout.span,
-            f"what moves keeps moving for {time} after the last command",
-            "say for example `timeout: 500ms`",
+            f"everything keeps moving for {time} after the last command",
+            "set for example `timeout: 500ms`",
         )
     elif timeout.value < SHORTEST_TIMEOUT:
-        message = f"it trips between commands unless they come more often than every {time}"
-        yield timeout.span, message, "say `timeout: 20ms` at least"
+        message = f"it trips between commands unless they arrive more often than every {time}"
+        yield timeout.span, message, "set `timeout` to at least 20ms"
     if repeat.value > max(2 * timeout.value, DEFAULT_REPEAT.value):
         message = f"if its datagram is lost, the next one follows {duration(repeat.value)} later"
         yield repeat.span, message, f"repeat it within the timeout of {time}"
     if ttl is not None and ttl.value > timeout.value:
-        message = f"a command that comes {duration(ttl.value)} late would release the deadman, which trips after {time}"
-        yield ttl.span, message, f"say `ttl: {time.replace(' ', '')}` at most"
+        message = f"a command that is {duration(ttl.value)} late would release the deadman, which trips after {time}"
+        yield ttl.span, message, f"set `ttl` to at most {time.replace(' ', '')}"
 
 
 def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
@@ -140,8 +140,8 @@ def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     for destination in route.destinations:
         name = destination.endpoint.value
         if name not in stopped and name in lookup.boards:
-            message = f"'{name}' gets '{route.case.value}' and is not in `to`: nothing stops it"
-            hint = "add it to `to`, or give it a route of its own, or say `because: why`"
+            message = f"'{name}' receives '{route.case.value}' but is not in `to`, so nothing stops it"
+            hint = "add it to `to`, give it its own route, or add `because: why`"
             lookup.report(deadman.to[0].span, Code.DOUBTFUL_DEADMAN, message, hint)
             return
 
@@ -160,13 +160,13 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
         return
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
-    message = f"it would cut into commands of '{case}', which '{board}' gets too"
+    message = f"it would interrupt commands of '{case}', which '{board}' also receives"
     # Commands to another motor of the board must not disarm it: it would stay silent for as long as they come.
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
     hint = (
-        f"say `disarmed_by: {value}` if they take over from '{route.case.value}', {beside} if they move something else"
+        f"add `disarmed_by: {value}` if they take over from '{route.case.value}', or {beside} if they move other motors"
     )
     lookup.report(
         deadman.disarmed_by[0].span if deadman.disarmed_by else deadman.span, Code.DOUBTFUL_DEADMAN, message, hint
@@ -181,7 +181,7 @@ def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> boo
         endpoint = lookup.table.endpoints.get(destination.endpoint.value)
         waits_for = "`on_limit: latest`" if destination.on_limit is OnLimit.LATEST else "the endpoint's bandwidth"
         if destination.on_limit is OnLimit.LATEST or (endpoint is not None and endpoint.bandwidth is not None):
-            message = f"a command that waited for {waits_for} could undo the deadman when it is older than its timeout"
+            message = f"a command that waits for {waits_for} could be sent after the timeout and undo the deadman"
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
             return True
@@ -205,7 +205,9 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
         elif name.value not in served and are_known:
             to = " or ".join(f"'{to.value}'" for to in deadman.to)
             message = f"no other route sends '{name.value}' to {to}, so it cannot take over"
-            hint = did_you_mean(name.value, _commanding(table, route, deadman)) or f"no other route commands {to}"
+            hint = (
+                did_you_mean(name.value, _commanding(table, route, deadman)) or f"no other route sends commands to {to}"
+            )
             lookup.report(name.span, Code.BAD_VALUE, message, hint)
     return tuple(each.name for each in found)
 
@@ -237,8 +239,8 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: Payload
         bounds = board.fields.get(case.number)
         for field, value in scalars(payload, bounds.message or {}) if bounds else ():
             if misfit := board.misfit(field, value):
-                hint = f"'{name}' gets it with `allow_non_finite: true`" if isinstance(value, float) else ""
-                lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board cannot take this: {misfit}", hint)
+                hint = f"set `allow_non_finite: true` for '{name}'" if isinstance(value, float) else ""
+                lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board rejects this: {misfit}", hint)
                 return True
     return False
 

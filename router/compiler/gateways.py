@@ -44,7 +44,9 @@ def _name_findings(table: RouteTable, gateway: Gateway) -> Iterator[Diagnostic]:
     for kind, taken in names.items():
         if gateway.name in taken:
             message = f"'{gateway.name}' is also the name of a {kind}"
-            yield Diagnostic(gateway.span, Code.BAD_VALUE, message, "metrics tell them apart by their names")
+            yield Diagnostic(
+                gateway.span, Code.BAD_VALUE, message, "rename one of them: metrics distinguish them by name"
+            )
 
 
 def _pattern_findings(gateway: Gateway) -> Iterator[Diagnostic]:
@@ -59,7 +61,7 @@ def _client_topics(lookup: Lookup, gateway: Gateway) -> dict[str, InboundPlan]:
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)
         if name in found:
-            message = f"'{name}' is let in twice"
+            message = f"'{name}' is in 'inbound' twice"
             lookup.report(inbound.topic.topic.span, Code.BAD_VALUE, message, "name it once")
         found[name] = _inbound(lookup, gateway, inbound, name)
     return {name: plan for name, plan in found.items() if plan}

@@ -141,12 +141,12 @@ class Lookup:
         if package is not None and package.value not in packages:
             near = nearest(package.value, packages, _SAME_PACKAGE)
             hint = f"did you mean '{near}'?" if near else _SOURCE.format(package.value)
-            message = f"no package '{package.value}' has ROS messages"
+            message = f"there is no package '{package.value}' with ROS messages"
             self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
             return
         hint = _ros_type_hint(name.value, known)
         if package is not None:
-            hint = f"that is what `defaults.package` makes of the payload; say its 'type' ({hint})"
+            hint = f"the type is made from `defaults.package`; set the topic's 'type' ({hint})"
         self.report(name.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name.value}'", hint)
 
     def scope(
@@ -182,7 +182,7 @@ class Lookup:
     def when(self, expression: Expression | None, scope: Scope) -> Node | None:
         if expression is None:
             return None
-        hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"
+        hint = "write a comparison, such as fix_quality != GPSFixQuality.NO_FIX"
         return self.value(expression, scope, (BoolKind,), "'when' takes a bool", hint)
 
 
@@ -194,9 +194,9 @@ def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str
     if is_source and name == "*":
         return f"did you mean '{ANY}'?"
     if is_source and name == ROS:
-        return "a topic is written `source: {topic: NAME}`"
+        return "write a topic as `source: {topic: NAME}`"
     is_topic = is_source and not nearest(name, known, _ALIKE)
-    topic = f"; a topic is written `source: {{topic: {name}}}`" if is_topic else ""
+    topic = f"; write a topic as `source: {{topic: {name}}}`" if is_topic else ""
     return did_you_mean(name, known, _ALIKE) + topic
 
 
@@ -231,7 +231,7 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     if inputs.is_file(source):  # in an installation, what is built and sourced counts
         return f"it is in {source.parent}, but not built: build and source {package}"
     if siblings or len(parts) == 1:
-        general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"
+        general = "neither schemas/ nor an installed package defines it; write types like sensor_msgs/msg/Imu"
         return one_of(namesakes) or did_you_mean(name, siblings) or general
     near = nearest(package, {full.partition("/")[0] for full in known}, _SAME_PACKAGE)
     if near:
@@ -242,4 +242,4 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
 
 _SAME_PACKAGE = 0.85
 """How near the name of a package is to be a misspelt one: `my_interfaces` is not `rcl_interfaces`."""
-_SOURCE = "build '{}' and source its workspace, as with `source install/setup.bash`"
+_SOURCE = "build '{}' and source its workspace (`source install/setup.bash`)"

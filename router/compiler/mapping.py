@@ -97,8 +97,8 @@ def build(
         if left:
             names = ", ".join(f"'{name}'" for name in left[:_MOST_NAMES]) + ", ..." * (len(left) > _MOST_NAMES)
             other = scope.message if ros_type == target else target
-            message = f"without 'fields' all of {ros_type} is filled by name, and {other} has no {names}"
-            hint = "map its fields, or say `fields: auto` to leave out what has no counterpart"
+            message = f"without 'fields', every field of {ros_type} needs a counterpart, but {other} has no {names}"
+            hint = "map the fields, or write `fields: auto` to leave out those without a counterpart"
             outcome.findings.append(Diagnostic(span, Code.NOTHING_MAPPED, message, hint))
         return outcome
     builder = _Builder(scope, fields.span, "item." if whole else "")
@@ -107,7 +107,7 @@ def build(
     plan = builder.record(given, automatic, "")
     outcome = FieldMapping(plan, builder.rows, builder.findings or list(presence_findings(plan)))
     if target.fields and not builder.rows and not outcome.findings:
-        hint = "map its fields, or say `fields: auto`"
+        hint = "map its fields, or write `fields: auto`"
         if automatic is not None:
             hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
@@ -172,8 +172,8 @@ class _Builder:
                 if path not in self._whole:
                     self._whole.add(path)
                     message = f"{holder} has no fields"
-                    hint = "give the whole of it one value, or choose one: {map: FIELD, VALUE: ..., else: ...}"
-                    hint = "text is {text: WORD}" if isinstance(holder, String) else hint
+                    hint = "assign one value to it, or choose one: {map: FIELD, VALUE: ..., else: ...}"
+                    hint = "write text as {text: WORD}" if isinstance(holder, String) else hint
                     self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))
                 return []
             member = holder.field(name)
@@ -244,7 +244,7 @@ class _Builder:
             if entry.value.choices is not None and found.span == entry.value.span:
                 found = self._chosen_finding(member, entry.value.choices) or found
             if isinstance(member.type, String) and not entry.value.literal and _FRAME.fullmatch(entry.value.text):
-                found = replace(found, hint=f"as text it is {{text: {entry.value.text}}}")
+                found = replace(found, hint=f"for text, write {{text: {entry.value.text}}}")
             self.findings.append(found)
             return unset(member, entry.value.span)
         self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))
@@ -304,12 +304,12 @@ def _oneof_findings(plan: Record) -> Iterator[Diagnostic]:
             continue
         other = first.setdefault(member.oneof, member.name)
         if other != member.name:
-            message = f"'{other}' and '{member.name}' are of one oneof, '{member.oneof}', and exclude each other"
-            yield Diagnostic(plan.span, Code.DUPLICATE_FIELD, message, "map one of them, by hand and without `auto`")
+            message = f"'{other}' and '{member.name}' are members of the oneof '{member.oneof}' and exclude each other"
+            yield Diagnostic(plan.span, Code.DUPLICATE_FIELD, message, "map only one of them, without `auto`")
 
 
 def _required_findings(plan: Record) -> Iterator[Diagnostic]:
     for member, made in plan.members:
         if member.is_required and isinstance(made, Unset):
-            message = f"nothing fills '{member.name}', without which there is no {plan.type}"
+            message = f"nothing fills '{member.name}', which {plan.type} requires"
             yield Diagnostic(plan.span, Code.MISSING_KEY, message, "map it")

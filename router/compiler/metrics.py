@@ -38,11 +38,11 @@ METRICS = (
     Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
     Metric("received_bytes", "counter", ("listener",), "Bytes in those datagrams."),
     Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
-    Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is not there."),
-    Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were put back or taken off."),
-    Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route took, by reason."),
+    Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is missing."),
+    Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were restored or removed."),
+    Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route accepted, by reason."),
     Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),
-    Metric("messages_received", "counter", ("route", "source"), "Messages that a route took, by who sent them."),
+    Metric("messages_received", "counter", ("route", "source"), "Messages that a route accepted, by source."),
     Metric("datagrams_sent", "counter", ("route", "destination"), "Datagrams handed to the kernel."),
     Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
@@ -51,101 +51,115 @@ METRICS = (
         "messages_dropped",
         "counter",
         ("route", "target", "reason"),
-        "Messages that a target should have got.",
+        "Messages not delivered to a target, by reason.",
         tells_commands=True,
     ),
-    Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
+    Metric(
+        "messages_filtered", "counter", ("route", "target"), "Messages withheld by `when`, or without a subscriber."
+    ),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
-    Metric("messages_waiting", "level", ("route", "target"), "Messages that wait between two threads of the router."),
+    Metric("messages_waiting", "level", ("route", "target"), "Messages queued between two threads of the router."),
     Metric(
         "publish_stalled_seconds",
         "number",
         ("topic",),
-        "For how long a call that publishes there has been in the ROS middleware; 0 below 10 ms.",
+        "How long the current publish call has been in the ROS middleware; 0 below 10 ms.",
     ),
     Metric(
         "route_duration_seconds",
         "histogram",
         ("route",),
-        "Time from a message's receipt until it is forwarded, and served or queued for all other targets.",
+        "Time from receipt of a message until it is forwarded, and delivered or queued for all other targets.",
     ),
-    Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last took a message."),
+    Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last accepted a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
-    Metric("endpoint_stale_after_seconds", "number", ("endpoint", "kind"), "Silent for longer, it is stale."),
+    Metric(
+        "endpoint_stale_after_seconds", "number", ("endpoint", "kind"), "Silence after which the endpoint is stale."
+    ),
     Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
     Metric("deadman_trips", "counter", ("route",), "How often commands stopped coming."),
     Metric(
         "deadman_datagrams_sent",
         "counter",
         ("route", "destination"),
-        "Datagrams that the deadman sent, also at the start.",
+        "Datagrams that the deadman sent, including those at the start.",
     ),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
-    Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
-    Metric("gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of ours."),
-    Metric("gateway_key_conflicts", "counter", ("route",), "Times that another gateway had the same Zenoh key."),
-    Metric("gateway_connections", "number", ("route", "mode"), "Zenoh routers and peers that are connected now."),
-    Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
+    Metric("gateway_clients", "number", ("route",), "Current clients of a gateway."),
     Metric(
-        "gateway_client_lag_seconds", "number", ("route", "client"), "For how long a client has not had everything."
+        "gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of the router's."
     ),
-    Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it came."),
+    Metric("gateway_key_conflicts", "counter", ("route",), "How often another gateway used the same Zenoh key."),
+    Metric("gateway_connections", "number", ("route", "mode"), "Zenoh routers and peers that are currently connected."),
+    Metric(
+        "gateway_topics", "number", ("route", "state"), "Topics that currently match a gateway's patterns, by state."
+    ),
+    Metric("gateway_client_lag_seconds", "number", ("route", "client"), "How long a client has been behind."),
+    Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it connected."),
     Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames of the client that newer ones replaced."),
-    Metric("client_messages_dropped", "counter", ("route", "reason"), "Messages that single clients did not get."),
-    Metric("mirror_dropped", "counter", (), "Datagrams that recordings and taps missed, though they were routed."),
+    Metric(
+        "client_messages_dropped",
+        "counter",
+        ("route", "reason"),
+        "Messages not delivered to single clients, by reason.",
+    ),
+    Metric("mirror_dropped", "counter", (), "Routed datagrams that recordings and taps missed."),
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
     Metric("recorded_bytes", "counter", (), "Bytes in those datagrams."),
-    Metric("record_dropped", "counter", ("reason",), "Datagrams that a recording lacks, by reason."),
-    Metric("config_reloads", "counter", ("result",), "Changed tables that the running router was to take."),
+    Metric("record_dropped", "counter", ("reason",), "Datagrams missing from a recording, by reason."),
+    Metric("config_reloads", "counter", ("result",), "Reloads of the table, by result."),
     Metric("config_last_reload_successful", "number", (), "1 unless the last reload failed."),
-    Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was taken."),
+    Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was loaded."),
     Metric(
-        "qos_incompatible", "number", ("route", "topic", "policy"), "Peers that get or give nothing now, for their QoS."
+        "qos_incompatible",
+        "number",
+        ("route", "topic", "policy"),
+        "Peers that currently cannot connect because of their QoS.",
     ),
 )
 
 REJECT_REASONS: Mapping[str, str] = {
-    "truncated": "longer than the router takes",
+    "truncated": "longer than the router accepts",
     "empty": "no bytes",
-    "malformed": "no envelope, or a payload that is not of its type",
+    "malformed": "not an envelope, or its payload is not of its type",
     "no_payload": "an envelope without a payload",
     "unknown_case": "a field number that the envelope does not have",
     "unhandled": "a payload case without a route",
     "ignored": "a payload case that the table ignores",
-    "source_mismatch": "from an address that the route does not take it from, or not by the listener that believes it",
+    "source_mismatch": "from an address that is not a source of the route, or on the wrong listener",
 }
 """Why no route took a datagram, with what each means."""
 
 DROP_REASONS: Mapping[str, str] = {
-    "mapping_error": "a mapping failed on these values, as in a division by zero",
-    "non_finite": "NaN or infinity where an integer or a time is wanted, or for a board",
-    "too_large": "the envelope, a text or a list is larger than the board takes",
+    "mapping_error": "a mapping failed for these values, for example by division by zero",
+    "non_finite": "NaN or infinity where an integer or a time is needed, or for a board",
+    "too_large": "the envelope, a text or a list is larger than the board accepts",
     "stale": "older than `ttl`",
-    "rate_limited": "more often than `max_rate`; not logged, as the table asks for it",
-    "queue_full": "the endpoint's `bandwidth` was short, or a thread was behind, for longer than the queue lasts",
+    "rate_limited": "more often than `max_rate`; not logged, because the table asks for it",
+    "queue_full": "the queue was full, because the endpoint's `bandwidth` was too small or a thread was behind",
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it, or nobody listens there",
-    "publish_error": "the ROS middleware refused it",
-    "incomplete": "a frame that was not complete when its time was up, or had no room",
-    "loop": "it came from this router: stays 0, because tables with loops are refused",
+    "publish_error": "the ROS middleware rejected it",
+    "incomplete": "a frame that was not complete within its timeout, or for which there was no room",
+    "loop": "it came from this router: stays 0, because tables with loops are rejected",
 }
 """Why a target did not get a message, with what each means."""
 
 GATEWAY_REJECT_REASONS: Mapping[str, str] = {
-    "too_large": "longer than the gateway takes, also after decompression",
-    "malformed": "no packet or document of the gateway's format, or no JSON",
+    "too_large": "longer than the gateway accepts, before or after decompression",
+    "malformed": "not a packet or document in the gateway's format, or not JSON",
     "source_mismatch": "not from the host that the gateway sends to",
-    "not_allowed": "a topic that `inbound` does not have",
-    "wrong_type": "another type than `inbound` says",
+    "not_allowed": "a topic that is not in `inbound`",
+    "wrong_type": "not the type that `inbound` declares",
     "invalid": "a field is missing, unknown, of another type or out of range",
-    "rate_limited": "schemas were asked for too often",
+    "rate_limited": "schemas were requested too often",
 }
 """Why a gateway refused what a client sent, with what each means."""
 
 GATEWAY_DROP_REASONS: Mapping[str, str] = {
-    "mapping_error": "no message of the topic's type, or text that is no UTF-8",
+    "mapping_error": "not a message of the topic's type, or text that is not UTF-8",
     "too_large": "longer than `max_message`, or than a datagram",
-    "overloaded": "it came while earlier ones were still being converted",
+    "overloaded": "it arrived while earlier ones were still being converted",
 }
 """Why no client of a gateway got a ROS message, with what each means."""
 
@@ -157,7 +171,7 @@ INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 
 TOPIC_STATES: Mapping[str, str] = {
     "served": "a client gets it",
-    "several_types": "served as the type that most of its publishers have",
+    "several_types": "served with the type that most of its publishers use",
     "not_installed": "not served: its type is not installed here",
 }
 """What a gateway can do with a topic that its patterns match."""
@@ -165,19 +179,19 @@ TOPIC_STATES: Mapping[str, str] = {
 CLIENT_DROP_REASONS: Mapping[str, str] = {
     "superseded": "a newer value of the topic took its place, because the client is slow",
     "send_error": "the network refused it",
-    "left": "it waited for a client that left",
+    "left": "it was queued for a client that disconnected",
 }
 """Why one client of a gateway did not get a message, with what each means."""
 
 RECORD_DROP_REASONS: Mapping[str, str] = {
     "overflow": "the disk was slower than the network for longer than the buffer lasts",
-    "write_error": "the file could not be written, as when the disk is full; or a fault of the router",
+    "write_error": "the file could not be written, for example because the disk is full, or the router failed",
 }
 """Why a recording lacks a datagram, with what each means."""
 
 RELOAD_RESULTS: Mapping[str, str] = {
-    "ok": "the new table runs",
-    "invalid": "the table has errors, or changes what only a restart can",
+    "ok": "the new table is running",
+    "invalid": "the table has errors, or changes something that needs a restart",
     "failed": "something that it names cannot be opened",
 }
 """What became of a reload, with what each means. Unless it is ok, the old table goes on."""

@@ -29,16 +29,16 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Findings for the addresses of a table and for what listens on them."""
     for first, second in combinations(_held(table), 2):
         if first.is_udp == second.is_udp and _overlap(first, second):
-            message = f"{second.owner} has the address of {first.owner}"
-            hint = "one socket takes it all; give it a port of its own"
+            message = f"{second.owner} uses the address of {first.owner}"
+            hint = "only one of them can receive there; use another port"
             if first.interface != second.interface:  # what is bound to no interface takes that of all of them
-                hint += f", or give {second.owner if first.interface else first.owner} an 'interface' too"
+                hint += f", or give {second.owner if first.interface else first.owner} an 'interface'"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _listener_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
-            message = f"'{endpoint.name}' is not a board, and gets NaN and infinity in any case"
-            yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "leave `allow_non_finite` out")
+            message = f"'{endpoint.name}' is not a board, so it receives NaN and infinity anyway"
+            yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "remove `allow_non_finite`")
     yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}
     blamed: set[str] = set()
@@ -73,8 +73,8 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
         if gateway.zenoh is not None:
             first = keys.setdefault(gateway.zenoh.key.value, gateway)
             if first is not gateway:
-                message = f"gateway '{gateway.name}' has the key of gateway '{first.name}'"
-                yield Diagnostic(gateway.zenoh.key.span, Code.ADDRESS_CLASH, message, "give it a key of its own")
+                message = f"gateway '{gateway.name}' uses the key of gateway '{first.name}'"
+                yield Diagnostic(gateway.zenoh.key.span, Code.ADDRESS_CLASH, message, "choose another key")
 
 
 def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
@@ -86,7 +86,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
     for name, local in own.items():
         if _reaches(address.value, local):
             message = f"'{gateway.name}' would send to the router's own {name} ({address.value})"
-            yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "name the address of its client")
+            yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "write the address of its client")
 
 
 def _overlap(one: _Held, other: _Held) -> bool:
@@ -114,7 +114,7 @@ def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
         return
     for listener in table.listeners.values():
         if listener.name not in believed_by:
-            message = f"no endpoint that sends is believed by listener '{listener.name}': it rejects everything"
+            message = f"listener '{listener.name}' accepts none of the sending endpoints, so it rejects everything"
             hint = f"remove it, or give an endpoint 'listener: {listener.name}'"
             yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
 
@@ -128,7 +128,7 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
     host = one.address.value.host
     if one.source_port is None or other.source_port is None:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host}"
-        hint = "an endpoint is recognised by its address: correct it, or give both a 'source_port'"
+        hint = "endpoints are recognised by address: correct it, or give both a 'source_port'"
         if one.listener or other.listener:
             hint += ", or a 'listener' each"
         return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
@@ -148,7 +148,9 @@ def loop_finding(
     for listener in table.listeners.values():
         if _reaches(endpoint.address.value, listener.address.value):
             message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
-            return Diagnostic(span, Code.FORWARDING_LOOP, message, "the router would receive what it sends for ever")
+            return Diagnostic(
+                span, Code.FORWARDING_LOOP, message, "the router would receive its own datagrams in an endless loop"
+            )
     return None
 
 

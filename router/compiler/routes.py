@@ -50,7 +50,7 @@ def _coverage(lookup: Lookup) -> None:
     if missing and table.routes_span is not None:  # a table of gateways has no routes for any
         plural = "payload case" if len(missing) == 1 else "payload cases"
         message = f"no route for the {plural} {', '.join(missing)}"
-        hint = "route it, or say `ignore: reason`"
+        hint = "add a route, or ignore it with `ignore: reason`"
         lookup.report(table.routes_span, Code.UNCOVERED_PAYLOAD_CASE, message, hint)
 
 
@@ -64,8 +64,8 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
     return checked
 
 
-_NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' are of `for_each`, which this route lacks"
-_NO_COLLECT = f"'{ITEMS}' and '{COUNT}' are of `collect`, which this route lacks"
+_NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' need `for_each`, which this route lacks"
+_NO_COLLECT = f"'{ITEMS}' and '{COUNT}' need `collect`, which this route lacks"
 _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
 
 
@@ -82,7 +82,7 @@ def _without_for_each(message: MessageType) -> dict[str, tuple[str, str]]:
     """The names that a route from ROS lacks without `for_each`, with what to do: see `Scope.absent`."""
     lists = [member.name for member in message.fields if isinstance(member.type, List)]
     hint = f"add `for_each: {lists[0] if len(lists) == 1 else 'LIST'}`"
-    hint += f"; lists are {', '.join(lists)}" if len(lists) > 1 else ""
+    hint += f"; its lists are {', '.join(lists)}" if len(lists) > 1 else ""
     return dict.fromkeys((ITEM, INDEX, COUNT), (_NO_FOR_EACH, hint))
 
 
@@ -95,7 +95,7 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
     _sources(lookup, route)
     if not route.destinations and not route.topics:
         places = "destinations" if route.is_outbound else "destinations or topics"
-        message, hint = f"'{route.name}' goes nowhere", f"name {places}, or say `ignore: reason`"
+        message, hint = f"'{route.name}' has no targets", f"add {places}, or ignore it with `ignore: reason`"
         lookup.report(route.span, Code.NO_TARGET, message, hint)
     for topic in route.all_topics:
         found = (topic_name_finding(topic), *qos_findings(topic, publishes=topic in route.topics))
@@ -113,7 +113,7 @@ def _sources(lookup: Lookup, route: Route) -> None:
         if source.value != ANY:
             lookup.endpoint(source, (ANY,))
         elif len(route.sources) > 1:
-            message, hint = f"'{ANY}' stands alone", "name endpoints, or it, not both"
+            message, hint = f"'{ANY}' excludes other sources", f"write either '{ANY}' or the names of endpoints"
             lookup.report(source.span, Code.BAD_VALUE, message, hint)
     if route.sources and route.source_topics:
         message = "a route takes messages from endpoints or from topics, not from both"
@@ -154,7 +154,7 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for index, topic in enumerate(route.topics):
         if any(are_same(topic, other) for other in route.topics[:index]):
-            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{topic.topic.value}' stands here twice", "name it once")
+            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{topic.topic.value}' is a topic twice", "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None:
             targets.append(_publish(lookup, route, case, topic, ros_type, names))
@@ -166,7 +166,7 @@ def _forward(
     lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
 ) -> CheckedTarget:
     if destination.fields is not None:
-        message, hint = "a datagram is forwarded unchanged", "'fields' is for messages that come from a topic"
+        message, hint = "datagrams are forwarded unchanged", "use 'fields' only for messages from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
     return _destination(lookup, route, destination, endpoint, lookup.scope(case.type, route=route))
 
@@ -193,11 +193,11 @@ def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:
 
 def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) -> CheckedCollect | None:
     if not route.topics and route.destinations:
-        message = "'collect' puts frames together for topics, and there are none"
-        lookup.report(collect.span, Code.UNKNOWN_KEY, message, "destinations get each datagram as it came")
+        message = "'collect' assembles frames for topics, but this route has none"
+        lookup.report(collect.span, Code.UNKNOWN_KEY, message, "remove it: destinations receive each datagram")
     scope = lookup.scope(case.type)
     names = (IntKind, EnumKind, StringKind, BoolKind)
-    by = lookup.value(collect.by, scope, names, "'by' takes what can name a frame: an integer or a string")
+    by = lookup.value(collect.by, scope, names, "'by' takes an integer or a string that identifies the frame")
     count = lookup.value(collect.count, scope, (IntKind,), "'count' takes an integer")
     order = lookup.value(collect.order, scope, (IntKind,), "'order' takes an integer")
     if by is None or count is None or order is None:
@@ -272,7 +272,7 @@ def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
 def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | None:
     """The list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
     node = lookup.value(
-        expression, scope, (ListKind,), "'for_each' takes a list", 'a literal is written in quotes: "[left, right]"'
+        expression, scope, (ListKind,), "'for_each' takes a list", 'quote a list literal: "[left, right]"'
     )
     if node is not None and isinstance(node.kind, ListKind) and node.kind.element is None:
         lookup.report(node.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
@@ -303,7 +303,9 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
         for key, origin in origins.items():
             if (name := _taken(key, taken)) is not None:
                 message = f"another route takes '{route.case.value}' from '{name}'"
-                yield Diagnostic(origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; let one have it")
+                yield Diagnostic(
+                    origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; remove it from one of them"
+                )
         taken.update((key, origin.span) for key, origin in origins.items())
 
 

@@ -32,15 +32,15 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
         try:
             re.compile(pattern.text)
         except (re.error, OverflowError, RecursionError) as error:
-            hint = "regular expressions are Python's, and match whole names"
+            hint = "write a regular expression of Python that matches whole names"
             return PatternProblem(f"'{pattern.text}' is not a regular expression: {error}", hint)
         return None
     if not pattern.text.startswith("/"):
-        hint = f"patterns are for absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
+        hint = f"patterns match absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
         return PatternProblem(f"'{pattern.text}' does not begin with '/'", hint)
     if wrong := [part for part in _parts(pattern.text) if not _PART.fullmatch(part)]:
-        what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "a part of it is empty"
-        hint = "parts are letters, digits, '_', '*' and '?', or '**' alone; {regex: ...} can say more"
+        what = f"'{wrong[0]}' is not a valid part of a topic name" if wrong[0] else "one of its parts is empty"
+        hint = "write parts of letters, digits, '_', '*' and '?', or '**' alone; for anything else, use {regex: ...}"
         return PatternProblem(f"'{pattern.text}' matches no topic: {what}", hint)
     return None
 

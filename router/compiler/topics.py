@@ -54,7 +54,7 @@ def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: li
         if "package" in table.broken:
             return topic
         message = f"the topic '{topic.topic.value}' lacks the key 'type'"
-        hint = f"say it, or `defaults: {{package: PACKAGE}}`, which makes it PACKAGE/msg/{name}"
+        hint = f"add it, or set `defaults: {{package: PACKAGE}}`, which makes it PACKAGE/msg/{name}"
         findings.append(Diagnostic(topic.topic.span, Code.MISSING_KEY, message, hint))
         return topic
 
@@ -72,10 +72,10 @@ def topic_name_finding(topic: Topic) -> Diagnostic | None:
     """A finding if the name of a topic is invalid."""
     name = topic.topic.value
     if not _NAME.fullmatch(name):
-        hint = "names are letters, digits and '_' with '/' between; no part begins with a digit"
+        hint = "use letters, digits and '_', with '/' between parts; no part starts with a digit"
         return Diagnostic(topic.topic.span, Code.BAD_TOPIC_NAME, f"'{name}' is not a ROS topic name", hint)
     if len(name) > LONGEST_NAME:
-        message = f"a ROS topic name has at most {LONGEST_NAME} characters, this one {len(name)}"
+        message = f"a ROS topic name has at most {LONGEST_NAME} characters, this one has {len(name)}"
         return Diagnostic(topic.topic.span, Code.BAD_TOPIC_NAME, message)
     return None
 
@@ -111,18 +111,18 @@ def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
 
     if given.depth and topic.queue_depth and given.depth.value != topic.queue_depth.value:
         message = f"depth {given.depth.value} contradicts queue_depth {topic.queue_depth.value}"
-        yield conflict(given.depth.span, message, "say it once")
+        yield conflict(given.depth.span, message, "set only one of them")
     if given.history and given.history.value == "keep_all":
         if depth := given.depth or topic.queue_depth:
-            yield conflict(depth.span, "history keep_all has no depth", "leave the depth out, or say keep_last")
+            yield conflict(depth.span, "history keep_all has no depth", "remove the depth, or write keep_last")
         elif publishes and plan.reliability != "best_effort":
             # The middleware makes a reliable publisher wait for a full history: measured, 100 ms per message.
-            message = "one subscriber that stalls would stop the router, which keeps all for it"
-            yield conflict(given.history.span, message, "say a depth instead, or reliability: best_effort")
+            message = "with keep_all, a single stalled subscription would block the router"
+            yield conflict(given.history.span, message, "set a depth instead, or reliability: best_effort")
     if plan.durability == "transient_local" and plan.reliability == "best_effort":
         span = given.durability or given.reliability or given.profile
-        yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
-                       "transient_local goes with reliability: reliable")  # fmt: skip
+        yield conflict(span.span if span else given.span, "late joiners receive nothing from a best_effort publisher",
+                       "set reliability: reliable for transient_local")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +193,10 @@ def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnos
     for other in others:
         if other.publishes and other.owner != use.owner:
             message = f"while clients of {use.owner} are silent, this would publish on '{name}' against {other.owner}"
-            hint = "give each a topic of its own, and let a node choose between them, such as twist_mux"
+            hint = "give each its own topic, and let a node such as twist_mux choose between them"
         elif other.route is not None and other.route.deadman is not None and not other.publishes:
-            message = f"{other.owner} takes '{name}', and this would keep its deadman from tripping"
-            hint = "leave it to the route"
+            message = f"{other.owner} subscribes to '{name}', so this would keep its deadman from tripping"
+            hint = "remove this one: the route has its own"
         else:
             continue
         yield Diagnostic(use.deadman.span, Code.BAD_VALUE, message, hint)
@@ -206,17 +206,17 @@ def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnos
 def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
     if use.topic.type and first.topic.type and use.topic.type.value != first.topic.type.value:
         message = f"topic '{name}' has the type {first.topic.type.value} in {first.owner}"
-        hint = f"a topic has one type; see {first.topic.type.span}"
+        hint = f"use one type for the topic; see {first.topic.type.span}"
         return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
     span = use.topic.qos.span if use.topic.qos else (use.topic.queue_depth or use.topic.topic).span
     if use.publishes == first.publishes:
         if use.qos == first.qos:
             return None
-        message = f"topic '{name}' has another QoS in {first.owner}"
-        return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
+        message = f"topic '{name}' has a different QoS in {first.owner}"
+        return Diagnostic(span, Code.QOS_CONFLICT, message, f"use one QoS for the topic; see {first.topic.span}")
     publisher, subscriber = (use, first) if use.publishes else (first, use)
     if reason := _unheard(publisher.qos, subscriber.qos):
-        message = f"{subscriber.owner} hears nothing that {publisher.owner} publishes on"
+        message = f"{subscriber.owner} would not receive what {publisher.owner} publishes on"
         return Diagnostic(span, Code.QOS_CONFLICT, f"{message} '{name}': {reason}", "give both the same QoS")
     return None
 
@@ -224,15 +224,15 @@ def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
 def _unheard(offered: QosPlan, requested: QosPlan) -> str:
     """Why DDS would not match the two, or an empty string."""
     if offered.reliability == "best_effort" and requested.reliability == "reliable":
-        return "it wants reliable and gets best_effort"
+        return "it requests reliable, but best_effort is offered"
     if offered.durability == "volatile" and requested.durability == "transient_local":
-        return "it wants transient_local and gets volatile"
+        return "it requests transient_local, but volatile is offered"
     if _is_longer(offered.deadline, requested.deadline):
-        return "it wants a shorter deadline than is offered"
+        return "it requests a shorter deadline than is offered"
     if _is_longer(offered.liveliness_lease_duration, requested.liveliness_lease_duration):
-        return "it wants a shorter liveliness lease than is offered"
+        return "it requests a shorter liveliness lease than is offered"
     if offered.liveliness == "automatic" and requested.liveliness == "manual_by_topic":
-        return "it wants liveliness manual_by_topic and gets automatic"
+        return "it requests liveliness manual_by_topic, but automatic is offered"
     return ""
 
 

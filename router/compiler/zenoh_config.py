@@ -44,8 +44,8 @@ def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
         if not is_default(made, key):
             span = config.places.get(tuple(key.split("/")), config.span)
             where = f"'{key}' in '{config.path.name}'" if config.path else f"'{key}'"
-            message = f"{where} has no place in the 'config' of a gateway"
-            yield Diagnostic(span, Code.BAD_VALUE, message, f"write it as '{ours}' beside 'config'")
+            message = f"{where} is not allowed in the 'config' of a gateway"
+            yield Diagnostic(span, Code.BAD_VALUE, message, f"set '{ours}' beside 'config' instead")
 
 
 def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnostic]:
@@ -65,12 +65,12 @@ def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnost
         does.append("listens on all networks of this machine")
         remedies.append("'listen'")
     if ways:
-        does.append(f"looks for others by {' and '.join(ways)}")
+        does.append(f"discovers others by {' and '.join(ways)}")
         off = ", ".join(f"{way}: {{enabled: false}}" for way in ways)
         remedies.append(f"'config: {{scouting: {{{off}}}}}'")
     if does:
-        what = f"gateway '{gateway.name}' {' and '.join(does)}, whatever {networks} are"
-        hint = f"say {' and '.join(remedies)}, or 'mode: client' and where to 'connect'"
+        what = f"gateway '{gateway.name}' {' and '.join(does)}, beyond {networks}"
+        hint = f"set {' and '.join(remedies)}, or 'mode: client' and 'connect'"
         yield Diagnostic(gateway.transport.span, Code.OUTSIDE_NETWORKS, what, hint)
 
 
@@ -83,7 +83,7 @@ def reason(error: object) -> str:
     """The text of an error without the values that it quotes and the positions in the library's source."""
     text = re.sub(r" at /\S+:\d+\.?$", "", str(error).strip())
     if '{"access_control":' in text or "is invalid" in text:
-        return "its values contradict each other, as a user without a password does"
+        return "its values contradict each other, for example a user without a password"
     for pattern in _PLACED:
         if match := re.search(pattern, text, re.DOTALL):
             return f"line {match['line']}, column {match['column']}: {_without_values(match['what'])}"
@@ -106,14 +106,14 @@ def _without_values(text: str) -> str:
 def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
     why, hint = reason(error), ""
     if unknown := re.search(r"unknown field `([^`]*)`, expected (.*)", why):
-        why = f"{why[: unknown.start()]}it has no key '{unknown[1]}' there"
+        why = f"{why[: unknown.start()]}unknown key '{unknown[1]}'"
         hint = did_you_mean(unknown[1], re.findall(r"`([^`]+)`", unknown[2]))
     elif "expected a string" in why:
         hint = "put the value in quotes"
     if config.path is not None:
-        return Diagnostic(config.span, Code.BAD_FILE, f"Zenoh does not take '{config.path.name}': {why}", hint)
+        return Diagnostic(config.span, Code.BAD_FILE, f"Zenoh rejects '{config.path.name}': {why}", hint)
     span = config.places.get(_blamed(json.loads(config.text), (), str(error)), config.span)
-    return Diagnostic(span, Code.BAD_VALUE, f"Zenoh does not take this: {why}", hint)
+    return Diagnostic(span, Code.BAD_VALUE, f"Zenoh rejects this: {why}", hint)
 
 
 def _blamed(value: Any, here: Path, message: str) -> Path:

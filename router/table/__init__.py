@@ -1,4 +1,4 @@
-"""What the user wrote: YAML text to RouteTable, with every finding of text and shape."""
+"""Reading of tables: YAML text to RouteTable, with all findings about text and shape."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[RouteTable | None, list[Diagnostic]]:
-    """The table at `path` and what is wrong with it, in the order of the file.
+    """Read the table at `path`. Return it with its findings, in the order of the file.
 
-    The table is None only when nothing usable could be built (unreadable, bad YAML, no envelope); else
-    it holds what is valid, and `broken` names what was left out. `environ` None means the environment.
+    The table is None only if nothing usable could be built (unreadable, bad YAML, no envelope). Otherwise it contains
+    all valid parts, and `broken` names the others. `environ` defaults to the environment.
     """
     from router.table.build import build_table
     from router.table.mistakes import cut_findings
@@ -45,7 +45,7 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
 
 
 def read_table(path: Path) -> RouteTable:
-    """The table at `path`. Raises TableError if it has errors."""
+    """Read the table at `path`. Raises TableError if it has errors."""
     table, findings = load_table(path)
     if table is None or any(finding.severity is Severity.ERROR for finding in findings):
         raise TableError(findings)
@@ -53,9 +53,9 @@ def read_table(path: Path) -> RouteTable:
 
 
 def http_address(path: Path, environ: Mapping[str, str]) -> Address | None:
-    """The table's `http.address`, read without a check of the rest; None where only `load_table` can say what is wrong.
+    """Return the table's `http.address` without checking the rest; None if it is missing or invalid.
 
-    `router status` waits for nothing else.
+    `router status` needs nothing else.
     """
     try:
         http = load_chain(path, environ, [], []).get("http")
@@ -68,12 +68,12 @@ def http_address(path: Path, environ: Mapping[str, str]) -> Address | None:
 
 
 def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """Each finding once, in the order of the files."""
+    """Return each finding once, in the order of the files."""
     return sorted(dict.fromkeys(findings), key=lambda found: (found.span, found.code.value, found.message))
 
 
 def summary(table: RouteTable) -> str:
-    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`, without what there is none of."""
+    """Return `26 payload cases, 31 topics, 8 endpoints, 1 gateway`; kinds without any are omitted."""
     topics = sum(len(route.all_topics) for route in table.routes)
     cases = {route.case.value for route in table.routes}
     counts = {

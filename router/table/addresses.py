@@ -1,6 +1,6 @@
-"""Addresses of a table: IPv4 literals with a port, read strictly, and the `networks` that all of them must lie in.
+"""Addresses of a table: strict parsing of IPv4 literals with a port, and the check that they lie in `networks`.
 
-Names are never looked up: a table means the same on every machine.
+Host names are never resolved, so a table means the same on every machine.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _NO_MULTICAST = "broadcast and multicast are not supported"
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
 LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
-"""Zenoh's: tcp/192.168.0.10:7447. What may follow the address is no address of another machine."""
+"""A Zenoh locator: tcp/192.168.0.10:7447. The part after the address cannot name another machine."""
 
 
 class BadAddressError(ValueError):
-    """Why a text is no address, and what to do about it."""
+    """A text is not an address. `what` says why, `hint` what to do about it."""
 
     def __init__(self, what: str, hint: str = _EXAMPLE) -> None:
         super().__init__(what)
@@ -46,7 +46,7 @@ class BadAddressError(ValueError):
 
 
 def parse_address(text: str) -> Address:
-    """The address that the text names. Raises BadAddressError."""
+    """Parse an address. Raises BadAddressError."""
     host, colon, port = text.rpartition(":")
     if not colon or _is_ipv4(port):
         raise BadAddressError(f"'{text}' has no port")
@@ -62,7 +62,7 @@ def parse_address(text: str) -> Address:
 
 
 def parse_remote(text: str) -> Address:
-    """The address of one machine, to send to. Raises BadAddressError."""
+    """Parse the address of a single machine, as a destination. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) == 0 or _first(address) >= 224:
         raise not_one_machine(address)
@@ -70,14 +70,14 @@ def parse_remote(text: str) -> Address:
 
 
 def not_one_machine(address: Address) -> BadAddressError:
-    return BadAddressError(f"{address.host} is not the address of one machine", _NO_MULTICAST)
+    return BadAddressError(f"{address.host} is not the address of a single machine", _NO_MULTICAST)
 
 
 def parse_local(text: str) -> Address:
-    """An address that this machine can have, or 0.0.0.0 for all that it has. Raises BadAddressError."""
+    """Parse an address of this machine, or 0.0.0.0 for all of them. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) >= 224:
-        raise BadAddressError(f"{address.host} is not an address that this machine can have", _NO_MULTICAST)
+        raise BadAddressError(f"{address.host} cannot be an address of this machine", _NO_MULTICAST)
     return address
 
 
@@ -100,7 +100,7 @@ def _is_octet(text: str) -> bool:
 
 def _bad_host(host: str) -> BadAddressError:
     if not _NUMBERS.fullmatch(host):
-        hint = "addresses are IPv4 literals such as 192.168.0.30; names are not looked up"
+        hint = "addresses are IPv4 literals such as 192.168.0.30; host names are not resolved"
         return BadAddressError(f"'{host}' is not an IPv4 address", hint)
     parts = host.split(".")
     if len(parts) != 4:
@@ -118,11 +118,11 @@ ADDRESSES: tuple[Path, ...] = (
     *(("gateways", "*", "transport", name) for name in ("udp", "tcp", "websocket")),
     *(("gateways", "*", "transport", "zenoh", name, "*") for name in ("connect", "listen")),
 )
-"""Where addresses stand in a table; `*` is any name, or any item of a list."""
+"""Paths of all addresses in a table; `*` is any name, or any item of a list."""
 
 
 def outside_findings(root: MappingNode, networks: Networks, files: Sequence[str]) -> Iterator[Diagnostic]:
-    """`files` are those of the table, each before the one that it extends."""
+    """Yield findings for addresses outside `networks`. `files` are the table's, each before the one that it extends."""
     extended = files[files.index(networks.span.file) + 1 :]
     for pattern in ADDRESSES:
         for path, node in _found(root, pattern, ()):
@@ -151,14 +151,14 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
         address = parse_address(locator["address"] if locator else node.text)
     except BadAddressError:
         if is_locator:  # a host name, IPv6, a path; other addresses have this finding already
-            what = f"'{node.text}' under '{key}' of {name} has no IPv4 address that could lie in {networks}"
+            what = f"'{node.text}' under '{key}' of {name} has no IPv4 address to compare with {networks}"
             remedy = _remedy(path, "tcp/127.0.0.1:7447", networks, is_extended)
             yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, remedy)
         return
     host = ipaddress.IPv4Address(address.host)
     if any(host in network for network in networks.members):
         return
-    which = "all networks of this machine, which is more than" if address.host == "0.0.0.0" else "outside"
+    which = "which includes more than" if address.host == "0.0.0.0" else "outside"
     what = f"'{key}' of {name} is {address}, {which} {networks}"
     nearest = f"{_moved(host, networks.members[0])}:{address.port}"
     example = f"{locator['protocol']}{nearest}{locator['rest']}" if locator else nearest
@@ -166,15 +166,15 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
 
 
 def _moved(host: ipaddress.IPv4Address, network: ipaddress.IPv4Network) -> ipaddress.IPv4Address:
-    """The host of this number in a network; of number 0, which is no host, the first."""
+    """Return the address in a network with the host part of `host`; for host part 0, the first host."""
     number = int(host) & int(network.hostmask)
     return network.network_address + (number or min(1, network.num_addresses - 1))
 
 
 def _remedy(path: Path, example: str, networks: Networks, is_extended: bool) -> str:
     if not is_extended:
-        return f"write one that lies there, such as {example}"
+        return f"write an address inside them, such as {example}"
     said = f"[{example}]" if "zenoh" in path[3:] else example
     for key in reversed(path):
         said = f"{key}: {said}" if key == path[0] else f"{{{key}: {said}}}"
-    return f"give it one in {networks.span.file}, such as {said}"
+    return f"override it in {networks.span.file}, for example with {said}"

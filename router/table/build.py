@@ -1,6 +1,6 @@
 """Build the typed route table from nodes that fit the schema. Parts with findings are left out and named in `broken`.
 
-Objects of the model are read key by key as its classes declare them (`structure`); what has a syntax of its own has a
+`structure` reads objects key by key, as the classes of the model declare them. Types with their own syntax have a
 function here.
 """
 
@@ -81,7 +81,7 @@ from router.table.reading import (
 from router.table.source import Source
 from router.table.units import TOPIC_RATE
 
-with left_out("_hashlib"):  # OpenSSL: 4 MB and 8 ms, where Python's own is enough
+with left_out("_hashlib"):  # OpenSSL costs 4 MB and 8 ms; Python's own implementation is enough
     from hashlib import sha256
 
 T = TypeVar("T")
@@ -97,9 +97,9 @@ DEFAULT_FORMATS: Mapping[Transport, GatewayFormat] = {
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
-    """The table of all valid parts; None if the envelope or the routes as a whole are invalid or missing.
+    """Build the table of all valid parts; None if the envelope or the routes as a whole are invalid or missing.
 
-    Findings that the schema cannot make, such as a buffer size that the kernel refuses, are added to `findings`.
+    Problems that the schema cannot detect, such as a buffer size that the kernel rejects, are added to `findings`.
     """
     builder = _Builder(findings)
     envelope = builder.one(root, "envelope", _envelope)
@@ -112,7 +112,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
     defaults = root.get("defaults")
     if defaults is not None and defaults.broken:
-        builder.broken.add("package")  # it may be what is broken
+        builder.broken.add("package")  # it may be the broken part
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
@@ -136,7 +136,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
 
 
 def _has_gateways_only(root: MappingNode) -> bool:
-    """The table receives no datagrams, so it needs no envelope."""
+    """Return whether the table receives no datagrams, so that it needs no envelope."""
     return "gateways" in root.entries and not root.entries.keys() & {"listen", "routes"}
 
 
@@ -145,11 +145,11 @@ Salvage = Callable[[Entry], Union[Entry, None]]
 
 
 def _nothing(_: Entry) -> None:
-    """Most parts are valid as a whole or not at all, such as an endpoint."""
+    """Return nothing: most parts, such as an endpoint, are valid as a whole or not at all."""
 
 
 class _Builder:
-    """Builds parts and remembers which could not be built."""
+    """Builds parts of the table and records which are broken."""
 
     def __init__(self, findings: list[Diagnostic]) -> None:
         self._findings = findings
@@ -163,7 +163,7 @@ class _Builder:
     def each(
         self, root: MappingNode, name: str, build: Callable[[Entry], T], salvage: Salvage = _nothing
     ) -> Mapping[str, T]:
-        """The parts by name under a key of the root, of a broken one what `salvage` leaves."""
+        """Build the parts under a key of the root, by name. `salvage` returns the valid rest of a broken part."""
         group = root.entries.get(name)
         if group is None:
             return {}
@@ -190,7 +190,7 @@ class _Builder:
 
 
 def structure(model: type[M], settings: MappingNode, **given: Any) -> M:
-    """An object of a class of the model: `given`, and of the mapping every other key that the class declares."""
+    """Build an object of a model class from `given` and, for all other keys of the class, from the mapping."""
     values = {
         key.attribute: _value(key, entry)
         for key in keys_of(model)
@@ -200,7 +200,7 @@ def structure(model: type[M], settings: MappingNode, **given: Any) -> M:
 
 
 def _entry(settings: MappingNode, name: str) -> Entry | None:
-    """The entry of a key, whose name has dots where it stands inside others."""
+    """Return the entry of a key; dots in its name separate nested keys."""
     outer, _, inner = name.partition(".")
     entry = settings.entries.get(outer)
     return _entry(mapping(entry.value), inner) if entry and inner else entry
@@ -214,7 +214,7 @@ def _value(key: Key, entry: Entry) -> object:
 
 
 def _item_span(node: Node) -> SourceSpan:
-    """A mapping in a list has no key of its own; its first key stands for it."""
+    """Return the span of a list item; for a mapping, which has no key, that of its first key."""
     return next(iter(node.entries.values())).key.span if isinstance(node, MappingNode) and node.entries else node.span
 
 
@@ -239,11 +239,11 @@ def _scalar_value(key: Key, found: ScalarNode) -> object:
     return key.type(found.text) if issubclass(key.type, enum.Enum) else found.text
 
 
-# what stands at the root
+# keys of the root
 
 
 def _named(model: type[M]) -> Callable[[Entry], M]:
-    """A reader of what stands under a name of its own."""
+    """Return a reader for parts under a name that the table chooses."""
     return lambda entry: structure(model, mapping(entry.value), name=entry.key.text, span=entry.key.span)
 
 
@@ -257,7 +257,7 @@ def _own_protos(span: SourceSpan) -> Path:
     try:
         return asset("protos")
     except FileNotFoundError as error:
-        what = "'envelope' names no protos, and this router has none of its own"
+        what = "'envelope' has no 'protos', and this installation includes none"
         raise InvalidValueError(span, Code.MISSING_KEY, what, "add `protos: FOLDER`") from error
 
 
@@ -292,16 +292,17 @@ def _network(node: Node) -> IPv4Network:
     written = located(node)
     try:
         return IPv4Network(written.value)
-    except ValueError as error:  # not its form, which the schema has checked
-        what = f"{written.value} is a host of the network {IPv4Network(written.value, strict=False)}"
-        raise InvalidValueError(written.span, Code.BAD_VALUE, what, "write the network") from error
+    except ValueError as error:  # host bits are set; the schema has checked the form
+        hint = f"write {IPv4Network(written.value, strict=False)}"
+        what = f"{written.value} is the address of a host, not of a network"
+        raise InvalidValueError(written.span, Code.BAD_VALUE, what, hint) from error
 
 
 # routes
 
 
 def _case(entry: Entry) -> tuple[Route, ...]:
-    """The routes of one payload case, all named after the case so far."""
+    """Build the routes of one payload case, all named after the case for now."""
     if not isinstance(entry.value, SequenceNode):
         return (_route(entry.key, entry.value, entry.key.span),)
     return tuple(_route(entry.key, item, _item_span(item)) for item in entry.value.items)
@@ -329,14 +330,14 @@ def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
 
 
 def _members(node: Node | None) -> Sequence[Node]:
-    """The items of a list, or the one thing that stands in its place."""
+    """Return the items of a list, or a single value as the only item."""
     return node.items if isinstance(node, SequenceNode) else (node,) if node else ()
 
 
 def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
-    """The routes of all cases, with names that tell them apart in metrics and log.
+    """Return the routes of all cases, with unique names for metrics and log.
 
-    A case's only route keeps the case's name; of several each is named after its first source.
+    The only route of a case keeps the case's name; several routes are named after their first source.
     """
     cases = tuple(cases)
     taken = {route.name for routes in cases for route in routes}
@@ -354,7 +355,7 @@ def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """The name, or with the first of `_2`, `_3`, ... behind it with which it is not taken."""
+    """Return the name, with the first suffix `_2`, `_3`, ... that makes it unique if it is taken."""
     free, number = name, 1
     while free in taken:
         number += 1
@@ -373,7 +374,7 @@ def _topic(node: Node, span: SourceSpan) -> Topic:
 
 
 def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
-    """The deadman of a route with these destinations, which get its payload unless it says `to`."""
+    """Build the deadman of a route. Without `to`, its payload goes to the route's destinations."""
     settings = _with_timeout(entry)
     [payload] = mapping(settings.get("send")).entries.values()
     own = {} if settings.get("to") else {"to": destinations}
@@ -383,10 +384,10 @@ def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
 
 
 def _with_timeout(deadman: Entry) -> MappingNode:
-    """The settings of a deadman. Its timeout is a key that there must be, here or in the table's defaults."""
+    """Return the settings of a deadman. Raises InvalidValueError if neither they nor the defaults have a timeout."""
     settings = mapping(deadman.value)
     if settings.get("timeout") is None:
-        hint = "say it here, or for all deadmen: `defaults: {deadman: {timeout: 500ms}}`"
+        hint = "set it here, or for all deadmen with `defaults: {deadman: {timeout: 500ms}}`"
         what = "'deadman' lacks the key 'timeout'"
         raise InvalidValueError(deadman.key.span, Code.MISSING_KEY, what, hint)
     return settings
@@ -408,7 +409,7 @@ def _choices(node: MappingNode, span: SourceSpan) -> Expression:
 
 
 def _expression(node: Node, span: SourceSpan) -> Expression:
-    """A scalar as it was written, a list of expressions, a choice, or text that stands for itself."""
+    """Build an expression: a scalar as written, a list of expressions, a choice, or literal text."""
     if is_choice(node):
         return _choices(mapping(node), span)
     if isinstance(node, MappingNode):
@@ -420,7 +421,7 @@ def _expression(node: Node, span: SourceSpan) -> Expression:
 
 
 def _fields(node: Node, span: SourceSpan) -> FieldMap:
-    """`auto`, or a mapping of fields, with `auto` perhaps among them."""
+    """Build a field map from `auto`, or from a mapping of fields that may contain `auto`."""
     if isinstance(node, ScalarNode):
         return FieldMap(node.span, auto=True, entries=())
     written = mapping(node)
@@ -429,7 +430,7 @@ def _fields(node: Node, span: SourceSpan) -> FieldMap:
 
 
 def _constants(entry: Entry) -> FieldMap:
-    """The fields of a payload that is not filled from a message; here `auto` is a field like any other."""
+    """Build the fields of a constant payload; here `auto` is an ordinary field."""
     return FieldMap(entry.key.span, auto=False, entries=tuple(_field_entries(mapping(entry.value), (), ())))
 
 
@@ -444,7 +445,7 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
 
 
 def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:
-    """The places of the names between the dots of a key; the whole key where its text is not verbatim."""
+    """Yield the spans of the names between the dots of a key; the whole key if its text is not verbatim."""
     start = 0
     for part in key.text.split("."):
         yield key.place.part(start, start + len(part))
@@ -480,14 +481,14 @@ def _transport_address(transport: Transport, written: Located[str]) -> Located[A
 
 
 def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
-    """A mapping of settings, or the path of a file."""
+    """Build a Zenoh configuration from a mapping of settings, or from the path of a file."""
     if isinstance(node, MappingNode):
         return ZenohConfig(span, json.dumps(to_data(node)), places=dict(_places(node)))
     written = located(node)
     path = beside(written.value, written.span)
     try:
         if inputs.exists(path) and not inputs.is_file(path):
-            raise OSError(0, "it is no ordinary file")
+            raise OSError(0, "it is not a regular file")
         return ZenohConfig(written.span, inputs.read_text(path), path)
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
@@ -497,7 +498,7 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
 
 
 def _places(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:
-    """Of each key, and of each item of a list, by its path."""
+    """Yield the span of each key and of each list item, by path."""
     if isinstance(node, MappingNode):
         for key, entry in node.entries.items():
             yield (*here, key), entry.key.span
@@ -542,4 +543,4 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,
 }
-"""Readers of types with a syntax of their own. Each gets the value's node and the span of its key."""
+"""Readers of types with their own syntax. Each takes the value's node and the span of its key."""

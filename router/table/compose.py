@@ -1,7 +1,7 @@
 """YAML text to nodes: PyYAML's parser events, composed without recursion and with bounds.
 
-Plain scalars follow the core schema of YAML 1.2. What cannot be parsed is raised as TableError, in words that say what
-to do, at the line that has the mistake. What is merely wrong becomes a finding, and its node is marked broken.
+Plain scalars follow the core schema of YAML 1.2. Text that cannot be parsed raises TableError, which points at the
+mistake and says what to do. Other problems become findings, and their nodes are marked broken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's where this P
 
 @dataclass(slots=True)
 class _Collection:
-    """A mapping or sequence that is not closed yet. A mapping's children are key, value, key, value."""
+    """A mapping or sequence that is still open. A mapping's children are key, value, key, value."""
 
     event: yaml.CollectionStartEvent
     span: SourceSpan
@@ -36,7 +36,7 @@ class _Collection:
 
 
 def compose(source: Source, environ: Mapping[str, str], findings: list[Diagnostic]) -> Node:
-    """The one document of the text. Findings that leave a tree are appended to `findings`."""
+    """Compose the only document of the text. Non-fatal findings are appended to `findings`."""
     return _Composer(source, environ, findings).compose()
 
 
@@ -61,13 +61,13 @@ class _Composer:
             elif isinstance(event, yaml.AliasEvent):
                 self._alias(event)
             elif isinstance(event, yaml.DocumentStartEvent) and self._root is not None:
-                raise self._fatal(self._span(event), "a second document begins here", "a table is one document")
+                raise self._fatal(self._span(event), "a second document begins here", "write one document per file")
         if self._root is None or (isinstance(self._root, ScalarNode) and not self._root.text):
-            raise self._fatal(SourceSpan(self._source.file), "the file holds no table", "begin with 'version: 1'")
+            raise self._fatal(SourceSpan(self._source.file), "the file contains no table", "start with 'version: 1'")
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
-        last: yaml.Event | None = None  # that is written: an unclosed quote is taken for a key without a value
+        last: yaml.Event | None = None  # with text: an unclosed quote is parsed as a key without a value
         try:
             for event in yaml.parse(self._source.text, Loader=LOADER):
                 if not isinstance(event, yaml.ScalarEvent) or event.value or event.style:
@@ -81,21 +81,21 @@ class _Composer:
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
     def _open_quote(self, event: yaml.Event | None) -> SourceSpan | None:
-        """Where a quoted scalar over several lines begins, if that is what was read last."""
+        """Return where a multi-line quoted scalar begins, if that is the last event."""
         if not isinstance(event, yaml.ScalarEvent) or event.style not in ("'", '"'):
             return None
         line, column, end_line, _ = _marks(event)
         return self._source.span(line, column, line, column + 1) if end_line > line else None
 
     def _open_bracket(self) -> SourceSpan | None:
-        """Where the innermost '[' or '{' stands that is not closed yet."""
+        """Return the position of the innermost open '[' or '{'."""
         flow = [collection for collection in self._open if collection.event.flow_style]
         return flow[-1].span if flow else None
 
     def _begin(self, event: yaml.CollectionStartEvent) -> None:
         span = self._span(event)
         if len(self._open) == MAX_DEPTH:
-            raise self._fatal(span, f"this is nested more than {MAX_DEPTH} deep", "")
+            raise self._fatal(span, f"this is nested more than {MAX_DEPTH} levels deep", "")
         if event.anchor is not None:
             self._anchors.pop(event.anchor, None)
         self._open.append(_Collection(event, span, self._has_tag(event, span)))
@@ -103,7 +103,8 @@ class _Composer:
     def _alias(self, event: yaml.AliasEvent) -> None:
         if event.anchor not in self._anchors:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
-            what = f"the alias '*{event.anchor}' " + ("stands inside what it repeats" if recursive else "has no anchor")
+            problem = "is inside the value that it repeats" if recursive else "has no anchor"
+            what = f"the alias '*{event.anchor}' {problem}"
             raise self._fatal(self._span(event), what, "" if recursive else "quote text that begins with '*'")
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
@@ -118,7 +119,7 @@ class _Composer:
         parent.children.append(node)
         parent.size += size
         if parent.size > MAX_NODES:
-            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, aliases written out", "")
+            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, counting aliases in full", "")
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)
@@ -133,17 +134,17 @@ class _Composer:
             broken |= bool(problems)
             place = TextPlace(span)
         if unusable := unusable_character(text):
-            broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
+            broken |= self._report(span, f"the text contains the character {unusable[1]}", "")
         if not event.style and text[-1:] == "," and " " not in text and self._open_bracket() is None:
             broken |= self._report(
-                span, f"'{text}' ends with a ','", "remove it: only within brackets does ',' separate"
+                span, f"'{text}' ends with a ','", "remove it: ',' separates values only inside brackets"
             )
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
-            # A variable by its name: its value may be secret.
-            what = f"'{event.value}' is {found.meaning} to some YAML readers and something else to others"
-            hint = (f"{found.remedy}, or, for text, " if found.remedy else "") + f'quote it: "{event.value}"'
+            # Shows a variable by name, since its value may be secret.
+            what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
+            hint = (f"{found.remedy}; for text, " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)
@@ -174,27 +175,27 @@ class _Composer:
             if not isinstance(key, ScalarNode):
                 broken = self._report(
                     key.span,
-                    "a key must be a word, not a mapping or a sequence",
+                    "a key must be a word, not a mapping or a list",
                     "quote text that begins with '{' or '['",
                 )
             elif blank := foreign_blank(key.text):
                 broken = self._report(
-                    key.span, f"the character {blank} stands in this key", "remove it, or write an ordinary space"
+                    key.span, f"this key contains the character {blank}", "remove it, or write an ordinary space"
                 )
             elif key.text == "<<" and key.value == "<<":
-                broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
+                broken = self._report(key.span, "tables do not support merge keys ('<<')", "write out the keys")
             elif key.text in entries and key.text in rests:
-                continue  # what the comma cut off has a finding already
+                continue  # already has a finding
             elif key.text in entries:
                 first = entries[key.text].key.span
-                what = f"the key '{key.text}' is already in this mapping, at line {first.line}"
+                what = f"the key '{key.text}' is already in this mapping, on line {first.line}"
                 self._findings.append(Diagnostic(key.span, Code.DUPLICATE_KEY, what, "remove one of the two"))
             else:
                 entries[key.text] = Entry(key, value)
         return MappingNode(collection.span, entries, broken)
 
     def _without_slip(self, key: Node) -> Node:
-        """The key that is meant, with a finding if it is another one."""
+        """Return the key that is meant, and report a finding if it is misspelt."""
         if isinstance(key, ScalarNode) and key.place.is_whole_line:
             for pattern, what, hint in _KEY_SLIPS:
                 if match := pattern.fullmatch(key.text):
@@ -209,14 +210,14 @@ class _Composer:
         from router.table.mistakes import exclamation
 
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
-        hint = "remove it; quotes make a value text"
+        hint = "remove it; to make a value text, quote it"
         if (found := exclamation(self._source, span.line - 1)) is not None:
             self._findings.append(found)
             return True
-        return self._report(span, f"the tag '{name}' has no place in a table", hint)
+        return self._report(span, f"tables do not support the tag '{name}'", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
-        """Add a finding; True, because what has one is broken."""
+        """Add a finding. Return True, the value of `broken` for its node."""
         self._findings.append(Diagnostic(span, Code.BAD_YAML, what, hint))
         return True
 
@@ -228,7 +229,7 @@ class _Composer:
 
 
 def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
-    """Line and column of the first character and of the one after the last, from 0."""
+    """Return line and column of the first character and of the end, from 0."""
     start, end = event.start_mark, event.end_mark
     if start is None or end is None:
         raise TypeError("the parser sets marks on every event")
@@ -236,14 +237,14 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
 
 
 _KEY_SLIPS = (
-    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "this ':' is one too many", "remove it"),
+    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "unexpected ':'", "remove it"),
     (
         re.compile(r"(?P<slip>-)(?P<key>[A-Za-z_][\w.]*)"),
         "a space is missing after '-'",
-        "begin items of a list with '- '; a key has no '-'",
+        "start list items with '- '; a key has no '-'",
     ),
 )
-"""What a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
+"""Characters that a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
 
 # Plain scalars
 
@@ -252,20 +253,20 @@ _WORDS: dict[str, Plain] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
-_INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python refuses to read far longer ones
+_INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python does not parse far longer ones
 _HEX = re.compile(r"0x[0-9a-fA-F]{1,300}")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
 
 class Surprise(NamedTuple):
-    """What some YAML readers take a scalar for, and how to say what one means."""
+    """How some YAML parsers interpret a scalar, and how to write it unambiguously."""
 
     meaning: str
     remedy: str
 
 
 _NUMBERS = frozenset("0123456789+-.")
-"""What a number begins with, and what nearly all other scalars do not."""
+"""First characters of numbers; nearly all other scalars begin differently."""
 _TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
 _OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
 _BINARY = Surprise("a binary number", "write a decimal number")
@@ -289,7 +290,7 @@ _NUMBER_SURPRISES = (
 
 
 def resolve(text: str) -> Plain:
-    """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` and `1e999` stay text."""
+    """Return the value of a plain scalar. Tables have no infinities or NaN: `.inf` and `1e999` stay text."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] not in _NUMBERS:
@@ -304,7 +305,7 @@ def resolve(text: str) -> Plain:
 
 
 def surprise(text: str) -> Surprise | None:
-    """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
+    """Return how YAML 1.1 interprets a plain scalar differently from YAML 1.2; None if it does not."""
     if text[:1] not in _NUMBERS:
         return _WORD_SURPRISES.get(text)
     return next((found for pattern, found in _NUMBER_SURPRISES if pattern.fullmatch(text)), None)

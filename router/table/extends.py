@@ -1,10 +1,10 @@
-"""`extends`: the chain of files that a table is made of, merged into one tree.
+"""`extends`: merges the chain of files that make up a table into one tree.
 
-Mappings merge key by key, everything else replaces. These mappings replace as well: what may be one or a list, such as
-the topics of a route; a quality of service, which may be a name; a `map` of values; a route or gateway that one of the
-two files ignores, a route from topics one from endpoints, a deadman that one of the files says there is none of, the
-payload that a deadman sends, and the transport of a gateway. `topic` and `topics` of a route replace each other. Every
-node keeps the span of the file where it was written.
+Mappings merge key by key; everything else is replaced. These mappings are also replaced: values that may be a list
+(such as the topics of a route) or a name (a QoS); a `map` of values; a route or gateway that only one of the two files
+ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and the
+reverse; the payload of a deadman; and the transport of a gateway. `topic` and `topics` of a route replace each other.
+Every node keeps the span of its own file.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from router.table.source import Source, read_source
 KEY = "extends"
 IGNORE = "ignore"
 _DEPTH = len(("routes", "case"))
-"""At which routes and gateways stand."""
+"""Depth of routes and gateways in a table."""
 _WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
-"""The key that says that there is no route or gateway, or no such part of it."""
+"""Keys that disable a route, a gateway, or a part of one."""
 _ALTERNATIVES = {"topic": "topics", "topics": "topic"}
-"""Keys of a route that exclude each other."""
+"""Mutually exclusive keys of a route."""
 _WHOLE = ("source", "destinations", *_ALTERNATIVES)
-"""Keys of a route that take one or a list."""
+"""Keys of a route that take a single value or a list."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
-"""What of a route or gateway has one key, which says what kind it is."""
+"""Parts of a route or gateway with a single key, which selects their kind."""
 
 
 def load_chain(
     path: Path, environ: Mapping[str, str], sources: list[Source], findings: list[Diagnostic]
 ) -> MappingNode:
-    """The table at `path` with everything that it extends, without the key `extends`.
+    """Return the table at `path`, merged with all tables that it extends, without the key `extends`.
 
-    Appends every file read to `sources`, the table first, and what is wrong to `findings`. Raises
-    TableError for what leaves no tree.
+    Appends every file read to `sources`, the table first, and problems to `findings`. Raises TableError if there is no
+    tree.
     """
     layers: list[MappingNode] = []
     seen: list[str] = []
@@ -64,7 +64,7 @@ def load_chain(
 
 
 def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode:
-    """`over` laid upon `base`, which stand at the path `here`."""
+    """Merge `over` into `base`; both are at the path `here`."""
     entries = dict(base.entries)
     is_route = here[:1] == ("routes",) and len(here) == _DEPTH
     for key, entry in over.entries.items():
@@ -79,7 +79,7 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Whether `over` replaces `base` instead of being merged with it: see above."""
+    """Return whether `over` replaces `base` instead of being merged into it; see the module's docstring."""
     if path == ("defaults", "qos") or is_choice(over) or is_choice(base):
         return True
     if path[0] not in _OF_ONE_KIND:
@@ -113,7 +113,7 @@ def _reference(root: MappingNode) -> ScalarNode | None:
         return None
     node = entry.value
     if node.broken:
-        raise TableError([])  # its own finding is in the list already
+        raise TableError([])  # its finding is already in the list
     if not isinstance(node, ScalarNode) or not isinstance(node.value, str) or not node.text:
         span = node.span if isinstance(node, ScalarNode) and node.text else entry.key.span
         raise TableError.of(span, Code.WRONG_TYPE, f"'{KEY}' must be the path of another table")
@@ -121,13 +121,13 @@ def _reference(root: MappingNode) -> ScalarNode | None:
 
 
 def _read_base(path: Path, reference: ScalarNode) -> Source:
-    """Read the file that a table extends. If it cannot be read, the line that names it is blamed."""
+    """Read the file that a table extends. Raises TableError at the line that names it if it cannot be read."""
     try:
         return read_source(path)
     except TableError as error:
         found = error.diagnostics[0]
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
-            raise  # the file is there, a place in it is wrong
+            raise  # the file exists, but something in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
         looked = f"looked for {shown_path(Path(inputs.real_path(path)))}"
         hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or looked

@@ -1,8 +1,8 @@
-"""Whether data fits a JSON Schema, decided by functions that are made of the schema.
+"""Fast check of whether data fits a JSON Schema, by functions made from the schema.
 
-Nearly every table fits. jsonschema takes 20 times as long to find that, after an import that takes as long as the check
-of a table, so only data that does not fit is left to it (schema.py). fastjsonschema generates Python from a schema, and
-that would have to be compiled at each start.
+Nearly every table fits. jsonschema takes 20 times as long to find that out, and its import takes as long as the check
+of a table, so schema.py uses it only for data that does not fit. fastjsonschema generates Python from a schema, which
+would have to be compiled at each start.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ Fits = Callable[[Any], bool]
 
 
 def fitting(schema: Mapping[str, Any]) -> Fits:
-    """A function from data to whether it fits a schema of draft 7, with the keywords that ours use.
+    """Return a function that tells whether data fits a schema of draft 7, with the keywords that our schemas use.
 
-    References lead to the schema's own `definitions`. It may be wrong about a list whose items are 1 and true, which is
-    none of unique items.
+    References lead to the schema's own `definitions`. It treats 1 and true as equal items of a list.
     """
     return _Maker(schema["definitions"]).of(schema)
 
@@ -31,7 +30,7 @@ class _Maker:
     def of(self, schema: Mapping[str, Any] | bool) -> Fits:
         if isinstance(schema, bool):
             return lambda _: schema
-        if "$ref" in schema:  # what stands beside it does not count
+        if "$ref" in schema:  # other keywords beside it are ignored
             return self._reference(schema["$ref"].removeprefix("#/definitions/"))
         found = [_KEYWORDS[keyword](self, limit, schema) for keyword, limit in schema.items() if keyword in _KEYWORDS]
         if unknown := schema.keys() - _KEYWORDS.keys() - _OTHERS:
@@ -42,7 +41,7 @@ class _Maker:
         return [self.of(each) for each in schemas]
 
     def _reference(self, name: str) -> Fits:
-        """A definition, made when it is first used: it may lead to itself."""
+        """Return the check of a definition, made on first use because it may refer to itself."""
 
         def fits(value: object) -> bool:
             if name not in self._made:
@@ -76,7 +75,7 @@ def _if(maker: _Maker, condition: Any, schema: Mapping[str, Any]) -> Fits:
 
 
 def _members(maker: _Maker, _: Any, schema: Mapping[str, Any]) -> Fits:
-    """The members of a mapping, those in `properties` and others."""
+    """Check the members of a mapping, those in `properties` and others."""
     known = {name: maker.of(part) for name, part in schema.get("properties", {}).items()}
     other = maker.of(schema.get("additionalProperties", True))
 
@@ -109,17 +108,17 @@ _TYPES: Mapping[str, Fits] = {
 
 
 def _is_one_of(limits: Collection[Any]) -> Fits:
-    """Scalars. True is not 1."""
+    """Check that a value is one of these scalars. True does not equal 1."""
     return lambda value: any(value == each and isinstance(value, bool) is isinstance(each, bool) for each in limits)
 
 
 def exact_pattern(pattern: str) -> str:
-    """JSON Schema's `$` is the very end of the text; Python's would let a line end follow."""
+    """Translate `$` at the end: in JSON Schema it is the very end of the text, in Python a line end may follow."""
     return pattern[:-1] + r"\Z" if pattern.endswith("$") else pattern
 
 
 def _pattern(limit: str) -> Fits:
-    pattern = exact_pattern(limit)  # compiled when it is first used
+    pattern = exact_pattern(limit)  # compiled on first use
     return lambda text: re.search(pattern, text) is not None
 
 
@@ -128,7 +127,7 @@ def _are_unique(items: list[Any]) -> bool:
 
 
 def _of(kind: str, make: Callable[[Any], Fits]) -> Callable[[_Maker, Any, Mapping[str, Any]], Fits]:
-    """A keyword about values of one type: those of another type fit."""
+    """Return a keyword that constrains values of one type; values of other types fit."""
     is_concerned = _TYPES[kind]
 
     def keyword(_: _Maker, limit: Any, __: Mapping[str, Any]) -> Fits:
@@ -139,7 +138,7 @@ def _of(kind: str, make: Callable[[Any], Fits]) -> Callable[[_Maker, Any, Mappin
 
 
 def _each(kind: str, is_met: Callable[[Fits, Any], bool]) -> Callable[[_Maker, Any, Mapping[str, Any]], Fits]:
-    """A keyword about what is in values of one type."""
+    """Return a keyword that constrains the members of values of one type."""
 
     def keyword(maker: _Maker, limit: Any, _: Mapping[str, Any]) -> Fits:
         part = maker.of(limit)
@@ -177,4 +176,4 @@ _KEYWORDS: Mapping[str, Callable[[_Maker, Any, Mapping[str, Any]], Fits]] = {
 _OTHERS = frozenset({
     "$schema", "$comment", "title", "description", "default", "examples", "errorMessage", "definitions", "then", "else",
 })  # fmt: skip
-"""What says nothing about data, or something with `if` only."""
+"""Keywords that do not constrain data, or only together with `if`."""

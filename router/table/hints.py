@@ -1,4 +1,4 @@
-"""Hints for keys and values that do not fit the schema: what people write by mistake, and what they mean."""
+"""Hints for keys and values that do not fit the schema: common mistakes, and what is meant by them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.table.source import in_braces
 from router.table.units import meant_quantity
 
 NAME_FIELDS = ("fields", "send")
-"""Keys under which the names of fields stand, each with an expression."""
+"""Keys whose mappings contain field names, each with an expression."""
 _ELSEWHERE = {
     "topic": ("name", "ros"),
     "endpoint": ("name", "to", "destination"),
@@ -50,29 +50,29 @@ _ELSEWHERE = {
     "from": ("source", "sender"),
     "case": ("payload", "type"),
 }
-"""Keys, with their names in other programs."""
+"""Our keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
 _IN_OTHER_WORDS = (
-    ("address", ADDRESS_PARTS, "an address is IP and port in one: `address: 192.168.0.30:8`"),
-    ("ignore", ("enabled", "enable", "disabled", "active"), "what is out of use has the one key `ignore: why`"),
-    ("endpoint", ("topic", "topics"), "a ROS topic is a key of the route: `topic: NAME`"),
-    ("queue_depth", ("endpoint",), "an endpoint is named alone: `source: NAME`"),
+    ("address", ADDRESS_PARTS, "write the IP address and port together: `address: 192.168.0.30:8`"),
+    ("ignore", ("enabled", "enable", "disabled", "active"), "to disable it, write only `ignore: why`"),
+    ("endpoint", ("topic", "topics"), "write a ROS topic as a key of the route: `topic: NAME`"),
+    ("queue_depth", ("endpoint",), "name an endpoint directly: `source: NAME`"),
     ("qos", ("latched", "latch", "transient_local"), "write `qos: {durability: transient_local}`"),
     ("qos", ("reliable", "best_effort"), "write `qos: {reliability: best_effort}` or `reliable`"),
     ("websocket", ("type", "kind", "address", "port"), "write its kind and address, such as {websocket: 0.0.0.0:8765}"),
     ("package", ("timeout", "repeat"), "write `deadman: {timeout: 500ms, repeat: 100ms}`"),
-    ("repeat", ("send", "at_start"), "each deadman says that for itself"),
-    ("at", ("wait", "sleep", "delay", "after"), "say when it is, since the beginning of the test: `at: 500ms`"),
-    ("extends", ("description", "name", "title"), "what is for people stands in a comment: `# ...`"),
-    ("source", ("description", "comment", "note"), "what is for people stands in a comment: `# ...`"),
+    ("repeat", ("send", "at_start"), "set it in each deadman"),
+    ("at", ("wait", "sleep", "delay", "after"), "write the time since the start of the test: `at: 500ms`"),
+    ("extends", ("description", "name", "title"), "write descriptions as comments: `# ...`"),
+    ("source", ("description", "comment", "note"), "write descriptions as comments: `# ...`"),
 )
-"""A known key, the keys that people write beside it by mistake, and the hint for these."""
+"""A known key, keys that people write beside it by mistake, and the hint for them."""
 CLOSE = 0.7
-"""The similarity of a misspelt key to the one that is suggested: `period` does not suggest `schema_period`."""
+"""Similarity required of a suggested key: `schema_period` is not suggested for `period`."""
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:
-    """The key among `known` that a misspelt one stands for."""
+    """Return the key among `known` that a misspelt one stands for, or None."""
     known = list(known)
     if ":" in name or in_other_words(name, known):
         return None
@@ -84,29 +84,29 @@ def in_other_words(name: str, known: Iterable[str]) -> str:
 
 
 _IN_WORDS = ("none", "ignore", "because")
-"""Keys whose value is a reason in words."""
+"""Keys whose value is a reason in prose."""
 
 
 def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
-    """A hint for a key that goes on with the words before it, or stands below fields and may be one of them."""
+    """Return a hint for a key that continues the text before it, or that may belong to the fields above it."""
     if before is None:
         return ""
     key, written = before[0], before[1].value
     is_nothing = isinstance(entry.value, ScalarNode) and entry.value.value is None
     if is_nothing and isinstance(written, ScalarNode) and key in _IN_WORDS:
-        return f"quote text that has ',' in it: `{key}: \"{written.text}, {name}\"`"
+        return f"quote text that contains ',': `{key}: \"{written.text}, {name}\"`"
     is_below = entry.key.span.line > before[1].key.span.line and not is_nothing
     if key in NAME_FIELDS and isinstance(written, MappingNode) and is_below:
-        return f"indent it like the keys of '{key}', if it is one of them"
+        return f"if it is a key of '{key}', indent it like the others"
     return ""
 
 
 _NAMED = {"topics": "topic", "destinations": "endpoint"}
-"""Lists whose items are mappings, not keys of one, and the key that names an item."""
+"""Lists of mappings that people write as one mapping, and the key that names an item."""
 
 
 def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
-    """What to do about a key with this value that the mapping at `path` does not have."""
+    """Return a hint for an unknown key, with this value, of the mapping at `path`."""
     if words := in_other_words(name, known):
         return words
     if ":" in name:
@@ -114,7 +114,7 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
     if key := meant(name, known):
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
-        return f"a payload case stands under 'send': `send: {{{name}: ...}}`"
+        return f"put a payload case under 'send': `send: {{{name}: ...}}`"
     if owners := _owners(name, path):
         return owners
     if path[:1] == ("routes",) and (key := _NAMED.get(str(path[-1]))):
@@ -124,9 +124,9 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
 
 
 def _owners(name: str, path: Path) -> str:
-    """A hint for a key that belongs elsewhere in a table; empty if there is no such key.
+    """Return a hint for a key that belongs elsewhere in a table; empty if there is no such key.
 
-    Definitions of the same name as the one at `path` are skipped: deadmen are of two kinds.
+    Skips definitions of the same name as the one at `path`: there are two kinds of deadmen.
     """
     definitions = table_schema()["definitions"]
     others = (*map(str, path[-1:]), "defaults")
@@ -136,11 +136,11 @@ def _owners(name: str, path: Path) -> str:
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
     owners += ["the table itself"] if name in keys_of(table_schema()) else []
-    return f"that is a key of: {', '.join(owners)}" if owners else ""
+    return f"it belongs in: {', '.join(owners)}" if owners else ""
 
 
 def for_value(error: SchemaError) -> str:
-    """A hint that says which value was meant, where that is clear."""
+    """Return a hint with the value that was meant, if that is clear."""
     value = str(error.value)
     if error.keyword == "pattern":
         pattern = error.limit
@@ -158,7 +158,7 @@ def for_value(error: SchemaError) -> str:
 
 
 _OPTIONAL = ("ttl", "age", "max_rate")
-"""Limits of which there are none where the key is missing."""
+"""Limits that do not apply if the key is missing."""
 _QOS_WORDS = {
     "reliable": "reliability: reliable",
     "best_effort": "reliability: best_effort",
@@ -166,7 +166,7 @@ _QOS_WORDS = {
     "latched": "durability: transient_local",
     "keep_all": "history: keep_all",
 }
-"""Words that are no profile, and the key that they belong to."""
+"""Words that are not a profile, and the setting that they stand for."""
 _LOCAL = "{{address: {0}}}"
 _INSTEAD: Mapping[Path, str] = {
     ("listen",): "{{rover: {{address: {0}}}}}",
@@ -181,7 +181,7 @@ _INSTEAD: Mapping[Path, str] = {
     ("gateways", "*", "topics"): "{{include: [{0}]}}",
     ("gateways", "*", "inbound", "*"): "{{topic: {0}, type: TYPE}}",
 }
-"""Mappings, and what to write in place of the one value that stands there."""
+"""Mappings that people write as a single value, and what to write instead."""
 
 
 _BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gateways",))
@@ -189,7 +189,7 @@ _BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gatewa
 
 
 def for_type(error: SchemaError, tree: Node) -> str:
-    """What to do about a value of the wrong type, where that is clear."""
+    """Return a hint for a value of the wrong type, if the remedy is clear."""
     name, value = str(error.path[-1]) if error.path else "", error.value
     if value is None:
         return _for_nothing(error, tree, name)
@@ -200,7 +200,7 @@ def for_type(error: SchemaError, tree: Node) -> str:
     if error.is_list_in_list:
         rows = to_data(node_at(tree, error.path[:-1]))
         count = sum(len(row) if isinstance(row, list) else 1 for row in rows) if isinstance(rows, list) else 0
-        return f"write one list of {count}, row after row"
+        return f"write one list of {count} values, row by row"
     return _written_otherwise(error, name, value)
 
 
@@ -212,17 +212,17 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
         return f"a ':' is missing, write `{first.rstrip('=')}: {rest.lstrip('= ')}`"
     if "object" in error.limit:
         is_case = error.path[:-1] == ("routes",)
-        return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
+        return "indent its keys below it" + (", or write {ignore: why}" if is_case else "")
     siblings = node_at(tree, error.path[:-1])
     if isinstance(siblings, MappingNode) and (number := _decimal(siblings, name)):
-        return f"a decimal number has a point: {number}"
+        return f"write decimal numbers with a point: {number}"
     if isinstance(siblings, MappingNode) and MAP in siblings.entries:
-        return f"say what it becomes: `{name}: VALUE`"
-    return "a field that is left out keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
+        return f"add its value: `{name}: VALUE`"
+    return "remove it: an omitted field keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
 
 
 def _decimal(siblings: MappingNode, name: str) -> str:
-    """`1.5` for `{x: y + 1,5}`, where `name` is what stands behind the ','; empty for anything else."""
+    """Return `1.5` for `{x: y + 1,5}`, where `name` is the part after the ','; empty for anything else."""
     names = list(siblings.entries)
     before = siblings.get(names[names.index(name) - 1]) if names.index(name) else None
     whole = re.search(r"(?<![\w.])\d+$", before.text) if isinstance(before, ScalarNode) else None
@@ -231,7 +231,7 @@ def _decimal(siblings: MappingNode, name: str) -> str:
 
 
 def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
-    """The value in the form that its key takes."""
+    """Return a hint with the value in the form that its key takes."""
     if isinstance(value, str) and _is_of(error.limit, resolve(value)):
         return f"write it without quotes: {value}"
     if hint := _for_collection(error, value):
@@ -254,11 +254,11 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
 
 
 def without_case(fields: Mapping[str, object]) -> str:
-    """A hint for fields that stand below `send` of a deadman, without their payload case; empty for anything else."""
+    """Return a hint for fields directly below `send` of a deadman, without a payload case; empty for anything else."""
     written = [f"{name}: {shown}" for name, value in fields.items() if (shown := _in_flow(value)) is not None]
     if len(written) < len(fields):
         return ""
-    return f"below 'send' stands a payload case, and below that its fields: `send: {{CASE: {{{', '.join(written)}}}}}`"
+    return f"put a payload case under 'send', and its fields under that: `send: {{CASE: {{{', '.join(written)}}}}}`"
 
 
 def _is_of(kinds: str | list[str], value: object) -> bool:
@@ -269,9 +269,9 @@ def _is_of(kinds: str | list[str], value: object) -> bool:
 
 def _for_collection(error: SchemaError, value: object) -> str:
     if isinstance(value, dict) and error.limit == "array":
-        return "begin each of its items with '-'"
+        return "start each item with '-'"
     if isinstance(value, list) and error.path in _BY_NAME:
-        return "write a name and ':' in place of each '-'"
+        return "replace each '-' with a name and ':'"
     return ""
 
 
@@ -280,7 +280,7 @@ def _is_at(path: Path, place: Path) -> bool:
 
 
 def _in_flow(value: object) -> str | None:
-    """A scalar, or the scalars of a list, as they stand within brackets; None for anything else."""
+    """Return a scalar, or the scalars of a list, as written inside brackets; None for anything else."""
     if isinstance(value, list):
         items = [_in_flow(item) for item in value]
         return None if None in items or not items else ", ".join(item for item in items if item)
@@ -290,5 +290,5 @@ def _in_flow(value: object) -> str | None:
 
 
 def as_variable(text: str) -> str:
-    """A hint for a variable that is written as in a shell."""
+    """Return a hint for a variable that is written as in a shell; empty for anything else."""
     return f'write "{in_braces(text)}"' if in_braces(text) != text else ""

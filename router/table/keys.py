@@ -1,11 +1,11 @@
 """Keys of a table. Each is declared once, as a field of a class in `model`.
 
-The field's name, type and default are those of the key. Marks in `Annotated` say the rest:
+The field's name, type and default are those of the key. Marks in `Annotated` add the rest:
 
     max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
 
-A `Quantity` parses and shows a number with a unit. `Named` and `Words` are below. `build` reads objects by
-these declarations, `flat` and `phrases` show them.
+A `Quantity` parses and prints a number with a unit; `Named` and `Words` are below. `build` reads objects according to
+these declarations, `flat` and `phrases` print them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from router.table.units import Quantity
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """The name of a key that is not that of its field; with dots where it stands inside other keys."""
+    """The name of a key whose field is named differently. Dots separate nested keys."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """The wording of the key's value, which replaces `{}`; used only where the key `beside` is set as well."""
+    """A phrase with `{}` for the key's value; used only if the key `beside` is also set."""
 
     text: str
     beside: str | None = None
@@ -38,7 +38,7 @@ class Words:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key as its field declares it. `type` is that of the value, of one item where it `is_list`."""
+    """A key as its field declares it. `type` is the type of the value, or of an item if it `is_list`."""
 
     name: str
     attribute: str
@@ -50,7 +50,7 @@ class Key:
     default: Any
 
     def text(self, value: Any) -> str:
-        """The value as a table writes it."""
+        """Return the value as it is written in a table."""
         if self.quantity is not None:
             return self.quantity.show(value.value if isinstance(value, Located) else value)
         return _text(value)
@@ -69,7 +69,7 @@ def _text(value: object) -> str:
 
 
 def keys_of(model: type) -> tuple[Key, ...]:
-    """The keys that a class of the model declares."""
+    """Return the keys that a model class declares."""
     if model not in _KEYS:
         hints = get_type_hints(model, include_extras=True)
         _KEYS[model] = tuple(_key(field, hints[field.name]) for field in fields(model) if field.name != "span")
@@ -103,7 +103,7 @@ def _key(field: Field[Any], hint: Any) -> Key:
 
 
 def phrases(part: Any) -> dict[str, str]:
-    """The wording of the keys that are set and have one: `at most 30 Hz` for `max_rate`."""
+    """Return the phrases of all keys that are set and have one: `at most 30 Hz` for `max_rate`."""
     words = {}
     for key in keys_of(type(part)):
         value = getattr(part, key.attribute)
@@ -115,9 +115,9 @@ def phrases(part: Any) -> dict[str, str]:
 
 
 def flat(part: object) -> dict[str, str]:
-    """Every setting of a part of the table as the table writes it, by its key with dots, without what is not set.
+    """Return every setting of a part of the table as text, by dotted key. Keys that are not set are omitted.
 
-    Of a mapping, its values by name.
+    For a mapping, return its values by name.
     """
     return dict(_flat(part, ""))
 
@@ -131,7 +131,7 @@ def _flat(part: object, prefix: str) -> Iterator[tuple[str, str]]:
 
 
 def _settings(part: object) -> Iterator[tuple[str, Any, Callable[[Any], str]]]:
-    """Name, value and how it is shown, of all that is set; None counts where it is not the default."""
+    """Yield name, value and printer of every setting; None counts as set if it is not the default."""
     if isinstance(part, Mapping):
         yield from ((name, value, _text) for name, value in part.items() if value is not None)
         return
@@ -142,12 +142,12 @@ def _settings(part: object) -> Iterator[tuple[str, Any, Callable[[Any], str]]]:
 
 
 def _has_keys(value: object) -> bool:
-    """Whether the value is a part with keys, not one with a text of its own."""
+    """Return whether the value is a part with keys, without its own `__str__`."""
     return is_dataclass(value) and not isinstance(value, Located) and type(value).__str__ is object.__str__
 
 
 def are_same(one: object, other: object) -> bool:
-    """Whether two tables, or parts of them, say the same, wherever in their files they say it."""
+    """Return whether two tables, or parts of them, have the same content, regardless of positions."""
     return _without_places(one) == _without_places(other)
 
 

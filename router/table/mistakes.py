@@ -1,7 +1,7 @@
-"""Mistakes in writing YAML, in words that say what to do, at the line that has the mistake.
+"""Findings for mistakes in YAML, at the line with the mistake, with a remedy.
 
-Some make the text no YAML (`explain`). One is YAML and means something else than it seems to: a comment that looks like
-the rest of an expression, as in `x # 1000` (`cut_findings`).
+`explain` handles syntax errors. `cut_findings` handles one mistake that is valid YAML: a comment that looks like the
+rest of an expression, as in `x # 1000`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from router.table.source import Source
 
 
 class _Advice(NamedTuple):
-    """What is wrong and what to do. With `at_start` the place is where the construct begins."""
+    """What is wrong and what to do. With `at_start`, the finding points at the beginning of the construct."""
 
     what: str
     hint: str = ""
     at_start: bool = False
 
 
-_TAB = _Advice("a tab indents this line", "indent with spaces")
-_OPEN_QUOTE = _Advice("this quote is not closed in its line", at_start=True)
+_TAB = _Advice("this line is indented with a tab", "indent with spaces")
+_OPEN_QUOTE = _Advice("this quote is not closed on its line", at_start=True)
 _NO_KEY_ENDS = "could not find expected ':'"
 _NO_KEY = "did not find expected key"
 _NO_DASH = "did not find expected '-' indicator"
@@ -39,8 +39,8 @@ _NOT_CLOSED = {
     "did not find expected ',' or '}'": ("{", "}"),
 }
 _BETWEEN_KEYS = (_NO_KEY, _NO_DASH, _NO_DOCUMENT)
-_ITEM_AMONG_KEYS = "an item of a list stands among keys"
-_QUOTE_COLONS = "quote text that has ': ' in it"
+_ITEM_AMONG_KEYS = "a list item stands among the keys of a mapping"
+_QUOTE_COLONS = "quote text that contains ': '"
 _ADVICE = {
     **{
         problem: _Advice(f"this '{opening}' is not closed by a '{closing}', or a ',' is missing inside", at_start=True)
@@ -49,23 +49,23 @@ _ADVICE = {
     "found unexpected end of stream": _OPEN_QUOTE,
     "found unexpected document indicator": _OPEN_QUOTE,
     "found unknown escape character": _Advice(
-        "this backslash sequence does not exist", "single quotes take backslashes as they are"
+        "unknown backslash sequence", "use single quotes, which keep backslashes as they are"
     ),
     "mapping values are not allowed in this context": _Advice(
-        "a ':' cannot stand here", f"{_QUOTE_COLONS}; keys of a mapping begin on lines of their own"
+        "a ':' is not allowed here", f"{_QUOTE_COLONS}; start each key of a mapping on its own line"
     ),
-    "found unexpected ':'": _Advice("a ':' cannot stand here", "remove it, or quote text that has it"),
-    _NO_KEY: _Advice("no key begins here", "quote text that has special characters in it"),
+    "found unexpected ':'": _Advice("a ':' is not allowed here", "remove it, or quote the text that contains it"),
+    _NO_KEY: _Advice("a key is expected here", "quote text that contains special characters"),
     _NO_DASH: _Advice(
-        "this line does not begin with '-' as its neighbours do",
-        "begin an item with '- ', or indent what belongs to the item above",
+        "this line does not start with '-' as its neighbours do",
+        "start an item with '- ', or indent what belongs to the item above",
     ),
     "block sequence entries are not allowed in this context": _Advice(
-        "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
+        "a list item cannot start here", "start each list item on its own line"
     ),
     "did not find expected node content": _Advice("a value is missing here"),
-    _NO_DOCUMENT: _Advice("this line is indented less than the first key", "indent keys of one mapping alike"),
-    "found incompatible YAML document": _Advice("this is a YAML version that is not understood", "remove the line"),
+    _NO_DOCUMENT: _Advice("this line is indented less than the first key", "indent all keys of a mapping equally"),
+    "found incompatible YAML document": _Advice("this YAML version is not supported", "remove the line"),
 }
 _NO_BEGINNING = (
     "found character that cannot start any token",
@@ -75,56 +75,56 @@ _NO_BEGINNING = (
     "did not find expected alphabetic or numeric character",
     "did not find expected whitespace or line break",
 )
-"""Problems with the sign that a value begins with. The last three are found behind it."""
+"""Problems with the first character of a value. The last three are detected after it."""
 _UNBEGUN = {
     ",": _Advice("a value is missing before this ','", "remove the ','"),
-    "-": _Advice("an item in brackets does not begin with '-'", "remove the '-', or the brackets"),
+    "-": _Advice("an item in brackets does not start with '-'", "remove the '-', or the brackets"),
 }
-_COMMENT_SIGN = _Advice("a comment begins with '#'", "write '#' in its place")
+_COMMENT_SIGN = _Advice("a comment starts with '#'", "replace this with '#'")
 _SLIPS = (
     (
         re.compile(r"(<{7}|={7}|>{7}|\|{7})(?: |$)"),
-        _Advice("a merge conflict is not resolved", "keep one version, and remove '<<<<<<<', '=======' and '>>>>>>>'"),
+        _Advice("unresolved merge conflict", "keep one version, and remove '<<<<<<<', '=======' and '>>>>>>>'"),
     ),
     (re.compile(r" *(//|/\*|--(?!\S))"), _COMMENT_SIGN),
-    (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "begin items of a list with '- '")),
+    (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "start list items with '- '")),
 )
-"""What begins a line only by mistake. YAML often fails no earlier than in the next line."""
+"""Beginnings of lines that are always mistakes. YAML often fails only on the next line."""
 _AFTER_VALUE = (
     (re.compile(r"//|/\*|--(?!\S)"), _COMMENT_SIGN),
     (
         re.compile(r"""(?<=["'])\w"""),
-        _Advice("the quoted text ends before this", "put quotes of the other kind around the text"),
+        _Advice("the quoted text ends before this", "put the other kind of quotes around the text"),
     ),
     (
         re.compile(r"[-+*/%<>=!&|.(?]|(?:if|else|and|or|in|is|not)\b"),
         _Advice("the value ends before this", "quote the whole expression, as in \"'gps_' + str(index)\""),
     ),
 )
-"""What stands behind a value that is quoted or in brackets as if it went on."""
+"""Text after a quoted or bracketed value that looks like a continuation of it."""
 _FOREIGN = re.compile(
     r"(?:^|[-:,?{}\[\]])\s*?(?P<at_start>[^\S \t]|[\u200b-\u200d\u2060\u2013\u2014\u2018-\u201f])"
     r"|(?<=[!-~])(?P<inside>[\uff0c\uff1a\uff1b\uff3b\uff3d\uff5b\uff5d])"
 )
-"""Blanks, quotes and dashes of word processors where a value or key begins; wide signs after plain characters."""
+"""Typographic spaces, quotes and dashes where a value or key begins; full-width signs after ASCII characters."""
 _ASCII = str.maketrans("\u2013\u2014\u2018\u2019\u201c\u201d", "--''\"\"")
 _HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t]))#.*""")
 _SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
 _WITHOUT_COLON = re.compile(r"(?!(?:if|else|and|or|not|in)\b)([\w./]+)(?: *[=:]>? *(.+)| +(\S+))?")
 _IN_WORDS = re.compile(r"[{,] *(?P<key>none|ignore|because): +(?P<text>[^\"',{}\[\]:][^,{}\[\]]*)$")
-"""A reason in words, which has a ':' in it."""
+"""A reason in prose that contains a ':'."""
 _WITHOUT_COMMA = re.compile(r"[:,{\[] *([^\s,;:]+);? +([\w.]+) *$")
 
 
 def explain(
     error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None, open_bracket: SourceSpan | None
 ) -> Diagnostic:
-    """The finding for one syntax error.
+    """Return the finding for a syntax error.
 
-    `open_quote` is where the quoted scalar before the error begins, if it goes over several lines: then
-    its closing quote is most likely the next one's opening quote. `open_bracket` is the innermost
-    bracket around the error: where the text ends within it, it lacks its counterpart.
+    `open_quote` is the start of the quoted scalar before the error, if it spans several lines: its closing quote is
+    then most likely the opening quote of the next one. `open_bracket` is the innermost bracket around the error. If the
+    text ends inside it, its closing bracket is missing.
     """
     line = error.problem_mark.line if error.problem_mark else 0
     column = error.problem_mark.column if error.problem_mark else 0
@@ -155,11 +155,11 @@ def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnos
 
 
 _EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?=[ ,}\]]|$))))")
-_NO_EXCLAMATION = "a value cannot begin with '!'"
+_NO_EXCLAMATION = "a value cannot start with '!'"
 
 
 def exclamation(source: Source, line: int) -> Diagnostic | None:
-    """The finding for `!(a > b)`, as other languages write `not`."""
+    """Return a finding for `!(a > b)`, which is `not` in other languages; None without."""
     for number in (line, *_line_before(source, line)):
         text = source.lines[number] if number < len(source.lines) else ""
         if match := _EXCLAMATION.search(text):
@@ -171,7 +171,7 @@ def exclamation(source: Source, line: int) -> Diagnostic | None:
 
 
 def _closing(text: str, start: int) -> int:
-    """Where the bracket that is open at `start` is closed; the end of the text if it is not."""
+    """Return where the bracket that is open at `start` closes; the end of the text if it does not."""
     opened = 1
     for at, character in enumerate(text[start:], start):
         opened += (character == "(") - (character == ")")
@@ -181,7 +181,7 @@ def _closing(text: str, start: int) -> int:
 
 
 def _slip(source: Source, line: int) -> Diagnostic | None:
-    """The finding for what has no place in the line, or in the one before it, and makes YAML fail."""
+    """Return a finding for text in the line, or in the one before it, that YAML does not allow; None without."""
     for number in (*_line_before(source, line), line):
         text = _text(source, number)
         for pattern, advice in _SLIPS:
@@ -190,8 +190,9 @@ def _slip(source: Source, line: int) -> Diagnostic | None:
         if match := _FOREIGN.search(text):
             character = match[match.lastgroup or 0]
             plain = unicodedata.normalize("NFKC", character.translate(_ASCII))
-            what = f"the character U+{ord(character):04X} ({unicodedata.name(character, '').lower()}) cannot stand here"
-            hint = f"write '{plain}' in its place" if plain.isascii() else "remove it"
+            name = unicodedata.name(character, "").lower()
+            what = f"the character U+{ord(character):04X} ({name}) is not allowed here"
+            hint = f"replace it with '{plain}'" if plain.isascii() else "remove it"
             return _finding(source, number, match.start(match.lastgroup or 0), _Advice(what, hint))
     return None
 
@@ -203,9 +204,9 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
     if character == "\t":
         return _TAB
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
-        return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
+        return _Advice(f"a '{character}' is not allowed inside a word here", "quote text that contains brackets")
     if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
-        return _ADVICE[problem]._replace(hint=f"YAML gets no further than line {line + 1}")
+        return _ADVICE[problem]._replace(hint=f"parsing stops at line {line + 1}")
     if character == ":" and (advice := _colon(problem, before, written[column + 1 :])):
         return advice
     begun = start.column if start and start.line == line else column
@@ -215,8 +216,8 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
         return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
     if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
         keys = _keys_at(source, start.line)
-        what = f"this line is indented like the '-' above, and the keys of that item by {keys}"
-        return _Advice(what, f"indent it by {keys} spaces, or remove the '-' in line {start.line + 1}")
+        what = f"this line is indented like the '-' above, but the keys of that item by {keys}"
+        return _Advice(what, f"indent it by {keys} spaces, or remove the '-' on line {start.line + 1}")
     if problem in _NOT_CLOSED or (problem in _BETWEEN_KEYS and before.strip()):
         return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])
     passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
@@ -225,62 +226,62 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
 
 def _colon(problem: str, before: str, after: str) -> _Advice | None:
     if " ? " in before:
-        return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
+        return _Advice("a ':' is not allowed here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
     if problem in _NOT_CLOSED and (said := _IN_WORDS.search(before)):
         rest = re.match(r"[^,}\]]*", after)
         text = f"{said['text']}:{rest[0] if rest else ''}".replace('"', "'").rstrip()
-        return _Advice("a ':' cannot stand here", f'{_QUOTE_COLONS}: `{said["key"]}: "{text}"`')
+        return _Advice("a ':' is not allowed here", f'{_QUOTE_COLONS}: `{said["key"]}: "{text}"`')
     if problem in _NOT_CLOSED and (words := _WITHOUT_COMMA.search(before)):
         return _Advice(f"a ',' is missing before '{words[2]}'", f"write `{words[1]}, {words[2]}:`")
     if problem in _NOT_CLOSED:
-        return _Advice("a ':' cannot stand here", f"{_QUOTE_COLONS}, or put braces around the inner mapping")
+        return _Advice("a ':' is not allowed here", f"{_QUOTE_COLONS}, or put braces around the inner mapping")
     if after[:1] in ("[", "{"):
         return _Advice("a space is missing after ':'", f"write `: {after[:1]}`")
     if before.rstrip().endswith(":") or (_SEPARATOR.search(before) and not _HIDDEN.sub("", after).strip()):
-        return _Advice("this ':' is one too many", "remove it")
+        return _Advice("unexpected ':'", "remove it")
     return None
 
 
 def _no_beginning(written: str, column: int) -> _Advice:
-    """For the first character of a value, and for one behind a value that could begin another one."""
+    """Return advice for the first character of a value, or for one after a value that could begin another."""
     character = written[column]
     if written[:column].rstrip()[-1:] in {*"\"'])}"}:
         return _behind_value(written, column, "")._replace(at_start=True)
     return _UNBEGUN.get(character) or _Advice(
-        f"a value cannot begin with '{character}'", "put quotes around the value", at_start=True
+        f"a value cannot start with '{character}'", "put quotes around the value", at_start=True
     )
 
 
 def _behind_value(written: str, column: int, closing: str) -> _Advice:
-    """For what follows a value, where only the end of the line, or ',' or `closing`, can."""
+    """Return advice for text after a value, where only the end of the line, ',' or `closing` is allowed."""
     character = written[column : column + 1]
     for pattern, advice in _AFTER_VALUE:
         if pattern.match(written, column):
             return advice
     if closing:
-        hint = f"write '{closing}' in its place, or remove it" if character in ("]", "}") else ""
+        hint = f"replace it with '{closing}', or remove it" if character in ("]", "}") else ""
         return _Advice(f"a ',' or '{closing}' is missing before this", hint)
     if character and character in ")]},;":
-        return _Advice(f"this '{character}' is one too many", "remove it")
+        return _Advice(f"unexpected '{character}'", "remove it")
     if not _SEPARATOR.search(written[:column]):
         return _Advice("a ':' is missing before this")
     return _Advice("the value ends before this", "put quotes around the whole value")
 
 
 def _is_only_item(source: Source, first: int, line: int) -> bool:
-    """Whether the list that begins in line `first` has one item, a mapping, and `line` is a key beside it."""
+    """Return whether the list that begins on line `first` has one item, a mapping, and `line` is a key beside it."""
     dash = f"{' ' * _indent(source.lines[line])}-"
     items = [text for text in source.lines[first:line] if text.startswith(dash)]
     return len(items) == 1 and bool(_SEPARATOR.search(_text(source, first)))
 
 
 def _line_before(source: Source, line: int) -> list[int]:
-    """The last line before it that has more than a comment; empty if there is none."""
+    """Return the last line before `line` that has more than a comment; empty if there is none."""
     return next(([number] for number in reversed(range(line)) if _text(source, number)), [])
 
 
 def _bare_line(source: Source, line: int) -> int | None:
-    """The line, or the one before it, that lacks the ': ' which makes it a key."""
+    """Return the line, or the one before it, if it lacks the ': ' of a key; else None."""
     for number in (line, *_line_before(source, line)):
         text = _text(source, number)
         is_above = number < line and _keys_at(source, number) == _keys_at(source, line)
@@ -297,7 +298,7 @@ def _without_colon(source: Source, line: int) -> Diagnostic:
         return Diagnostic(span, Code.BAD_YAML, "a space is missing after ':'", f"write `{_spaced(text.strip())}`")
     column = _keys_at(source, line)
     words = _WITHOUT_COLON.fullmatch(_text(source, line)[column:])
-    hint = "indent text that goes on from the line above; begin a comment with '#'"
+    hint = "indent text that continues the line above; start a comment with '#'"
     if words:
         value = words[2] or words[3] or ("true" if words[1] == "auto" else "")
         hint = f"write `{words[1]}: {value}`" if value else f"write `{words[1]}:`"
@@ -310,7 +311,7 @@ def _spaced(text: str) -> str:
 
 
 def _neighbours(source: Source, line: int) -> list[int]:
-    """How far the keys and items above that could go on in this line are indented; empty if it is one of them."""
+    """Return the indentations at which this line could continue the keys and items above; empty if it has one."""
     if line >= len(source.lines):
         return []
     own, open_at = _indent(source.lines[line]), list[int]()
@@ -335,9 +336,9 @@ _KEY = re.compile(r"[ -]*([\w.]+):(?: |$)")
 
 
 def _too_shallow(source: Source, line: int) -> Diagnostic | None:
-    """The finding for a key above that left its mapping, so that this line, one of its mapping's, has no place.
+    """Return a finding for a key above that is indented too little, so that this line is misplaced; None without.
 
-    That a mapping of that depth has no such key tells it from a line that is indented too far.
+    If a mapping of that depth can have such a key, this line is indented too far instead.
     """
     own = _indent(source.lines[line]) if line < len(source.lines) else 0
     above = [number for number in reversed(range(line)) if _text(source, number)]
@@ -362,12 +363,12 @@ def _too_shallow(source: Source, line: int) -> Diagnostic | None:
 
 def _indented(source: Source, line: int, what: str) -> Diagnostic:
     own = _indent(source.lines[line])
-    hint = "indent the keys of one mapping alike, and the items of one list"
+    hint = "indent all keys of a mapping equally, and all items of a list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
 
 
 def _odd_line_above(source: Source, line: int) -> int | None:
-    """The one line that is indented by a space more or less than this line and the next one; None without."""
+    """Return the only line above that is indented one space more or less than this line and the next; None without."""
     own = _indent(source.lines[line])
     written = [(number, _indent(text)) for number, text in enumerate(source.lines) if _text(source, number)]
     if own != next((indent for number, indent in written if number > line and indent <= own), None):
@@ -384,14 +385,14 @@ def _odd_line_above(source: Source, line: int) -> int | None:
 
 
 def _text(source: Source, line: int) -> str:
-    """The line without its comment, and with quotes in place of quoted text; empty where there is nothing else."""
+    """Return the line without its comment, with quotes in place of quoted text; empty if nothing else is left."""
     text = source.lines[line] if line < len(source.lines) else ""
     text = _HIDDEN.sub(lambda match: '"' * len(match[1] or ""), text).rstrip(" \t")
     return text if text.strip(" ") else ""
 
 
 def _keys_at(source: Source, line: int) -> int:
-    """How far in the first key of a line stands; the dash of an item counts as indentation."""
+    """Return the column of the first key of a line; the dash of an item counts as indentation."""
     text = source.lines[line]
     return len(text) - len(text.lstrip(" -"))
 
@@ -404,19 +405,19 @@ def _indent(text: str) -> int:
 
 
 _EXPRESSIONS = ("fields", "send", "when", "for_each", "by", "count", "order")
-"""Keys of routes below which expressions stand."""
+"""Keys of routes whose values are expressions."""
 _REST = re.compile(r"\s+#\s*(?:[-+*/%<>]\s*\w[\w.]*|\d+(?:\.\d*)?(?:e-?\d+)?)\s*")
 
 
 def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagnostic]:
-    """A warning for each expression of the routes before a comment that is only a number, or an operator and a word."""
+    """Yield a warning for each expression before a comment that is only a number, or an operator and a word."""
     lines = {source.file: source.lines for source in sources}
     for node in _expressions(root.get("routes"), is_expression=False):
         span = node.span
         comment = lines[span.file][span.line - 1][span.end_column - 1 :] if node.place.is_whole_line else ""
         if _REST.fullmatch(comment):
-            what = f"the comment '{comment.strip()}' is no part of the expression before it"
-            hint = "write an operator in place of '#', or say in the comment what it is about"
+            what = f"the comment '{comment.strip()}' is not part of the expression before it"
+            hint = "replace '#' with an operator, or add words to the comment"
             yield Diagnostic(span, Code.CUT_EXPRESSION, what, hint)
 
 

@@ -1,7 +1,7 @@
-"""The route table as typed, frozen data. Every value that a finding may blame keeps its span.
+"""The route table as typed, frozen data. Every value that a finding can point at keeps its span.
 
-The fields declare the keys of the table (see `keys`). Whether a payload case, a field or a ROS type exists is checked
-by the compiler.
+The fields declare the keys of the table (see `keys`). The compiler checks whether payload cases, fields and ROS types
+exist.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from router.table.units import (
 
 
 def bound_to(address: Address, interface: str | None) -> str:
-    """Return what a local socket is bound to as text: `0.0.0.0:5000`, or `0.0.0.0:5000 on wlan0`."""
+    """Return the local address of a socket as text: `0.0.0.0:5000`, or `0.0.0.0:5000 on wlan0`."""
     return f"{address} on {interface}" if interface else str(address)
 
 
@@ -46,7 +46,7 @@ class Networks:
     members: tuple[IPv4Network, ...]
 
     def __str__(self) -> str:
-        """As findings name them, with the place that says so."""
+        """Return the text for findings, with the position of the key."""
         return f"the networks of {self.span.file}:{self.span.line} ({', '.join(map(str, self.members))})"
 
 
@@ -62,7 +62,7 @@ class EndpointKind(enum.Enum):
 
 
 class Priority(enum.Enum):
-    """The order in which targets share an endpoint's bandwidth when it is short."""
+    """The order of targets when an endpoint's bandwidth is insufficient."""
 
     COMMAND = "command"
     TELEMETRY = "telemetry"
@@ -70,7 +70,7 @@ class Priority(enum.Enum):
 
 
 class OnLimit(enum.Enum):
-    """What becomes of messages that exceed `max_rate`: all are dropped, or the latest is kept and sent later."""
+    """What happens to messages beyond `max_rate`: all are dropped, or the latest is kept and sent later."""
 
     FIRST = "first"
     LATEST = "latest"
@@ -78,10 +78,10 @@ class OnLimit(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
-    """`protos` is an absolute path, the router's own unless the table has one; `message` and `oneof` name the envelope.
+    """`protos` is an absolute path, by default the router's own protos; `message` and `oneof` name the envelope.
 
-    `lock` is the absolute path of the lock file, None where it is beside the protos. `exclude` are files and folders of
-    `protos`, relative to it.
+    `lock` is the absolute path of the lock file, None if it is beside the protos. `exclude` are files and folders
+    relative to `protos`.
     """
 
     protos: Located[Path]
@@ -93,7 +93,7 @@ class EnvelopeSettings:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """`diagnostics` is where the table asks for /diagnostics, None where it does not; `span` is the key `node`."""
+    """`diagnostics` is the span of the key that enables /diagnostics, or None; `span` is the key `node`."""
 
     name: str = "rover_router"
     namespace: str = "/"
@@ -121,7 +121,7 @@ class Listener:
 
 
 EPHEMERAL = "ephemeral"
-"""The value of `send_from` for a source port that the kernel chooses, in place of a listener's port."""
+"""The value of `send_from` for a source port chosen by the kernel, instead of a listener's port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +129,8 @@ class Endpoint:
     """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
 
     An endpoint that is silent for longer than `stale_after` (ns) is stale; None means never. With a `listener`, only
-    datagrams that this listener receives are attributed to it. `send_from` is a listener's name or EPHEMERAL, None
-    where the table says nothing. `allow_non_finite`: a board also gets NaN and infinities.
+    datagrams that this listener receives are attributed to it. `send_from` is a listener's name, EPHEMERAL, or None if
+    it is not set. With `allow_non_finite`, a board also receives NaN and infinities.
     """
 
     name: str
@@ -150,7 +150,7 @@ class Endpoint:
 class RecordSettings:
     """Which datagrams are recorded, and where. `span` is the key `record`; `directory` is an absolute path.
 
-    `last` and `max_age` in ns, sizes in bytes.
+    `last` and `max_age` are in ns, sizes in bytes.
     """
 
     span: SourceSpan
@@ -166,8 +166,8 @@ class RecordSettings:
 class Expression:
     """The text of an expression, not yet parsed.
 
-    `place` tells where each character of it stands. A YAML sequence becomes `items`, a mapping with the key `map`
-    becomes `choices`; both have empty text. `literal` text stands for itself: `{text: imu_link}`.
+    `place` has the position of each character. A YAML sequence becomes `items`, a mapping with the key `map` becomes
+    `choices`; both have empty text. `literal` text, `{text: imu_link}`, is not an expression.
     """
 
     text: str
@@ -190,7 +190,7 @@ class Expression:
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """`{map: fix_quality, GPS_FIX: 1, else: 0}`: the value of `subject` chooses among `values`, by its name."""
+    """`{map: fix_quality, GPS_FIX: 1, else: 0}`: the value of `subject` selects one of `values` by name."""
 
     subject: Expression
     values: tuple[tuple[Located[str], Expression], ...]
@@ -204,9 +204,9 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class FieldEntry:
-    """`linear_acceleration: {x: accel_x}` is path ("linear_acceleration", "x"); dotted keys are split.
+    """`linear_acceleration: {x: accel_x}` has the path ("linear_acceleration", "x"); dotted keys are split.
 
-    `path_spans` has the place of each part of the path.
+    `path_spans` has the span of each part of the path.
     """
 
     path: tuple[str, ...]
@@ -216,9 +216,9 @@ class FieldEntry:
 
 @dataclass(frozen=True, slots=True)
 class FieldMap:
-    """What `fields:` says. `fields: auto`, or `auto: true` among the entries, sets `auto`.
+    """The value of `fields`. `fields: auto`, or `auto: true` among the entries, sets `auto`.
 
-    Entries win over what auto would do with the same field.
+    Entries take precedence over `auto`.
     """
 
     span: SourceSpan
@@ -234,7 +234,7 @@ class FieldMap:
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """rclpy's names; durations in nanoseconds. None where the table says nothing."""
+    """QoS settings under rclpy's names; durations in nanoseconds. None means not set."""
 
     span: SourceSpan
     profile: Located[str] | None = None
@@ -250,7 +250,7 @@ class Qos:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetKeys:
-    """The keys that destinations and topics have in common. `max_rate` is in Hz."""
+    """Common keys of destinations and topics. `max_rate` is in Hz."""
 
     when: Annotated[Expression | None, Words("when {}")] = None
     max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
@@ -259,7 +259,7 @@ class TargetKeys:
 
 @dataclass(frozen=True, slots=True)
 class Destination(TargetKeys):
-    """A destination endpoint of a route. `fields` is for routes that take messages from topics."""
+    """A destination of a route. `fields` is for routes from topics."""
 
     endpoint: Located[str]
     span: SourceSpan
@@ -268,9 +268,9 @@ class Destination(TargetKeys):
 
 @dataclass(frozen=True, slots=True)
 class Topic(TargetKeys):
-    """A ROS topic of a route: one that is published, or one that messages come from.
+    """A ROS topic of a route, as a target or as a source.
 
-    The `type` of a route's topic may be missing in the table, not in a checked one (see `compiler.check`).
+    The `type` of a route's topic may be missing in a table, but not in a checked one (see `compiler.check`).
     """
 
     topic: Located[str]
@@ -287,12 +287,12 @@ class Topic(TargetKeys):
 
 AT_START = Quantity(parse=lambda word: word == "send", show=lambda sends: "send" if sends else "silent")
 DEFAULT_REPEAT = Located(100_000_000, SourceSpan("the default"))
-"""How often a deadman sends, in ns."""
+"""Default interval between the datagrams of a deadman, in ns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeadmanKeys:
-    """The keys that the deadmen of routes and of gateways have in common. Durations in ns.
+    """Common keys of the deadmen of routes and gateways. Durations are in ns.
 
     `because` justifies settings that look like a mistake.
     """
@@ -307,8 +307,8 @@ class DeadmanKeys:
 class Deadman(DeadmanKeys):
     """What is sent when commands stop: the payload `case` with `fields`, to the endpoints `to`.
 
-    `span` is the key `deadman`. `disarmed_by` are payload cases; None if the table does not say. `at_start` says
-    whether it is sent when the router starts as well.
+    `span` is the key `deadman`. `disarmed_by` are payload cases, None if not set. With `at_start`, it is also sent when
+    the router starts.
     """
 
     span: SourceSpan
@@ -320,7 +320,7 @@ class Deadman(DeadmanKeys):
 
 @dataclass(frozen=True, slots=True)
 class Collect:
-    """How the datagrams of one frame are found and put in order. `span` is the key `collect`; `timeout` in ns."""
+    """How datagrams are grouped into frames and ordered. `span` is the key `collect`; `timeout` is in ns."""
 
     span: SourceSpan
     by: Expression
@@ -331,19 +331,18 @@ class Collect:
 
 ANY = "any"
 ROS = "ros"
-"""What metrics name as the source of messages that come from topics."""
+"""The source of messages from topics, as metrics name it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """What happens to one payload case, or to the messages of it that come from certain sources.
+    """What happens to one payload case, or to its messages from certain sources.
 
-    `span` is the payload case in the table, of a route in a list its first key.
-    `name` tells the routes of a table apart, in metrics and log: the payload case, or where a case has
-    several routes `imu_info_from_ros`. `ignore` holds the reason of a case that goes nowhere. Messages come from
-    `sources`, which are endpoint names or just `any`, or from `source_topics`. `fields` and `for_each` are for the
-    latter, `topics`, which are published, and `collect` for the former. `ttl` in ns. `no_deadman` is the reason why
-    a command route has none.
+    `span` is the payload case in the table, or the first key of a route in a list. `name` is unique, for metrics and
+    log: the payload case, or for one of several routes of a case for example `imu_info_from_ros`. `ignore` is the
+    reason for ignoring the case. Messages come from `sources`, which are names of endpoints or only `any`, or from
+    `source_topics`. `topics` (published) and `collect` are for the former, `fields` and `for_each` for the latter.
+    `ttl` is in ns. `no_deadman` is the reason why a route with commands has no deadman.
     """
 
     name: str
@@ -364,12 +363,12 @@ class Route:
 
     @property
     def is_outbound(self) -> bool:
-        """Whether its messages come from ROS."""
+        """Whether the messages come from ROS."""
         return bool(self.source_topics)
 
     @property
     def all_topics(self) -> tuple[Topic, ...]:
-        """The topics that it publishes on or takes messages from."""
+        """All topics of the route, targets and sources."""
         return (*self.topics, *self.source_topics)
 
 
@@ -383,7 +382,7 @@ class Transport(enum.Enum):
 
 
 class GatewayFormat(enum.Enum):
-    """What a gateway's clients read: packets with a binary header, or JSON documents."""
+    """The format that a gateway's clients read: packets with a binary header, or JSON documents."""
 
     GATEWAY_V1 = "gateway_v1"
     GATEWAY_V2 = "gateway_v2"
@@ -393,7 +392,7 @@ class GatewayFormat(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class TopicPattern:
-    """A glob over absolute topic names, or a regular expression for the whole of them."""
+    """A glob, or a regular expression, that matches whole absolute topic names."""
 
     text: str
     is_regex: bool
@@ -407,15 +406,15 @@ EACH = 0
 """The period of a gateway that sends every message."""
 
 MAX_OUTBOUND, MAX_INBOUND = 16 << 20, 64 << 10
-"""Bytes of a message to and from clients of a gateway without `max_message`."""
+"""Maximum bytes of a message to and from clients of a gateway without `max_message`."""
 
 MOST_INBOUND = 1 << 20
-"""Bytes of a message from clients, whatever `max_message` says: it is read in one go."""
+"""Maximum bytes of a message from clients, whatever `max_message` is: it is read in one go."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicRate:
-    """How often topics that match `pattern` are sent: a period in ns, or EACH."""
+    """The period (ns, or EACH) at which topics that match `pattern` are sent."""
 
     pattern: TopicPattern
     period: int
@@ -426,10 +425,10 @@ class TopicRate:
 
 @dataclass(frozen=True, slots=True)
 class ZenohConfig:
-    """What the Zenoh library is configured with: the file at `path`, or a mapping in the table (`path` None).
+    """Configuration of the Zenoh library: the file at `path`, or a mapping in the table (`path` None).
 
-    `text` is the content of the file, or the mapping as JSON. It may hold passwords: never print it. `places` are
-    those of the keys and list items of the mapping, by path.
+    `text` is the content of the file, or the mapping as JSON. It may contain passwords: never print it. `places` are
+    the spans of the mapping's keys and list items, by path.
     """
 
     span: SourceSpan
@@ -440,8 +439,10 @@ class ZenohConfig:
 
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
-    """Where a gateway meets its Zenoh network. `key` is what its key expressions begin with; locators as Zenoh has
-    them, `tcp/192.168.0.10:7447`. `mode` is peer, client or router.
+    """How a gateway connects to its Zenoh network.
+
+    `key` is the prefix of its key expressions; `connect` and `listen` are Zenoh locators, `tcp/192.168.0.10:7447`.
+    `mode` is peer, client or router.
     """
 
     key: Located[str]
@@ -464,7 +465,7 @@ class InboundDeadman(DeadmanKeys):
 
 @dataclass(frozen=True, slots=True)
 class Inbound:
-    """A topic that a gateway's clients may publish on. `ttl` in ns."""
+    """A topic that a gateway's clients may publish on. `ttl` is in ns."""
 
     topic: Topic
     span: SourceSpan
@@ -476,9 +477,9 @@ class Inbound:
 class Gateway:
     """ROS topics for clients that speak neither ROS nor protobuf, and back. `span` is its name in the table.
 
-    `address` is the clients' (udp) or the one to listen on (tcp, websocket); None for Zenoh. `receive` is the local
-    address of a udp gateway. Periods in ns, sizes in bytes. `compression` is a zstd level, 0 for none. The first of
-    `rates` that matches a topic applies; without one it is `publish_period`.
+    `address` is the clients' address (udp) or the one to listen on (tcp, websocket); None for Zenoh. `receive` is the
+    local address of a udp gateway. Periods are in ns, sizes in bytes. `compression` is a zstd level, 0 for none. The
+    first of `rates` that matches a topic applies, else `publish_period`.
     """
 
     name: str
@@ -503,18 +504,18 @@ class Gateway:
 
     @property
     def max_outbound(self) -> int:
-        """Bytes of the longest packet or document to clients."""
+        """Maximum bytes of a packet or document to clients."""
         return MAX_OUTBOUND if self.max_message is None else self.max_message
 
     @property
     def max_inbound(self) -> int:
-        """Bytes of the longest packet or document from clients, also decompressed."""
+        """Maximum bytes of a packet or document from clients, before and after decompression."""
         return MAX_INBOUND if self.max_message is None else min(self.max_message, MOST_INBOUND)
 
 
 @dataclass(frozen=True, slots=True)
 class IgnoredGateway:
-    """A name that another table has a gateway under, and why there is none here. `span` is the name."""
+    """A gateway of an extended table that this table ignores, with the reason. `span` is its name."""
 
     name: str
     span: SourceSpan
@@ -523,12 +524,11 @@ class IgnoredGateway:
 
 @dataclass(frozen=True, slots=True)
 class RouteTable:
-    """One table after `extends` and variables. `files` are all files read, the table itself first.
+    """A table after `extends` and variables. `files` are all files read, the table itself first.
 
-    `routes_span` is the place of the key `routes`. A table with gateways only has none, and needs no envelope.
-    `sha256` is over the bytes of `files` in order. `broken` names parts that were left out because they have findings,
-    such as `endpoints/arm_board`, so that their absence is not reported as well. The valid part of a route,
-    `routes/imu_info`, may be there all the same; what that lacks is not reported either.
+    `routes_span` is the key `routes`; a table with only gateways has none and needs no envelope. `sha256` is over the
+    bytes of `files` in order. `broken` names parts with findings, such as `endpoints/arm_board`, which were left out,
+    so that their absence is not reported again. The valid rest of a broken route may still be in `routes`.
     """
 
     path: Path

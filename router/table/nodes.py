@@ -1,6 +1,6 @@
 """A YAML document as data with positions: scalars, mappings and sequences, each with its span.
 
-`broken` marks what has a finding already, so that it is not reported again.
+`broken` marks nodes that already have a finding, so that they are not reported again.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from router.errors import SourceSpan
 
 @dataclass(frozen=True, slots=True)
 class TextPlace:
-    """`stretches` are the parts of the text that one line of the file has word for word: each with the
-    offset into the text at which it begins. There are none where the text was made of something else
-    (escapes, a value from a variable); then findings blame the whole.
+    """The position of each character of a text.
+
+    `stretches` are the parts of the text that a line of the file contains verbatim, each with its offset in the text.
+    There are none if the text was computed (escapes, a variable); findings then point at `whole`.
     """
 
     whole: SourceSpan
     stretches: tuple[tuple[int, SourceSpan], ...] = ()
 
     def part(self, start: int, end: int) -> SourceSpan:
-        """The span of characters `start` to `end` of the text (from 0, `end` exclusive), as far as its line goes."""
+        """Return the span of characters `start` to `end` of the text (from 0, `end` exclusive), within one line."""
         for offset, span in reversed(self.stretches):
             if offset <= start:
                 return span.part(start - offset, min(end - offset, span.end_column - span.column))
@@ -31,14 +32,14 @@ class TextPlace:
 
     @property
     def is_whole_line(self) -> bool:
-        """The text stands in the file as it is, on one line and without quotes."""
+        """Whether the file contains the text verbatim, on one line and without quotes."""
         return [span for _, span in self.stretches] == [self.whole]
 
 
 def locate(text: str, whole: SourceSpan, pieces: Iterable[tuple[int, int, str]]) -> TextPlace:
-    """The place of a text that was written in `pieces`, one for each line: line and column from 1, and what is there.
+    """Return the place of a text that was written in `pieces`, one per line: line and column from 1, and the text.
 
-    Blanks at the ends of a piece, and what the text has in place of a line end, do not count.
+    Whitespace at the ends of a piece, and the text in place of a line end, is ignored.
     """
     stretches: list[tuple[int, SourceSpan]] = []
     offset = _after_blanks(text, 0)
@@ -60,17 +61,14 @@ def _after_blanks(text: str, offset: int) -> int:
 
 
 Path = tuple[Union[str, int], ...]
-"""How to get from a document's root to a node: keys and indexes."""
+"""Keys and indexes that lead from a document's root to a node."""
 
 Plain = Union[None, bool, int, float, str]
 
 
 @dataclass(frozen=True, slots=True)
 class ScalarNode:
-    """`text` is what was written, variables filled in; `value` is what YAML makes of it.
-
-    `place` tells where each character of the text stands, as far as the file has them word for word.
-    """
+    """A scalar: `text` as written, with variables replaced, `value` in YAML, and the `place` of the text."""
 
     span: SourceSpan
     text: str
@@ -94,7 +92,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class MappingNode:
-    """Entries by the text of their key, in the order of the file."""
+    """A mapping, with its entries by the text of their key, in the order of the file."""
 
     span: SourceSpan
     entries: Mapping[str, Entry]
@@ -109,7 +107,7 @@ Node = Union[ScalarNode, SequenceNode, MappingNode]
 
 
 def cut_off(pairs: Iterable[tuple[str, Node]]) -> Iterator[str]:
-    """Keys that are the rest of an expression: `b)` of `{x: max(a, b)}`, where the comma ends the value of `x`."""
+    """Yield keys that are the rest of an expression: `b)` of `{x: max(a, b)}`, where the comma ends the value."""
     opened = 0
     rests: list[str] = []
     for key, value in pairs:
@@ -124,7 +122,7 @@ def cut_off(pairs: Iterable[tuple[str, Node]]) -> Iterator[str]:
 
 
 def to_data(node: Node) -> object:
-    """The same as dictionaries, lists and plain values."""
+    """Convert a tree to dictionaries, lists and plain values."""
     if isinstance(node, MappingNode):
         return {key: to_data(entry.value) for key, entry in node.entries.items()}
     if isinstance(node, SequenceNode):
@@ -133,7 +131,7 @@ def to_data(node: Node) -> object:
 
 
 def is_valid(node: Node) -> bool:
-    """Whether nothing in the tree has a finding."""
+    """Return whether nothing in the tree is broken."""
     if node.broken:
         return False
     if isinstance(node, MappingNode):
@@ -142,7 +140,7 @@ def is_valid(node: Node) -> bool:
 
 
 def marked_broken(node: Node, span: SourceSpan) -> Node:
-    """A copy of the tree in which what stands at `span` is broken."""
+    """Return a copy of the tree in which the node at `span` is broken."""
     if node.span == span:
         return replace(node, broken=True)
     if isinstance(node, MappingNode):
@@ -154,14 +152,14 @@ def marked_broken(node: Node, span: SourceSpan) -> Node:
 
 
 def node_at(root: Node, path: Sequence[str | int]) -> Node:
-    """The node at a path that exists."""
+    """Return the node at a path, which must exist."""
     for step in path:
         root = _child(root, step)
     return root
 
 
 def key_at(root: Node, path: Sequence[str | int]) -> ScalarNode | None:
-    """The key that the node at `path` stands under; None for the root and for a member of a sequence."""
+    """Return the key of the node at `path`; None for the root and for an item of a sequence."""
     if not path or isinstance(path[-1], int):
         return None
     parent = node_at(root, path[:-1])
@@ -169,7 +167,7 @@ def key_at(root: Node, path: Sequence[str | int]) -> ScalarNode | None:
 
 
 def rewritten(node: Node, changes: Mapping[Path, Callable[[Node], Node]], here: Path = ()) -> Node:
-    """A copy of the tree in which the node at each path of `changes` went through its change, children first."""
+    """Return a copy of the tree with each change applied to the node at its path, children first."""
     if isinstance(node, MappingNode):
         entries = {
             key: Entry(entry.key, rewritten(entry.value, changes, (*here, key))) for key, entry in node.entries.items()
@@ -190,23 +188,23 @@ def _child(node: Node, step: str | int) -> Node:
 
 
 MAP, ELSE, TEXT = "map", "else", "text"
-"""The keys of values that are mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
+"""Keys of values that are written as mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
 
 _INDISPENSABLE = frozenset({
     "source", "ignore", "none", "for_each", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count",
     "order", "transport",
 })  # fmt: skip
-"""Keys without which a route, a topic, a destination, a deadman, a collect or a gateway has no meaning."""
+"""Keys without which a route, topic, destination, deadman, `collect` or gateway is meaningless."""
 
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
-"""Sets of keys, each of which makes a mapping worth checking, whatever it lacks otherwise."""
+"""Sets of keys, any of which makes a mapping worth checking even if other keys are missing."""
 
 _NEEDED_BY = {"collect": ("topics",), "destinations": ("deadman",)}
-"""Keys of a route, with others that need them: expressions use `items`, a deadman sends to destinations."""
+"""Keys of a route, with the keys that need them: expressions use `items`, a deadman sends to destinations."""
 
 
 def valid_part(entry: Entry) -> Entry | None:
-    """A payload case or gateway without its broken parts, so that the rest is checked in the same run."""
+    """Return a payload case or gateway without its broken parts, so that the rest is still checked."""
     value = None if entry.key.broken else _valid_part(entry.value)
     return Entry(entry.key, value) if value else None
 
@@ -237,7 +235,7 @@ def _valid_mapping(node: MappingNode) -> MappingNode | None:
 
 
 def _valid_entry(entry: Entry) -> Entry | None:
-    """The valid part of an entry; None for one that is broken as a whole, such as a mapping in place of a list."""
+    """Return the valid part of an entry; None if it is broken as a whole, for example a mapping in place of a list."""
     if entry.value.broken:
         return None
     if entry.key.text == "fields" and not entry.key.broken:
@@ -247,7 +245,7 @@ def _valid_entry(entry: Entry) -> Entry | None:
 
 
 def _valid_fields(node: Node) -> Node | None:
-    """The valid ones of the fields of a message. The value of a field is valid as a whole, or not at all."""
+    """Return the valid fields of a message. The value of a field is valid as a whole, or not at all."""
     if node.broken:
         return None
     if not isinstance(node, MappingNode) or {MAP, TEXT} & node.entries.keys():

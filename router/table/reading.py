@@ -1,7 +1,7 @@
-"""Typed values out of nodes that fit the schema.
+"""Typed values from nodes that fit the schema.
 
-A TypeError from here says that the schema and its reader disagree, which is our bug. `InvalidValueError` is the table's
-fault: a value of the right shape that means nothing.
+A TypeError means that the schema and its reader disagree, which is a bug in the router. `InvalidValueError` is a
+mistake in the table: a value of the right shape that is invalid.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ R = TypeVar("R")
 
 
 class InvalidValueError(FindingError):
-    """A value that the schema cannot judge."""
+    """An invalid value that the schema cannot detect."""
 
 
 def parsed(parse: Callable[[V], R], written: Located[V]) -> R:
-    """`parse` of a value. Raises InvalidValueError at its place in place of ValueError."""
+    """Parse a value. Raises InvalidValueError at its position if `parse` raises ValueError."""
     try:
         return parse(written.value)
     except BadAddressError as error:
@@ -39,12 +39,12 @@ def mapping(node: Node | None) -> MappingNode:
 
 
 def is_choice(node: Node) -> bool:
-    """Whether it is `{map: fix_quality, ...}`, a value that is chosen."""
+    """Return whether a node is a choice, `{map: fix_quality, ...}`."""
     return isinstance(node, MappingNode) and isinstance(node.get(MAP), ScalarNode)
 
 
 def is_text(node: Node) -> bool:
-    """Whether it is `{text: imu_link}`."""
+    """Return whether a node is `{text: imu_link}`."""
     return isinstance(node, MappingNode) and [*node.entries] == [TEXT] and isinstance(node.get(TEXT), ScalarNode)
 
 
@@ -61,18 +61,18 @@ def sequence(node: Node | None) -> SequenceNode:
 
 
 def located(node: Node | None) -> Located[str]:
-    """A scalar's text as it was written."""
+    """Return the text of a scalar as written."""
     found = scalar(node)
     return Located(found.text, found.span)
 
 
 def beside(text: str, span: SourceSpan) -> Path:
-    """A path relative to the file that names it, made absolute."""
+    """Make a path absolute, relative to the file that names it."""
     return Path(span.file).absolute().parent / text
 
 
 def whole(node: Node | None) -> int:
-    """A whole number; YAML's 10.0 and 1e1 are whole as well."""
+    """Return a whole number; YAML's 10.0 and 1e1 are also whole."""
     found = scalar(node)
     if isinstance(found.value, bool) or not isinstance(found.value, (int, float)):
         raise TypeError(f"a whole number, not {found.value!r}")
@@ -85,12 +85,12 @@ def optional_text(settings: MappingNode, key: str) -> Located[str] | None:
 
 
 def integer(settings: MappingNode, key: str) -> Located[int] | None:
-    """An optional whole number."""
+    """Return an optional whole number."""
     node = settings.get(key)
     return Located(whole(node), node.span) if node else None
 
 
 def boolean(settings: MappingNode, key: str) -> bool:
-    """A truth value that is false unless it is given."""
+    """Return a boolean, by default False."""
     node = settings.get(key)
     return node is not None and scalar(node).value is True

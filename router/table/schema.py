@@ -1,4 +1,4 @@
-"""The JSON Schema of a table, and where a tree of nodes does not fit it."""
+"""The JSON Schema of a table, and the errors of a tree of nodes that does not fit it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SCHEMA = "schemas/route-table.schema.json"
 
 @dataclass(frozen=True, slots=True)
 class SchemaError:
-    """What of jsonschema's error is used: `value` at `path` fails `keyword: limit` of `schema`.
+    """The parts of a jsonschema error that we use: `value` at `path` fails `keyword: limit` of `schema`.
 
-    With `about_name` the value is the name of the last key of the path.
+    With `about_name`, the value is the name of the last key of the path.
     """
 
     path: Path
@@ -47,12 +47,12 @@ class SchemaError:
 
     @property
     def is_about_keys(self) -> bool:
-        """The mapping is one, but some of its keys are missing or too many."""
+        """Whether a mapping has missing or unknown keys."""
         return self.keyword in ("required", "additionalProperties")
 
     @property
     def lacks_mapping(self) -> bool:
-        """A key has nothing below it; what should be there may stand beside it, for want of indentation."""
+        """Whether a key that takes a mapping is empty; its keys may be beside it because they are not indented."""
         return self.keyword == "type" and self.value is None and "object" in self.limit
 
     @property
@@ -61,7 +61,7 @@ class SchemaError:
 
 
 def table_schema() -> dict[str, Any]:
-    """The schema as data."""
+    """Return the schema of tables as data."""
     return _schema(SCHEMA)
 
 
@@ -72,7 +72,7 @@ def _schema(name: str) -> dict[str, Any]:
 
 
 def is_misplaced(name: str, siblings: Collection[str]) -> bool:
-    """Whether a key does not belong beside its siblings: either it is one of tables, or they are, but not both."""
+    """Return whether a key does not belong beside its siblings: it or they are keys of a table, but not together."""
     mappings = [keys_of(schema) for schema in (table_schema(), *table_schema()["definitions"].values())]
     of_siblings = [keys for keys in mappings if keys.issuperset(siblings)]
     if not siblings or any(name in keys for keys in of_siblings):
@@ -81,15 +81,15 @@ def is_misplaced(name: str, siblings: Collection[str]) -> bool:
 
 
 def keys_of(schema: Mapping[str, Any]) -> set[str]:
-    """The keys of the mappings that a definition describes."""
+    """Return the keys of the mappings that a definition describes."""
     parts = (schema, schema.get("then", {}), schema.get("else", {}))
     return {key for part in parts for key in part.get("properties", ())}
 
 
 def schema_errors(tree: Node, schema: str) -> list[SchemaError]:
-    """Where a tree does not fit a schema of ours, which is named by its file.
+    """Return the errors of a tree that does not fit a schema, which is named by its file.
 
-    One error for each value, that of its type before any other; each missing key is one of its own.
+    There is one error per value, preferably about its type, and one per missing key.
     """
     data: Any = to_data(tree)
     if _fits(schema)(data):
@@ -111,7 +111,7 @@ def _validator(schema: str) -> Validator:
 
 
 def validator(schema: Mapping[str, Any]) -> Validator:
-    """What knows where data does not fit."""
+    """Return a validator, which finds where data does not fit."""
     from jsonschema import Draft7Validator, validators  # only for tables with errors: see fitting.py
 
     with_exact_end: type[Validator] = validators.extend(Draft7Validator, {"pattern": _pattern})  # type: ignore[no-untyped-call]
@@ -126,5 +126,5 @@ def _pattern(validator: Validator, pattern: str, instance: object, schema: objec
 
 
 def matches(text: str, pattern: str) -> bool:
-    """Whether a text matches a pattern of JSON Schema."""
+    """Return whether a text matches a JSON Schema pattern."""
     return bool(re.search(exact_pattern(pattern), text))

@@ -1,8 +1,7 @@
-"""The shape of a table: checked by its schema, with errors as findings in words.
+"""Check of a table's shape against its schema, with errors as findings.
 
-The schema carries the words: `errorMessage` ("must be ...", which editors show as well) beside the keyword. A misspelt
-key is one mistake: it is reported and then read as the key that was meant, so that nothing is found missing on its
-account.
+The schema contains their text: `errorMessage` ("must be ...", which editors also show) beside the keyword. A misspelt
+key is reported and then read as the key that was meant, so that this key is not also reported as missing.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _TYPES = {
 }
 _LONGEST = 60
 _ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
-"""Keys under which an address stands."""
+"""Keys whose value is an address."""
 _NAME_DEPTH = len(("endpoints", "name"))
 _NAMED_PARTS = {
     "listen": ("listener", "a"),
@@ -36,19 +35,19 @@ _NAMED_PARTS = {
     "routes": ("route", "a"),
     "gateways": ("gateway", "a"),
 }
-"""Mappings whose keys are names, and what each of these is."""
+"""Mappings whose keys are names, and the noun for an entry with its article."""
 _HINTS_FOR_MISSING = {
-    "source": "say who sends it: an endpoint, or {topic: NAME} for ROS; or say 'ignore: why'",
-    "transport": "or say 'ignore: why'",
-    "version": "begin with 'version: 1'",
-    "receive": "what its client publishes has to arrive somewhere",
+    "source": "name who sends it: an endpoint, or {topic: NAME} for ROS; or write 'ignore: why'",
+    "transport": "add it, or write 'ignore: why'",
+    "version": "start with 'version: 1'",
+    "receive": "add the local address that receives what its client publishes",
 }
 _BELONG_TOGETHER = ("envelope", "listen", "routes")
-_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
+_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with only 'gateways' needs none of them"
 
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
-    """The tree with misspelt keys put right and everything that has a finding marked broken."""
+    """Return the tree with misspelt keys corrected and everything that has a finding marked broken."""
     found = schema_errors(root, SCHEMA)
     if not found:
         return root
@@ -73,9 +72,9 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
 
 
 def _with_deep_keys(tree: Node, wrong: Container[Path], findings: list[Diagnostic]) -> Node:
-    """The tree without keys of routes and the like that stand beside these for want of indentation.
+    """Return the tree without keys of routes, endpoints and so on that are beside these because of wrong indentation.
 
-    `wrong` are the paths of parts that have errors. Each key is reported, and what it belongs to marked broken.
+    `wrong` are the paths of parts with errors. Each such key is reported, and the part that it belongs to is broken.
     """
     for part, (kind, article) in _NAMED_PARTS.items():
         node = node_at(tree, (part,)) if part in mapping(tree).entries else None
@@ -101,17 +100,17 @@ def _with_entries(node: Node, entries: Mapping[str, Entry]) -> Node:
 
 
 def _above(entry: Entry, entries: Mapping[str, Entry]) -> str | None:
-    """The name of the last of `entries` that stands above an entry, in the same file."""
+    """Return the name of the last of `entries` above an entry in the same file."""
     span = entry.key.span
     above = {other.key.span.line: name for name, other in entries.items() if other.key.span.file == span.file}
     return above[max(lines)] if (lines := [line for line in above if line < span.line]) else None
 
 
 def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
-    """Errors that follow from another one, which is reported.
+    """Return errors that are consequences of another one, which is reported.
 
-    These are all but the first of several lists in a list, and errors below `send` where it has several payload cases
-    or one without fields.
+    These are all but the first of several lists in a list, and errors below `send` if it has several payload cases or
+    one without fields.
     """
     empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
@@ -134,7 +133,7 @@ def _is_broken(tree: Node, path: Path) -> bool:
 
 
 def _is_rest(tree: Node, path: Path) -> bool:
-    """Whether the key at `path` is the rest of an expression that a comma has cut, which gets a finding of its own."""
+    """Return whether the key at `path` is the rest of an expression cut by a comma, which has its own finding."""
     siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in hints.NAME_FIELDS) else None
     return isinstance(siblings, MappingNode) and path[-1] in _rests(siblings)
 
@@ -152,9 +151,9 @@ def _rests(node: MappingNode) -> set[str]:
 def unknown_keys(
     tree: Node, path: Path, known: list[str], owner: str, empty: Container[Path] = ()
 ) -> Iterator[Diagnostic]:
-    """A finding for each key of the mapping at `path` that is not `known`.
+    """Yield a finding for each key of the mapping at `path` that is not `known`.
 
-    Keys after one of the paths in `empty` are not reported: they belong below it, and lack indentation.
+    Keys after one of the paths in `empty` are not reported: they belong below it and are not indented.
     """
     said = set()
     entries = mapping(node_at(tree, path)).entries
@@ -182,7 +181,7 @@ def _with_known_keys(node: Node, known: list[str]) -> Node:
         free = [] if hints.in_other_words(name, known) else [key for key in known if key not in written.entries]
         meant = name if name in known else hints.meant(name, free)
         if meant is None or (meant != name and meant in entries):
-            broken = True  # what the key was to say is lost
+            broken = True  # the key's content is lost
         else:
             entries[meant] = entry
     if "address" in entries and any(name in written.entries for name in hints.ADDRESS_PARTS):
@@ -194,7 +193,7 @@ def _with_known_keys(node: Node, known: list[str]) -> Node:
 
 
 def finding(error: SchemaError, tree: Node) -> Diagnostic:
-    """The finding for anything but an unknown key of a closed mapping."""
+    """Return the finding for any error except an unknown key of a closed mapping."""
     path, keyword = error.path, error.keyword
     key = key_at(tree, path)
     name = subject(path)
@@ -213,7 +212,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
     if keyword == "maxProperties":
         hint = hints.without_case(error.value) if path[-1] == "send" and isinstance(error.value, dict) else ""
-        return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it", hint)
+        return Diagnostic(span, code, f"{name} {_expected(error)}, and nothing else", hint)
     hint = hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")
@@ -223,7 +222,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
 
 
 def shown(value: object) -> str:
-    """A value as messages name it."""
+    """Describe a value for messages."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
@@ -256,12 +255,12 @@ def _bad_name(error: SchemaError, span: SourceSpan) -> Diagnostic:
 
 
 def _is_chosen(path: Path) -> bool:
-    """The key at the path is a name that a person gave, not one of the keys that others of their mapping rule out."""
+    """Return whether the key at the path is a name chosen by the table, not a key that its siblings exclude."""
     return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in hints.NAME_FIELDS)
 
 
 def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
-    missing = error.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
+    missing = error.message.split("'")[1]  # jsonschema has one error per key and names it nowhere else
     key = key_at(tree, error.path)
     span = key.span if key else _first_line(node_at(tree, error.path))
     is_whole_part = len(error.path) == _NAME_DEPTH
@@ -287,18 +286,18 @@ def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
         parse_address(text)
     except BadAddressError as error:
         return Diagnostic(span, Code.BAD_ADDRESS, error.what, hints.as_variable(text) or error.hint)
-    raise AssertionError(f"the schema refuses the address '{text}', parse_address takes it")
+    raise AssertionError(f"the schema rejects the address '{text}', parse_address accepts it")
 
 
 def _repeated(error: SchemaError, tree: Node) -> Diagnostic:
     items = error.value if isinstance(error.value, list) else []
     index = next(index for index, item in enumerate(items) if item in items[:index])
-    what = f"{shown(items[index])} stands in {subject(error.path)} twice"
+    what = f"{subject(error.path)} contains {shown(items[index])} twice"
     return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what)
 
 
 def _blamed(tree: Node, path: Path) -> SourceSpan:
-    """The value if it is a word on a line, else the key that it stands under."""
+    """Return the span of the value if it is on one line, else that of its key."""
     node = node_at(tree, path)
     key = key_at(tree, path)
     if key is None or (isinstance(node, ScalarNode) and node.span.end_column > node.span.column):
@@ -307,14 +306,14 @@ def _blamed(tree: Node, path: Path) -> SourceSpan:
 
 
 def _first_line(node: Node) -> SourceSpan:
-    """The span of a scalar, or of a collection's first key."""
+    """Return the span of a scalar, or of a mapping's first key."""
     if isinstance(node, MappingNode) and node.entries:
         return next(iter(node.entries.values())).key.span
     return node.span
 
 
 def subject(path: Path) -> str:
-    """What stands at a path, as messages name it."""
+    """Describe the value at a path for messages."""
     names = [step for step in path if isinstance(step, str)]
     if not names:
         return "the table"

@@ -1,13 +1,13 @@
-"""Expand the short forms of a table, so that the rest of the router sees one form of everything.
+"""Expansion of a table's short forms, so that the rest of the router handles only one form.
 
 | short | written out |
 |---|---|
 | `topic: imu_data` in a route | `topics: [{topic: imu_data}]` |
-| a topic by its name, `topics: [imu_data]` | `topics: [{topic: imu_data}]` |
+| a topic by name, `topics: [imu_data]` | `topics: [{topic: imu_data}]` |
 | `qos: sensor_data` | `qos: {profile: sensor_data}` |
 | a key of `defaults` | that key wherever it applies and is missing |
 
-Expanded nodes keep the positions of the short form; defaults those of `defaults`.
+Expanded nodes keep the positions of the short form, defaults those in `defaults`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NodeT = TypeVar("NodeT", bound=Node)
 
 
 def written_out(root: MappingNode) -> MappingNode:
-    """The table without short forms. What does not fit the schema is marked broken in it."""
+    """Return the table without short forms. Nodes that do not fit the schema are marked broken in it."""
     group = root.get("defaults")
     defaults = _valid_entries(group) if isinstance(group, MappingNode) else {}
     in_long = _Shorthand(defaults, _of_deadmen(group))
@@ -33,7 +33,7 @@ def written_out(root: MappingNode) -> MappingNode:
 
 
 class _Shorthand:
-    """The long forms of parts of a table with these defaults."""
+    """Writes out parts of a table with these defaults."""
 
     def __init__(self, defaults: Entries, of_deadmen: Entries) -> None:
         self._of_routes = {key: entry for key, entry in defaults.items() if key == "ttl"}
@@ -59,7 +59,7 @@ class _Shorthand:
         return _changed(self._topic(node), "deadman", self._deadman)
 
     def _topic(self, node: Node) -> Node:
-        """A mapping with 'topic'. Its own 'qos' or 'queue_depth' wins over the depth that the defaults say."""
+        """Expand a mapping with 'topic'. Its own 'qos' or 'queue_depth' overrides the default depth."""
         if not isinstance(node, MappingNode):
             return node
         if "qos" in node.entries:
@@ -73,7 +73,7 @@ class _Shorthand:
 
 
 def _of_deadmen(defaults: Node | None) -> Entries:
-    """The defaults of deadmen, valid or not. If a mistake may have lost the timeout, there is one, marked broken."""
+    """Return the defaults of deadmen, valid or not. If a mistake may hide the timeout, add one marked broken."""
     deadman = defaults.get("deadman") if isinstance(defaults, MappingNode) else None
     entries = deadman.entries if isinstance(deadman, MappingNode) else {}
     lost = next((node for node in (deadman, defaults) if node and node.broken), None)
@@ -84,7 +84,7 @@ def _of_deadmen(defaults: Node | None) -> Entries:
 
 
 def _named(node: Node) -> Node:
-    """A topic that may be its name alone, as a mapping."""
+    """Return a topic as a mapping, also if it is only a name."""
     return _alone("topic", node) if isinstance(node, ScalarNode) else node
 
 
@@ -107,15 +107,15 @@ def _key(text: str, span: SourceSpan) -> ScalarNode:
 
 
 def _with(node: Node, defaults: Entries) -> Node:
-    """The node, if it is a mapping, with the entries of `defaults` that it lacks."""
+    """Return the node, if it is a mapping, with those entries of `defaults` that it lacks."""
     if not isinstance(node, MappingNode) or not defaults:
         return node
     missing = {key: entry for key, entry in defaults.items() if key not in node.entries}
-    return replace(node, entries={**node.entries, **missing})  # its own ones first: they are its place in the file
+    return replace(node, entries={**node.entries, **missing})  # its own entries first: the first is its position
 
 
 def _changed(node: NodeT, key: str, change: Callable[[Node], Node]) -> NodeT:
-    """The node, if it is a mapping, with what stands under one key changed."""
+    """Return the node, if it is a mapping, with the value of one key changed."""
     if not isinstance(node, MappingNode) or key not in node.entries:
         return node
     entry = node.entries[key]

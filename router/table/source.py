@@ -1,6 +1,6 @@
-"""The text of one table file: read, bounded, decoded, free of invisible characters, `${VARIABLES}` filled in.
+"""Reading of one table file: bounded, decoded, without invisible characters, with `${VARIABLES}` replaced.
 
-What cannot be read at all is raised as TableError with one finding.
+A file that cannot be read raises TableError with one finding.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _UNUSABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\u
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """`file` is how findings name it; `text` has no byte order mark; `lines` are without their ends."""
+    """A file: `file` is its name in findings; `text` has no byte order mark; `lines` have no line ends."""
 
     path: Path
     file: str
@@ -31,14 +31,14 @@ class Source:
     lines: tuple[str, ...]
 
     def span(self, line: int, column: int, end_line: int, end_column: int) -> SourceSpan:
-        """A span from YAML's marks, which count from 0; several lines are blamed on the first."""
+        """Return a span from YAML's marks, which count from 0; of several lines, the first."""
         if end_line != line:
             end_column = len(self.lines[line]) if line < len(self.lines) else column
         return SourceSpan(self.file, line + 1, column + 1, max(end_column, column) + 1)
 
 
 def read_source(path: Path) -> Source:
-    """The file's text. Raises TableError when there is none to be had."""
+    """Read a file. Raises TableError if it cannot be read."""
     file = shown_path(path)
     data = _read(path, file)
     try:
@@ -53,19 +53,19 @@ def read_source(path: Path) -> Source:
         offset, name = unusable
         line = len(_LINE_END.split(text[:offset])) - 1
         column = offset - max(text.rfind("\n", 0, offset), text.rfind("\r", 0, offset)) - 1
-        what = f"the character {name} has no place in a table"
+        what = f"tables cannot contain the character {name}"
         raise TableError.of(source.span(line, column, line, column + 1), Code.BAD_YAML, what)
     return source
 
 
 def unusable_character(text: str) -> tuple[int, str] | None:
-    """Where a control character, a foreign line end or half a surrogate pair is, and its name; None without."""
+    """Return offset and name of a control character, foreign line end or half surrogate pair; None without."""
     match = _UNUSABLE.search(text)
     return (match.start(), f"U+{ord(match[0]):04X}") if match else None
 
 
 def foreign_blank(text: str) -> str | None:
-    """The name of the first character that looks like a space, or like nothing, and is no space to YAML."""
+    """Return the name of the first character that looks like a space, or is invisible, but is not a space in YAML."""
     if text.isascii():
         return None
     found = next((char for char in text if unicodedata.category(char) in ("Zs", "Cf") and char != " "), None)
@@ -78,7 +78,7 @@ def _read(path: Path, file: str) -> bytes:
         if inputs.is_dir(path):
             what = "this is a folder, not a route table"
         elif inputs.exists(path) and not inputs.is_file(path):
-            what = "this is no ordinary file"
+            what = "this is not a regular file"
         else:
             data = inputs.read_bytes(path, MAX_BYTES + 1)
             if len(data) <= MAX_BYTES:
@@ -89,10 +89,10 @@ def _read(path: Path, file: str) -> bytes:
         if isinstance(error, FileNotFoundError) and (near := nearest_path(path)):
             hint = f"did you mean '{shown_path(near)}'?"
         elif isinstance(error, FileNotFoundError) and not path.is_absolute():
-            hint = f"paths are relative to the working directory, here {Path.cwd()}"
+            hint = f"paths are relative to the working directory, {Path.cwd()}"
             if is_installed(asset("routes")):
                 hint += "; `router init` writes example tables there"
-    except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
+    except ValueError as error:  # a path that no file system accepts: NUL, half a surrogate pair
         what = f"the file cannot be read: {error}"
     raise TableError.of(SourceSpan(file), Code.BAD_FILE, what, hint)
 
@@ -104,7 +104,7 @@ _USAGE = "write ${NAME} or ${NAME:-default}"
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What is wrong with the characters `start` to `end` (exclusive) of a text."""
+    """A problem with the characters `start` to `end` (exclusive) of a text."""
 
     start: int
     end: int
@@ -117,7 +117,7 @@ _AS_IN_A_SHELL = re.compile(r"\$\(?([A-Za-z_]\w*)\)?|^~(?=/|$)")
 
 
 def in_braces(text: str) -> str:
-    """The text with variables that are written as in a shell, such as `$NAME` or `~`, as a table writes them."""
+    """Return the text with shell variables, such as `$NAME` or `~`, in the syntax of tables."""
     return _AS_IN_A_SHELL.sub(lambda match: f"${{{match[1] or 'HOME'}}}", text)
 
 
@@ -126,10 +126,9 @@ def has_variables(text: str) -> bool:
 
 
 def fill(text: str, environ: Mapping[str, str]) -> tuple[str, list[Problem]]:
-    """The text with every variable replaced, or with those that have a problem left as they are.
+    """Return the text with every variable replaced, except those with a problem, and the problems.
 
-    As in a shell, the default stands in for a variable that is empty as well. Values are not searched
-    for variables again.
+    As in a shell, the default also replaces an empty variable. Values are not expanded again.
     """
     parts: list[str] = []
     problems: list[Problem] = []
@@ -139,7 +138,7 @@ def fill(text: str, environ: Mapping[str, str]) -> tuple[str, list[Problem]]:
         match = _REFERENCE.match(text, start)
         position = match.end() if match else _end_of_bad_reference(text, start)
         filled = _value(match, environ) if match else Problem(
-            start, position, Code.BAD_VALUE, f"'{text[start:position]}' is no variable", _USAGE
+            start, position, Code.BAD_VALUE, f"'{text[start:position]}' is not a variable", _USAGE
         )  # fmt: skip
         if isinstance(filled, Problem):
             problems.append(filled)
@@ -156,12 +155,12 @@ def _value(match: re.Match[str], environ: Mapping[str, str]) -> str | Problem:
         near = nearest(name, environ)
         hint = f"did you mean '{near}'? " if near else ""
         hint += f"set it, or give it a default: ${{{name}:-value}}"
-        hint += f"; an expression names a field as `{name}`" if name.islower() else ""
+        hint += f"; in an expression, name a field as `{name}`" if name.islower() else ""
         return Problem(match.start(), match.end(), Code.UNDEFINED_VARIABLE, f"the variable '{name}' is not set", hint)
     filled = value or default or ""
     if _OPENING in filled:
-        what = f"the value of the variable '{name}' holds '${{', and values are not searched for variables"
-        return Problem(match.start(), match.end(), Code.BAD_VALUE, what, "put the final text into the variable")
+        what = f"the value of the variable '{name}' contains '${{', but values are not expanded again"
+        return Problem(match.start(), match.end(), Code.BAD_VALUE, what, "set the variable to the final text")
     return filled
 
 

@@ -1,7 +1,7 @@
-"""Numbers with units: durations, sizes and rates, from the text of a table and back.
+"""Numbers with units: parsing and printing of durations, sizes and rates.
 
-Parsing is exact: what does not come to a whole base unit is refused. Parsers raise ValueError with a sentence that says
-what is wrong. Showing gives the shortest text that is parsed as the same number.
+Parsing is exact: fractions of a base unit are rejected. Parsers raise ValueError with a message that says what is
+wrong. Printing gives the shortest text that parses as the same number.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ MAX_DURATION = (1 << 63) - 1
 
 
 MAX_SIZE = (1 << 30) - 1
-"""The largest receive buffer that the kernel takes, which doubles what it is asked for."""
+"""The largest receive buffer that the kernel accepts, which doubles the requested size."""
 
 MAX_DATA_RATE = 10**12
-"""More than any link carries; products with nanoseconds stay small integers."""
+"""Faster than any link; products with nanoseconds stay small integers."""
 
 EACH = "each"
-"""In place of a gateway's period or rate: every message is sent."""
+"""Replaces a gateway's period or rate: every message is sent."""
 
 NEVER = "never"
-"""In place of a duration that never passes."""
+"""Replaces a duration that never passes."""
 
 MIN_PERIOD = 1_000_000
-"""ns. A gateway with a shorter period does nothing else; `each` sends every message."""
+"""ns. A gateway with a shorter period would do nothing else; `each` sends every message."""
 
 MIN_INTERVAL = 10_000_000
-"""ns. Discovery of the ROS graph, and sending schemas, cost more than data."""
+"""ns. Discovery of the ROS graph and sending schemas cost more than data."""
 
 MIN_DATAGRAM = 576
-"""Bytes that every IPv4 host takes."""
+"""Bytes that every IPv4 host accepts."""
 
 MIN_DISK_SIZE, MAX_DISK_SIZE = 1 << 20, 1 << 50
-"""Bytes of recordings. Smaller files would be rotated every few datagrams."""
+"""Bytes of a recording. Smaller files would be rotated every few datagrams."""
 
 LARGEST_DATAGRAM = 65_507
 """Bytes that one UDP datagram over IPv4 can carry."""
@@ -56,14 +56,14 @@ LARGEST_DATAGRAM = 65_507
 MIN_MESSAGE, MAX_MESSAGE = 1000, 256 << 20
 
 _WHOLE = {"h": 3600 * 10**9, "min": 60 * 10**9}
-"""Nobody writes 1.5 min."""
+"""Units without decimals: nobody writes 1.5 min."""
 _DECIMAL = {"s": 10**9, "ms": 10**6, "us": 10**3}
 _MAX_DECIMALS = 15
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """How a table writes a kind of number: `parse` reads a scalar's value, `show` gives its text."""
+    """The syntax of a kind of number: `parse` reads a scalar's value, `show` prints it."""
 
     parse: Callable[[Any], Any]
     show: Callable[[Any], str]
@@ -87,7 +87,7 @@ _SPELLINGS = {
     "GB": ("gb", "g", "gigabyte"),
     "GiB": ("gib", "gi", "g"),
 }
-"""Units, and how people write them, in lower case."""
+"""Units, with the spellings that people use, in lower case."""
 _CONVERTED: Mapping[str, tuple[Fraction | int, str]] = {
     "d": (24, "h"),
     "day": (24, "h"),
@@ -96,17 +96,17 @@ _CONVERTED: Mapping[str, tuple[Fraction | int, str]] = {
     **dict.fromkeys(("kbps", "kbit/s", "kbit"), (Fraction(1, 8), "kB/s")),
     **dict.fromkeys(("mbps", "mbit/s", "mbit"), (Fraction(1, 8), "MB/s")),
 }
-"""Units that tables do not have, as so many of one that they have."""
+"""Units that tables do not support, as a multiple of one that they do."""
 
 
 def meant_quantity(text: str, fits: Callable[[str], bool]) -> str:
-    """`did you mean '4MB' or '4MiB'?`: what the text may stand for, of that what fits; empty where there is nothing."""
+    """Return `did you mean '4MB' or '4MiB'?` for the quantities that the text may stand for and that fit, or empty."""
     found = [f"'{each}'" for each in dict.fromkeys(_meanings(text)) if fits(each)]
     return f"did you mean {' or '.join(found)}?" if found else ""
 
 
 def _meanings(text: str) -> Iterator[str]:
-    """Quantities of all kinds; a duration as a rate as well, and a rate as a duration."""
+    """Yield quantities of all kinds that the text may stand for; durations also as rates, and the reverse."""
     if not _PARTS.fullmatch(text):
         return
     parts = [(number.replace(",", "."), unit.lower()) for number, unit in re.findall(_PART, text, re.IGNORECASE)]
@@ -128,7 +128,7 @@ def _meanings(text: str) -> Iterator[str]:
 
 
 def _units(written: str) -> list[tuple[Fraction | int, str]]:
-    """What a unit may stand for: so many of a unit that tables have. Sizes may lack a `/s`, or have one too many."""
+    """Return what a unit may stand for, as multiples of units of tables. A `/s` may be missing or superfluous."""
     for word in (written, written.removesuffix("s")):
         found = [_CONVERTED[word]] if word in _CONVERTED else []
         found += [(1, unit) for unit, spellings in _SPELLINGS.items() if word in spellings]
@@ -139,20 +139,20 @@ def _units(written: str) -> list[tuple[Fraction | int, str]]:
 
 
 def parse_duration(text: str) -> int:
-    """`500ms` as nanoseconds."""
+    """Parse `500ms` as nanoseconds."""
     return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
 
 
 def parse_period(text: str) -> int:
-    """`500ms` as nanoseconds, of a gateway that ticks."""
+    """Parse `500ms` as nanoseconds, for the period of a gateway."""
     period = parse_duration(text)
     if period < MIN_PERIOD:
-        raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; 'each' sends every message")
+        raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; to send every message, write 'each'")
     return period
 
 
 def parse_interval(text: str) -> int:
-    """`5s` as nanoseconds, for what is done now and then."""
+    """Parse `5s` as nanoseconds, for the interval of a rare task."""
     interval = parse_duration(text)
     if interval < MIN_INTERVAL:
         raise ValueError(f"'{text}' is shorter than {MIN_INTERVAL // 10**6}ms")
@@ -160,7 +160,7 @@ def parse_interval(text: str) -> int:
 
 
 def parse_rate(value: str | float) -> float:
-    """`30 Hz` or a plain number as Hz."""
+    """Parse `30 Hz` or a plain number as Hz."""
     if isinstance(value, str):
         if not (match := _HERTZ.fullmatch(value)):
             raise ValueError(f"'{value}' is not a rate such as '30 Hz'{_meaning(value, 'Hz')}")
@@ -171,7 +171,7 @@ def parse_rate(value: str | float) -> float:
 
 
 def parse_topic_rate(value: str | float) -> int:
-    """`50 Hz` or a plain number as a period in nanoseconds."""
+    """Parse `50 Hz` or a plain number as a period in nanoseconds."""
     period = round(1e9 / parse_rate(value))
     if not MIN_PERIOD <= period <= MAX_DURATION:
         raise ValueError(f"a topic's rate is at most {10**9 // MIN_PERIOD} Hz, or 'each'")
@@ -179,7 +179,7 @@ def parse_topic_rate(value: str | float) -> int:
 
 
 def _meaning(text: str, *units: str) -> str:
-    """`; did you mean '200ms'?`, if that has one of the units."""
+    """Return `; did you mean '200ms'?` if the text may be a quantity with one of the units, else empty."""
     meant = meant_quantity(text, lambda each: each != text and each.lstrip("0123456789. ") in units)
     return f"; {meant}" if meant else ""
 
@@ -187,7 +187,7 @@ def _meaning(text: str, *units: str) -> str:
 def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> int:
     match = _QUANTITY.fullmatch(text)
     if not match or match[3] not in units:
-        raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}{_meaning(text, *units)}")
+        raise ValueError(f"'{text}' is not a number with one of the units {', '.join(units)}{_meaning(text, *units)}")
     fraction = match[2] or ""
     amount, rest = divmod(int(match[1] + fraction) * units[match[3]], int("1" + "0" * len(fraction)))
     if rest:
@@ -199,7 +199,7 @@ def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smalles
 
 
 def duration(ns: int) -> str:
-    """`500 ms`, `1.5 s`, `1 h`."""
+    """Print a duration: `500 ms`, `1.5 s`, `1 h`."""
     for unit, size in _WHOLE.items():
         if ns >= size and ns % size == 0:
             return f"{ns // size} {unit}"
@@ -212,17 +212,17 @@ def duration(ns: int) -> str:
 
 
 def rate(hertz: float) -> str:
-    """`30 Hz`."""
+    """Print a rate: `30 Hz`."""
     return _in_hertz(hertz, lambda text: parse_rate(text) == hertz)
 
 
 def topic_rate(ns: int) -> str:
-    """A period as `50 Hz`."""
+    """Print a period as a rate: `50 Hz`."""
     return _in_hertz(1e9 / ns, lambda text: parse_topic_rate(text) == ns)
 
 
 def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
-    """With as few decimals as say the same."""
+    """Print a rate with as few decimals as give the same number."""
     for decimals in range(_MAX_DECIMALS):
         text = f"{hertz:.{decimals}f} Hz"
         if float(text[:-3]) and is_same(text):
@@ -231,7 +231,7 @@ def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
 
 
 def _or(word: str, quantity: Quantity, instead: int | None = 0) -> Quantity:
-    """The quantity, with a word that is read as `instead`."""
+    """Return the quantity with an additional word, which is parsed as `instead`."""
     return Quantity(
         lambda text: instead if text == word else quantity.parse(text),
         lambda value: quantity.show(value) if value else word,
@@ -239,7 +239,7 @@ def _or(word: str, quantity: Quantity, instead: int | None = 0) -> Quantity:
 
 
 def _bytes(units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> Quantity:
-    """Bytes, shown in the largest unit that gives a whole number."""
+    """Return a quantity of bytes, printed in the largest unit that gives a whole number."""
 
     def show(count: int) -> str:
         unit = next(unit for unit in reversed([*units]) if count % units[unit] == 0)
@@ -255,10 +255,10 @@ INTERVAL = Quantity(parse_interval, duration)
 RATE = Quantity(parse_rate, rate)
 TOPIC_RATE = _or(EACH, Quantity(parse_topic_rate, topic_rate))
 SIZE = _bytes(_BYTES, "bytes", MAX_SIZE)
-"""Of a buffer."""
+"""Size of a buffer."""
 DATAGRAM_SIZE = _bytes(_BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
 MESSAGE_SIZE = _bytes(_BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
-"""Of the text of one message."""
+"""Size of one message as text."""
 DISK_SIZE = _bytes(_DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
-"""Of files."""
+"""Size of files."""
 DATA_RATE = _bytes(_BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)

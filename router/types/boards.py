@@ -120,7 +120,9 @@ def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
     try:
         text = inputs.read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        return OptionsFile(), [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")]
+        return OptionsFile(), [
+            Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"the file cannot be read: {error}")
+        ]
     lines = []
     findings = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -146,7 +148,7 @@ def _changes(text: str) -> tuple[Mapping[str, int | bool], Iterable[tuple[str, s
     while at < len(text):
         option = _OPTION.match(text, at)
         if option is None:
-            return changes, [(f"'{text[at:]}' is no option of nanopb", "write for example 'max_size:16'")]
+            return changes, [(f"'{text[at:]}' is not a nanopb option", "write for example 'max_size:16'")]
         at = option.end()
         key, value = option["key"], option["value"]
         if key in _COUNTS and value.isdecimal():
@@ -159,7 +161,7 @@ def _changes(text: str) -> tuple[Mapping[str, int | bool], Iterable[tuple[str, s
             return changes, [(f"{key} cannot be '{value}'", "")]
         elif key not in _WITHOUT_INFLUENCE:
             hint = did_you_mean(key, _COUNTS | _FLAGS | {"type"})
-            return changes, [(f"the router cannot tell sizes with nanopb's option '{key}'", hint)]
+            return changes, [(f"the router cannot compute sizes with the nanopb option '{key}'", hint)]
     return changes, []
 
 
@@ -222,7 +224,7 @@ def unbounded_fields(
 def why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
     """Why a field has no largest encoding, None if it has one: what it contains does not count."""
     if field.type == FieldDescriptor.TYPE_GROUP:
-        return "is a group, which nanopb does not know"
+        return "is a group, which nanopb does not support"
     if field.is_repeated and options.max_count is None:
         return "is repeated without a max_count"
     if field.type == FieldDescriptor.TYPE_STRING and options.string_size is None:
@@ -230,7 +232,7 @@ def why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
     if field.type == FieldDescriptor.TYPE_BYTES and options.max_size is None:
         return "is bytes without a max_size"
     if not options.is_static:
-        return "is held by pointer or callback"
+        return "is stored by pointer or callback"
     return None
 
 
@@ -290,5 +292,5 @@ def _unbounded_finding(case: PayloadCase, found: Unbounded, schema: ProtoSchema,
     field = found.path[-1]
     path = ".".join((case.name, *(step.name for step in found.path)))
     place = schema.span(container(field).full_name, field.name)
-    hint = f"see {place}; bound it in an .options file beside the .proto, as nanopb does"
-    return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot take {path}: it {found.why}", hint)
+    hint = f"see {place}; limit its size in a nanopb .options file beside the .proto"
+    return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot decode {path}: it {found.why}", hint)

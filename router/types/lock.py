@@ -87,7 +87,7 @@ class LockComparison:
             return sorted([*errors, *self.additions], key=lambda finding: finding.span)
         if self.faults:
             return list(self.faults)
-        hint = f"write it with `{self._command}`"
+        hint = f"create it with `{self._command}`"
         if named is not None:
             what = f"there is no lock file {shown_path(self._schema.lock)}"
             return [Diagnostic(named.span, Code.BAD_FILE, what, hint)]
@@ -121,18 +121,18 @@ class LockComparison:
                 if name in was:
                     self._compare(name, was[name], declaration)
                 else:
-                    self._add(schema.span(name), f"the lock does not know {name}")
+                    self._add(schema.span(name), f"{name} is not in the lock")
         self._compare_envelopes(envelope, lock, locked, names)
 
     def _compare_envelopes(self, envelope: Envelope, lock: Lock, locked: Lock, names: Mapping[str, str]) -> None:
         span = self._schema.span(envelope.name)
         if (names.get(lock.message, lock.message), locked.oneof) != (envelope.name, envelope.oneof):
             message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {envelope.name}.{envelope.oneof}"
-            self._refuse(envelope.name, envelope.oneof, span, message, "name that one in the table")
+            self._refuse(envelope.name, envelope.oneof, span, message, "name the locked envelope in the table")
         if names:
             old = min(names)
-            more = f", and so for {len(names) - 1} more" if len(names) > 1 else ""
-            self._add(span, f"the lock has {old} for what is {names[old]} now{more}", "the wire is the same; ")
+            more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
+            self._add(span, f"the lock still has {names[old]} as {old}{more}", "the wire format is the same; ")
         if lock.max_size != envelope.max_size and not self.conflicts:
             but = ", fields without a bound not counted" if self._schema.unbounded(envelope.name) else ""
             message = f"{envelope.name} takes up to {envelope.max_size} bytes{but}; the lock says {lock.max_size}"
@@ -153,16 +153,16 @@ class LockComparison:
             elif holders and not any((each.number, each.name) in _names(current) for each in holders):
                 self._refuse_holder(owner, holders[0], entry)
             elif any(first <= entry.number <= last for first, last in locked.reserved):
-                message = f"number {entry.number} of {owner} is reserved, and given to '{entry.name}'"
-                hint = "the lock has it as reserved: take a free one"
+                message = f"number {entry.number} of {owner} is reserved, but used for '{entry.name}'"
+                hint = "the lock says that it is reserved: use a free number"
                 self._refuse(owner, entry.name, self._span(owner, entry, Part.NUMBER), message, hint)
             else:
-                self._add(self._schema.span(owner, entry.name), f"the lock does not know {owner}.{entry.name}")
+                self._add(self._schema.span(owner, entry.name), f"{owner}.{entry.name} is not in the lock")
         numbers = {entry.number for entry in current.entries}
         for entry in live:
             if entry.number not in numbers and entry.name not in moved:
                 number = entry.number
-                message = f"number {number} of {owner}, which was '{entry.name}', is free to be reused"
+                message = f"number {number} of {owner}, formerly '{entry.name}', is not reserved"
                 hint = f"the lock says {_shown(entry)}; write `reserved {number};` there"
                 self._refuse(owner, entry.name, self._schema.span(owner), message, hint, {entry})
 
@@ -195,7 +195,7 @@ class LockComparison:
         if holder.type != new.type:
             was, now = (f"'{each.type} {each.name}'" for each in (holder, new))
         message = f"number {new.number} of {owner} belongs to {was}, not to {now}"
-        hint = f"the lock says {_shown(holder)}; call it that, or reserve the number and take a free one"
+        hint = f"the lock says {_shown(holder)}; keep that name, or reserve the number and use a free one"
         self._refuse(owner, new.name, self._span(owner, new, Part.NUMBER), message, hint, {holder})
 
     def _span(self, owner: str, entry: Entry, part: Part) -> SourceSpan:
@@ -205,7 +205,7 @@ class LockComparison:
         self, owner: str, member: str, span: SourceSpan, message: str, hint: str, entries: Iterable[Entry] = ()
     ) -> None:
         name = f"{owner}.{member}"
-        hint += f"; if it is intended, `{self._command} --accept {name}`"
+        hint += f"; if it is intended, run `{self._command} --accept {name}`"
         finding = Diagnostic(span, Code.WIRE_NUMBER_CONFLICT, message, hint)
         self.conflicts.append(Conflict(name, owner, finding, frozenset(entries)))
 

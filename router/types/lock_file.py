@@ -67,14 +67,14 @@ def read_lock(path: Path) -> Lock | None:
     except json.JSONDecodeError as error:
         span = SourceSpan(span.file, error.lineno, error.colno, error.colno + 1)
         if re.match("<{7}|={7}|>{7}", error.doc.split("\n")[error.lineno - 1]):
-            hint = "take one side; `router validate` then says how to record what the other one had"
-            raise TableError.of(span, Code.BAD_FILE, "an unresolved merge", hint) from None
+            hint = "keep one side; `router validate` then says how to record what the other side had"
+            raise TableError.of(span, Code.BAD_FILE, "unresolved merge conflict", hint) from None
         problem = error.msg
     except (OSError, ValueError, RecursionError) as error:
         problem = str(error)
     except (LookupError, TypeError, AttributeError):
-        problem = "it has another structure"
-    hint = "take the file from version control; without it nobody knows which numbers are taken"
+        problem = "its structure is different"
+    hint = "restore the file from version control: it alone records which numbers are in use"
     raise TableError.of(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)
 
 
@@ -123,7 +123,7 @@ def write_lock(path: Path, lock: Lock) -> None:
         scratch.replace(path)
     except OSError as error:
         scratch.unlink(missing_ok=True)
-        message = f"cannot be written: {error.strerror}"
+        message = f"the file cannot be written: {error.strerror}"
         raise TableError.of(SourceSpan(shown_path(path)), Code.BAD_FILE, message) from None
 
 
@@ -142,7 +142,7 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
         twice = next(key for index, (key, _) in enumerate(pairs) if key in dict(pairs[:index]))
-        raise ValueError(f"the key '{twice}' stands there twice")
+        raise ValueError(f"the key '{twice}' occurs twice")
     return content
 
 
@@ -172,7 +172,7 @@ def _range(text: str) -> tuple[int, int]:
 def _field_entries(fields: Mapping[str, str]) -> Iterator[Entry]:
     for number, declared in fields.items():
         if (found := _FIELD.fullmatch(declared)) is None:
-            raise ValueError(f"'{number}: {declared}' where number, type and name belong")
+            raise ValueError(f"'{number}: {declared}' is not a number, a type and a name")
         yield Entry(int(number), found["name"], found["type"], found["oneof"] or "")
 
 

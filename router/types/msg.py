@@ -96,7 +96,7 @@ def _one_line(*comments: str) -> str:
 
 def _refuse_second(name: str, known: Mapping[str, object], line: _Line) -> None:
     if name in known:
-        raise line.error(f"there are two '{name}'", name)
+        raise line.error(f"'{name}' is declared twice", name)
 
 
 class _Line:
@@ -122,7 +122,7 @@ class _Line:
     def constant(self) -> tuple[str, object]:
         name, _, text = (part.strip() for part in self._rest.partition("="))
         if not _CONSTANT_NAME.fullmatch(name):
-            raise self.error(f"'{name}' is no name for a constant; write it in upper case", name)
+            raise self.error(f"'{name}' is not a valid constant name; write it in upper case", name)
         type_ = PRIMITIVES.get(self._type)
         if type_ is None:
             raise self.error(f"a constant cannot be of type {self._type}", self._type)
@@ -132,7 +132,7 @@ class _Line:
         name, _, text = self._rest.partition(" ")
         text = text.strip()
         if not _FIELD_NAME.fullmatch(name):
-            raise self.error(f"'{name}' is no name for a field; ROS wants lower case", name)
+            raise self.error(f"'{name}' is not a valid field name; write it in lower case", name)
         declared = self._field_type(package)
         element = declared.element if isinstance(declared, List) else declared
         if text and isinstance(element, MessageType):
@@ -150,16 +150,16 @@ class _Line:
     def _field_type(self, package: str) -> Type:
         found = _TYPE.fullmatch(self._type)
         if found is None:
-            raise self.error(f"'{self._type}' is no type", self._type)
+            raise self.error(f"'{self._type}' is not a type", self._type)
         element = PRIMITIVES.get(found["base"])
         if isinstance(element, String):
             element = String(_number(found["string_bound"]), element.wide)
         elif found["string_bound"]:
-            raise self.error(f"'{self._type}' is no type; only strings have a bound of their own", self._type)
+            raise self.error(f"'{self._type}' is not a type; only strings have a bound", self._type)
         elif element is None:
             named = _MESSAGE_NAME.fullmatch(found["base"])
             if named is None:
-                raise self.error(f"'{self._type}' is no type", self._type)
+                raise self.error(f"'{self._type}' is not a type", self._type)
             element = MessageType(f"{named['package'] or package}/msg/{named['name']}")
         return List(element, _number(found["length"]), _number(found["bound"])) if found["array"] else element
 
@@ -186,7 +186,7 @@ def parse_value(type_: Type, text: str) -> object:
         try:
             return float(text)
         except ValueError:
-            raise ValueError(f"'{text}' is no number") from None
+            raise ValueError(f"'{text}' is not a number") from None
     if isinstance(type_, String):
         return _parse_string(type_, text)
     raise ValueError(f"a field of type {type_} takes no default value")
@@ -208,9 +208,9 @@ def _parse_integer(type_: Int, text: str) -> int:
         try:
             value = int(text, 0)
         except ValueError:
-            raise ValueError(f"'{text}' is no integer") from None
+            raise ValueError(f"'{text}' is not an integer") from None
     if not type_.low <= value <= type_.high:
-        raise ValueError(f"{text} is outside of {type_}, {type_.low} to {type_.high}")
+        raise ValueError(f"{text} is outside the range of {type_}, {type_.low} to {type_.high}")
     return value
 
 
@@ -223,20 +223,20 @@ def _parse_string(type_: String, text: str) -> str:
             text = text.replace(f"\\{quote}", quote)
             break
     if type_.bound is not None and len(text) > type_.bound:
-        raise ValueError(f"'{text}' is longer than {type_.bound}")
+        raise ValueError(f"'{text}' is longer than {type_.bound} characters")
     return text
 
 
 def _parse_list(type_: List, text: str) -> tuple[object, ...]:
     if not (len(text) > 1 and text.startswith("[") and text.endswith("]")):
-        raise ValueError(f"'{text}' is no list; write [1, 2]")
+        raise ValueError(f"'{text}' is not a list; write [1, 2]")
     inner = text[1:-1].strip()
     items = []
     at = 0
     while at < len(inner):
         element = _ELEMENT.match(inner, at)
         if element is None or not element[1]:
-            raise ValueError(f"'{text}' is no list of {type_.element}")
+            raise ValueError(f"'{text}' is not a list of {type_.element}")
         item = parse_value(type_.element, element[1].rstrip())
         items.append(item.strip() if isinstance(item, str) else item)  # even inside quotes, as rosidl_adapter does
         at = element.end()

@@ -62,7 +62,7 @@ def _meant(root: Path, blame: SourceSpan) -> str:
     beside_table = path.parent.parent / path.name  # of a table in routes/
     near = next((each for each in (nearest_path(path), beside_table) if each is not None and inputs.is_dir(each)), None)
     if near is None:
-        return "a path is relative to the table that it stands in"
+        return "paths are relative to the table"
     return f"did you mean '{Path(os.path.relpath(near, Path(inputs.real_path(blame.file)).parent)).as_posix()}'?"
 
 
@@ -76,7 +76,7 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
         raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {inputs.real_path(root)}", _meant(root, blame))
     found = {path.relative_to(root).as_posix(): path for path in walk(root) if path.suffix in (PROTO, OPTIONS)}
     if not any(name.endswith(PROTO) for name in found):
-        raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")
+        raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} contains no .proto file")
     excluded = _excluded(root, found, exclude)
     files = {}
     faults: dict[str, Sequence[Diagnostic]] = {}
@@ -84,12 +84,12 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
         if name in excluded:
             continue
         if not _FILE_NAME.fullmatch(name):
-            hint = "take letters, digits, '_', '-' and '.'"
+            hint = "use only letters, digits, '_', '-' and '.'"
             faults[name] = [Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint)]
         try:
             files[name] = inputs.read_bytes(path)
         except OSError as error:
-            message = f"cannot be read: {error.strerror}"
+            message = f"the file cannot be read: {error.strerror}"
             faults[name] = [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]
         else:
             if complaints := list(_text_findings(path, files[name])):
@@ -145,8 +145,8 @@ def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
         line = content.count(b"\n", 0, error.start) + 1
         yield Diagnostic(SourceSpan(shown_path(path), line), Code.BAD_FILE, "the file is not UTF-8")
     if path.suffix == PROTO and not _SYNTAX.search(content):  # protoc would take it for proto2
-        hint = 'begin it with `syntax = "proto3";`'
-        yield Diagnostic(SourceSpan(shown_path(path)), Code.BAD_PROTO, "the file does not say its syntax", hint)
+        hint = 'start it with `syntax = "proto3";`'
+        yield Diagnostic(SourceSpan(shown_path(path)), Code.BAD_PROTO, "the file does not declare its syntax", hint)
 
 
 _TOKEN = re.compile(
@@ -262,7 +262,7 @@ def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], 
     if len(found) > 1:
         files = " and ".join(file for file, _ in found)
         what = f"several files declare a message '{wanted}': {files}"
-        hint = "remove all but one, or give its full name if they have packages"
+        hint = "remove all but one, or write the full name if they have packages"
         raise TableError.of(message.span, Code.DUPLICATE_MESSAGE, what, hint)
     file, name = found[0]
     if (above := _folder_above(folder, file)) is not None:
@@ -278,7 +278,7 @@ def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> lis
     hint = did_you_mean(wanted.value, [name for content in folder.protos.values() for name in scan(content).messages])
     message = f"no .proto file declares a message '{wanted.value}'"
     if folder.excluded:
-        hint = f"does a file declare it that `exclude` leaves out ({', '.join(folder.excluded)})?"
+        hint = f"is it in a file that `exclude` leaves out ({', '.join(folder.excluded)})?"
     faults = [each for found in folder.faults.values() for each in found]
     return [Diagnostic(wanted.span, Code.BAD_VALUE, message, hint), *faults]
 
@@ -302,4 +302,4 @@ def _too_deep(folder: Folder, protos: Located[Path], right: Path, file: str) -> 
     message = f"`protos` is {count} too deep: {file} imports '{_imports(folder.files[file])[0]}'"
     table = Path(protos.span.file)
     shown = os.path.relpath(right, table.absolute().parent) if inputs.is_file(table) else shown_path(right)
-    return Diagnostic(protos.span, Code.BAD_VALUE, message, f"take {shown}, to which imports are relative")
+    return Diagnostic(protos.span, Code.BAD_VALUE, message, f"use {shown}, because imports are relative to it")

@@ -267,7 +267,7 @@ def _unused(proto: str, faults: Sequence[Diagnostic]) -> Diagnostic:
     """The first fault of a file that is not compiled. `proto` is "" for one that only an import leads to."""
     first = faults[0]
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    message = f"the envelope does not use this file, and it is left out: {first.message}{more}"
+    message = f"the envelope does not use this file, so it is left out: {first.message}{more}"
     hint = first.hint
     if proto:
         hint = f"{hint or 'repair it'}; or, if it is not yours, write `exclude: [{proto}]` in the table's `envelope`"

@@ -114,7 +114,7 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
         hint = _type_hint(undefined["name"], complaint.file, files)
         return Diagnostic(span, Code.BAD_PROTO, f'"{undefined["name"]}" is not defined', hint)
     if _NO_LABEL.match(complaint.message):
-        hint = 'write `optional` before the type, or say `syntax = "proto3";` if that is what the file is'
+        hint = 'write `optional` before the type, or declare `syntax = "proto3";` if the file is proto3'
         return Diagnostic(span, Code.BAD_PROTO, complaint.message.rstrip("."), hint)
     what, *advice = _SENTENCE_END.split(complaint.message, maxsplit=1)
     return Diagnostic(span, _code(complaint, text), what.rstrip("."), "".join(advice).rstrip("."))
@@ -170,8 +170,8 @@ def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
         options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
         arguments = ["protoc", *(f"--proto_path={path}" for path in include), *options, EVERYTHING]
         if status := _protoc_compiler.run_main([argument.encode() for argument in arguments]):
-            message = f"protoc accepted these files at first, and then failed with status {status}"
-            hint = "perhaps they changed meanwhile: try again"
+            message = f"protoc first accepted these files, then failed with status {status}"
+            hint = "try again: the files may have changed in the meantime"
             raise TableError.of(SourceSpan(shown_path(folder.root)), Code.BAD_PROTO, message, hint)
         compiled = FileDescriptorSet.FromString(output.read_bytes())
     del compiled.file[-1]
@@ -194,8 +194,8 @@ def _scratch(folder: Folder, names: Sequence[str]) -> Iterator[list[str]]:
         try:
             include = _include(ending.enter_context(tempfile.TemporaryDirectory()), folder, names)
         except OSError as error:
-            what = f"protoc needs a temporary folder, and none can be written to: {error.strerror}"
-            raise StartError(what, "make /tmp writable, or set TMPDIR to a folder that is") from error
+            what = f"protoc needs a temporary folder, but none is writable: {error.strerror}"
+            raise StartError(what, "make /tmp writable, or set TMPDIR to a writable folder") from error
         yield include
 
 

@@ -84,7 +84,7 @@ def _read(path: Path, package: str) -> FoundDefinition:
         span = SourceSpan(shown_path(path), error.line, error.column, error.end_column)
         raise TableError.of(span, Code.BAD_FILE, error.message) from None
     except (OSError, UnicodeDecodeError) as error:
-        finding = Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")
+        finding = Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"the file cannot be read: {error}")
         raise TableError([finding]) from None
 
 

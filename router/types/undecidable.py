@@ -24,7 +24,7 @@ def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> li
     types = all_types(envelope)
     found = [*_of_envelope(envelope, cases), *(each for descriptor in types for each in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
-        what = f"{envelope.full_name} leads to {len(types)} types of messages, and the router takes {MOST_TYPES}"
+        what = f"{envelope.full_name} leads to {len(types)} message types; the limit is {MOST_TYPES}"
         found.append((envelope.full_name, what, ""))
     return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in found]
 
@@ -41,7 +41,7 @@ def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
     for field in all_fields(descriptor):
         is_group = field.type == FieldDescriptor.TYPE_GROUP
         if is_group and not parses(container(field), delimited(field.number, b"\xff")):
-            what = f"protobuf before 7.36 takes {field.full_name}, a group, for a message"
+            what = f"protobuf before 7.36 parses {field.full_name}, a group, as a message"
             yield field.full_name, what, "make it a message"
 
 

@@ -106,7 +106,7 @@ def test_nor_does_one_that_a_reload_brings(site: Rover) -> None:
 
 
 def test_the_broadcast_address_of_an_interface_is_refused(site: Rover) -> None:
-    said = "10.78.1.255 is not the address of one machine"
+    said = "10.78.1.255 is not the address of a single machine"
     wrong = TABLE.replace("10.79.9.9", "10.78.1.255")
     path = site.table(wrong)
     refused = site.rover.inside(lambda: RouterProcess(site.folder, path))

@@ -52,7 +52,7 @@ _ABOUT_VALUES = {
     Code.LOSSY_CONVERSION,
     Code.UNKNOWN_ENUM_VALUE,
 }
-_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "which no field holds", "does not fill float")
+_ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "no field can hold both", " to float")
 
 
 def is_about_values(finding: Diagnostic) -> bool:

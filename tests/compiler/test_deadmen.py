@@ -38,8 +38,8 @@ def test_one_warning_for_each_route_that_commands_boards(check_text: CheckText) 
     )
     found = [each for each in check_text(routes, endpoints=endpoints).diagnostics if each.code is Code.NO_DEADMAN]
     assert [each.message for each in found] == [
-        "nothing stops 'board' when 'manual_drive' stops coming",
-        "nothing stops 'board' when 'manual_brake' stops coming",
+        "nothing stops 'board' when 'manual_drive' stops arriving",
+        "nothing stops 'board' when 'manual_brake' stops arriving",
     ]
 
 
@@ -127,7 +127,7 @@ def test_payload_is_made_of_constants(check_text: CheckText, value: str) -> None
     deadman = f'{{timeout: 500ms, send: {{manual_brake: {{brake: "{value}"}}}}, to: [board]}}'
     (finding,) = findings(check_text, "board", deadman)
     assert finding.code is Code.UNKNOWN_FIELD
-    assert "is no constant" in finding.message
+    assert "is not a constant" in finding.message
 
 
 @pytest.mark.parametrize(
@@ -238,5 +238,5 @@ def test_deadmen_of_one_board_know_each_other(
     table = BESIDE.format(destinations=destinations, drive=drive, arm=arm)
     found = [each for each in check_text(table, endpoints=THREE).diagnostics if each.code is Code.DOUBTFUL_DEADMAN]
     assert [each.message for each in found] == [
-        f"it would cut into commands of '{case}', which 'board' gets too" for case in places
+        f"it would interrupt commands of '{case}', which 'board' also receives" for case in places
     ]

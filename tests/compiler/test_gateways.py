@@ -331,20 +331,20 @@ TO_A_ROUTER = "mode: client, connect: [tcp/127.0.0.1:7447]"
 @pytest.mark.parametrize(
     ("zenoh", "does"),
     [
-        ("", "listens on all networks of this machine and looks for others by multicast and gossip"),
-        ("mode: router", "listens on all networks of this machine and looks for others by multicast and gossip"),
+        ("", "listens on all networks of this machine and discovers others by multicast and gossip"),
+        ("mode: router", "listens on all networks of this machine and discovers others by multicast and gossip"),
         (f"connect: [tcp/127.0.0.1:7447], {NO_GOSSIP}", "listens on all networks of this machine"),
-        (LOCATORS, "looks for others by gossip"),
-        (f"mode: router, {LOCATORS}", "looks for others by gossip"),
+        (LOCATORS, "discovers others by gossip"),
+        (f"mode: router, {LOCATORS}", "discovers others by gossip"),
         (f"{LOCATORS}, {NO_GOSSIP}", ""),
         (
             f"{LOCATORS}, config: {{scouting: {{multicast: {{enabled: true}}, gossip: {{enabled: false}}}}}}",
             "multicast",
         ),
-        ("mode: client", "looks for others by multicast"),
+        ("mode: client", "discovers others by multicast"),
         (TO_A_ROUTER, ""),
-        (f"{TO_A_ROUTER}, config: {{scouting: {{multicast: {{enabled: true}}}}}}", "looks for others by multicast"),
-        (f"{LOCATORS}, config: zenoh.json5", "looks for others by multicast"),
+        (f"{TO_A_ROUTER}, config: {{scouting: {{multicast: {{enabled: true}}}}}}", "discovers others by multicast"),
+        (f"{LOCATORS}, config: zenoh.json5", "discovers others by multicast"),
     ],
 )
 def test_what_zenoh_does_without_an_address_has_no_place_beside_networks(

@@ -160,8 +160,8 @@ def replace_by_loop(path: Path) -> None:
 FOREIGN: dict[str, tuple[Callable[[Path], None], str]] = {
     "a link": (replace_by_link, "it is a link"),
     "a link to itself": (replace_by_loop, "it is a link"),
-    "a folder": (replace_by_folder, "it is no ordinary file"),
-    "a pipe": (replace_by_pipe, "it is no ordinary file"),
+    "a folder": (replace_by_folder, "it is not a regular file"),
+    "a pipe": (replace_by_pipe, "it is not a regular file"),
     "writable by the group": (lambda path: path.chmod(0o660), "others may write to it"),
     "writable by all": (lambda path: path.chmod(0o602), "others may write to it"),
     "in a folder that all write to": (lambda path: path.parent.chmod(0o777), "others may write to its folder"),

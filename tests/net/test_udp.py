@@ -142,7 +142,7 @@ def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack)
 
 
 def test_a_broadcast_destination_is_no_machine() -> None:
-    with pytest.raises(BadAddressError, match=r"127.255.255.255 is not the address of one machine"):
+    with pytest.raises(BadAddressError, match=r"127.255.255.255 is not the address of a single machine"):
         why_unreachable(Address("127.255.255.255", 9))
 
 

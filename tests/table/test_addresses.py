@@ -102,7 +102,7 @@ def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: s
     assert moved.removeprefix("tcp/").removeprefix("udp/") in found
     assert "the networks of" in found
     assert "table.yaml:3 (127.0.0.0/8)" in found
-    assert "write one that lies there, such as" in found
+    assert "write an address inside them, such as" in found
     assert outside(tmp_path, LOCAL.replace(address, moved).replace("networks: [127.0.0.0/8]\n", "")) == []
 
 
@@ -115,7 +115,7 @@ def test_the_networks_of_an_extended_table_hold_until_others_replace_them(tmp_pa
     (tmp_path / "base.yaml").write_text(LOCAL)
     text = "extends: base.yaml\nendpoints: {camera: {address: 192.168.0.60:8, kind: tool}}\n"
     [found] = outside(tmp_path, text)
-    assert "write one that lies there" in found
+    assert "write an address inside them" in found
     assert outside(tmp_path, f"{text}networks: [127.0.0.0/8, 192.168.0.0/24]\n") == []
     assert len(outside(tmp_path, f"{text}networks: [192.168.0.0/24]\n")) == 10
 

@@ -105,32 +105,32 @@ def test_one_mistake_is_one_finding_in_its_line(
 @pytest.mark.parametrize(
     ("text", "place", "message", "hint"),
     [
-        ("r:\n  - a: 1\n  - b: 2\n  c: 3\n", (4, 3), "does not begin with '-'", "indent what belongs"),
-        ("a\uff1a{b: c, d: e}\n", (1, 2), "U+FF1A (fullwidth colon)", "write ':'"),
-        ("a: {b: c\uff0cd: e}\n", (1, 9), "U+FF0C (fullwidth comma)", "write ','"),
-        ("a: \u201cb: c\u201d\n", (1, 4), "U+201C (left double quotation mark)", "write '\"'"),
-        ("a:\n  \u2013 b\n  - c: d\n", (2, 3), "U+2013 (en dash)", "write '-'"),
+        ("r:\n  - a: 1\n  - b: 2\n  c: 3\n", (4, 3), "does not start with '-'", "indent what belongs"),
+        ("a\uff1a{b: c, d: e}\n", (1, 2), "U+FF1A (fullwidth colon)", "replace it with ':'"),
+        ("a: {b: c\uff0cd: e}\n", (1, 9), "U+FF0C (fullwidth comma)", "replace it with ','"),
+        ("a: \u201cb: c\u201d\n", (1, 4), "U+201C (left double quotation mark)", "replace it with '\"'"),
+        ("a:\n  \u2013 b\n  - c: d\n", (2, 3), "U+2013 (en dash)", "replace it with '-'"),
         ("a:\u200bb\nc: d\n", (1, 3), "U+200B (zero width space)", "remove it"),
-        ("a: {b: c: d}\n", (1, 9), "a ':' cannot stand here", "put braces around"),
+        ("a: {b: c: d}\n", (1, 9), "a ':' is not allowed here", "put braces around"),
         ("a: ['b' 'c']\n", (1, 9), "a ',' or ']' is missing before this", ""),
-        ("a: [b, c}\n", (1, 9), "a ',' or ']' is missing before this", "write ']'"),
+        ("a: [b, c}\n", (1, 9), "a ',' or ']' is missing before this", "replace it with ']'"),
         ("a: {b: {}, , c: d}\n", (1, 12), "a value is missing before this ','", "remove the ','"),
-        ("a: [\n  - b]\n", (2, 3), "an item in brackets does not begin with '-'", "remove the '-'"),
-        ("r:\n  a: {}\n b: {}\n  c: {}\n", (3, 2), "indented by 1 space, its neighbours by 2 or 0", "alike"),
-        ("a: {b: c:}\n", (1, 9), "a ':' cannot stand here", "remove it"),
-        ("a: {b: c} // d\ne: f\n", (1, 11), "a comment begins with '#'", "write '#'"),
-        ("a: b\n// c\nd: e\n", (2, 1), "a comment begins with '#'", "write '#'"),
-        ("a:\n  b: 'it's'\n", (2, 10), "the quoted text ends before this", "quotes of the other kind"),
-        ("a: [*b*, c]\n", (1, 5), "a value cannot begin with '*'", "put quotes around"),
-        ("a: !#b\n", (1, 4), "a value cannot begin with '!'", "put quotes around"),
-        ("a: > 5\n", (1, 4), "a value cannot begin with '>'", "put quotes around"),
-        ("it is old\nb: c\n", (1, 1), "a key without ':'", "begin a comment with '#'"),
-        ("<<<<<<< HEAD\na: b\n", (1, 1), "a merge conflict is not resolved", "keep one version"),
+        ("a: [\n  - b]\n", (2, 3), "an item in brackets does not start with '-'", "remove the '-'"),
+        ("r:\n  a: {}\n b: {}\n  c: {}\n", (3, 2), "indented by 1 space, its neighbours by 2 or 0", "equally"),
+        ("a: {b: c:}\n", (1, 9), "a ':' is not allowed here", "remove it"),
+        ("a: {b: c} // d\ne: f\n", (1, 11), "a comment starts with '#'", "with '#'"),
+        ("a: b\n// c\nd: e\n", (2, 1), "a comment starts with '#'", "with '#'"),
+        ("a:\n  b: 'it's'\n", (2, 10), "the quoted text ends before this", "the other kind of quotes"),
+        ("a: [*b*, c]\n", (1, 5), "a value cannot start with '*'", "put quotes around"),
+        ("a: !#b\n", (1, 4), "a value cannot start with '!'", "put quotes around"),
+        ("a: > 5\n", (1, 4), "a value cannot start with '>'", "put quotes around"),
+        ("it is old\nb: c\n", (1, 1), "a key without ':'", "start a comment with '#'"),
+        ("<<<<<<< HEAD\na: b\n", (1, 1), "unresolved merge conflict", "keep one version"),
         ("a:\n  -b\n  - c: d\n", (2, 3), "a space is missing after '-'", "'- '"),
         ("a: {b:[c]}\n", (1, 6), "a space is missing after ':'", "write `: [`"),
-        ("a : : b\n", (1, 5), "this ':' is one too many", "remove it"),
+        ("a : : b\n", (1, 5), "unexpected ':'", "remove it"),
         ("a:\n  b: [c] * 2\n", (2, 10), "the value ends before this", "quote the whole expression"),
-        ("a: {b: c},\nd: e\n", (1, 10), "this ',' is one too many", "remove it"),
+        ("a: {b: c},\nd: e\n", (1, 10), "unexpected ','", "remove it"),
     ],
 )  # fmt: skip
 def test_a_syntax_error_names_the_mistake_and_the_remedy(
@@ -159,7 +159,7 @@ def test_deep_nesting_is_one_finding(tmp_path: Path, text: str) -> None:
     root, [finding] = composed(tmp_path, text)
     assert root is None
     assert finding.code is Code.BAD_YAML
-    assert "nested more than 32 deep" in finding.message
+    assert "nested more than 32 levels deep" in finding.message
 
 
 def test_an_alias_bomb_is_one_finding(tmp_path: Path) -> None:
@@ -233,4 +233,4 @@ def test_a_word_that_ends_with_a_comma_is_one_only_within_brackets(value: str, t
 @pytest.mark.parametrize("character", ["\u00a0", "\u2009", "\u200b"])
 def test_a_character_in_a_key_that_looks_like_a_space_is_named(character: str, tmp_path: Path) -> None:
     _, findings = composed(tmp_path, f"{{a:{character}b, c: d}}")
-    assert [each.message for each in findings] == [f"the character U+{ord(character):04X} stands in this key"]
+    assert [each.message for each in findings] == [f"this key contains the character U+{ord(character):04X}"]

@@ -99,7 +99,7 @@ def test_a_file_for_zenoh_is_beside_the_table_that_names_it(tmp_path: Path) -> N
     assert "secret" not in repr(found)
 
 
-@pytest.mark.parametrize(("name", "why"), [("none", "no such file"), (".", "no ordinary file"), ("latin", "UTF-8")])
+@pytest.mark.parametrize(("name", "why"), [("none", "no such file"), (".", "not a regular file"), ("latin", "UTF-8")])
 def test_a_file_for_zenoh_that_cannot_be_read_is_blamed_on_the_line_that_names_it(
     tmp_path: Path, name: str, why: str
 ) -> None:

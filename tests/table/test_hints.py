@@ -34,27 +34,27 @@ def findings(folder: Path, *edits: tuple[str, str]) -> list[tuple[str, str]]:
         ("exclude: [\"/rover/camera/**\"]", "exclude: \"/**\"", "write `exclude: [/**]`"),
         ("ph_info: {ignore: nobody needs it}", "ph_info: ignore", "write `ph_info: {ignore: why}`"),
         ("ph_info: {ignore: nobody needs it}", "ph_info: {enabled: false}",
-         "what is out of use has the one key `ignore: why`"),
+         "to disable it, write only `ignore: why`"),
         ("{address: 192.168.0.30:8, kind", "{address: 192.168.0.30, port: 8, kind",
-         "an address is IP and port in one: `address: 192.168.0.30:8`"),
-        ("    priority: command\n", "    description: by hand\n", "what is for people stands in a comment: `# ...`"),
+         "write the IP address and port together: `address: 192.168.0.30:8`"),
+        ("    priority: command\n", "    description: by hand\n", "write descriptions as comments: `# ...`"),
         ("deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: \"'router'\"}}, ",
          "deadman: {timeout: 300 ms, manual_brake: {brake: true}, ",
-         "a payload case stands under 'send': `send: {manual_brake: ...}`"),
+         "put a payload case under 'send': `send: {manual_brake: ...}`"),
         ("deadman: {none: nothing moves because of it}", "deadman: {none: true}", ""),
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]", "{basestation: {max_rate: 5}}",
          "write a list: [{endpoint: basestation, ...}]"),
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]",
-         "{endpoint: basestation, ttl: 1 s}", "that is a key of: route, inbound"),
+         "{endpoint: basestation, ttl: 1 s}", "it belongs in: route, inbound"),
         ("orientation_covariance: [-1, 0, accel_y]", "orientation_covariance: [[-1, 0], [0, 1]]",
-         "write one list of 4, row after row"),
+         "write one list of 4 values, row by row"),
         ("qos: {profile: sensor_data, depth: 5, deadline: 500ms}", "qos: best_effort",
          "write `qos: {reliability: best_effort}`"),
         ("qos: {profile: sensor_data, depth: 5, deadline: 500ms}", "latched: true",
          "write `qos: {durability: transient_local}`"),
         ("linear_acceleration: {x: accel_x, y: 9.81}", "linear_acceleration: {x accel_x}",
          "a ':' is missing, write `x: accel_x`"),
-        ("accel_x, y: 9.81}", "{map: state, OK, else: 0}}", "say what it becomes: `OK: VALUE`"),
+        ("accel_x, y: 9.81}", "{map: state, OK, else: 0}}", "add its value: `OK: VALUE`"),
         ("{protos: ../protos, message: PBEnvelope, oneof", "{protos:../protos, message: PBEnvelope, oneof",
          "a space is missing after ':', write `protos: ../protos`"),
         ("protos: ../protos", "protos: $PROTOS", 'write "${PROTOS}"'),
@@ -88,7 +88,7 @@ def test_what_stands_beside_an_empty_key_has_no_findings_of_its_own(
             "          orientation_covariance: [-1, 0, accel_y]\n")  # fmt: skip
     [(message, hint)] = findings(tmp_path, (rest, ""), (written, instead))
     assert message.startswith(empty)
-    assert hint == "indent what belongs to it further than it"
+    assert hint == "indent its keys below it"
 
 
 def test_a_misspelt_name_of_the_extended_table_is_named(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_what_is_no_file_is_one_finding(tmp_path: Path, monkeypatch: pytest.Monk
     assert "folder" in found["."].message
     assert "too long" in found["x" * 300].message
     assert "not a directory" in refused(Path(__file__) / "nope.yaml").message
-    assert all("no ordinary file" in found[path].message for path in ("pipe", os.devnull))
+    assert all("not a regular file" in found[path].message for path in ("pipe", os.devnull))
     assert "no such file" in found["nope.yaml"].message
     assert str(tmp_path) in found["nope.yaml"].hint, "where a relative path begins"
     assert refused(tmp_path / "nope.yaml").hint == ""

@@ -348,7 +348,7 @@ def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_
 def test_a_broadcast_address_is_a_problem(table: Path) -> None:
     rewritten(table, "127.0.0.30:8", "127.255.255.255:8")
     [found] = before_start(table, {})
-    text = "sensor_board: 127.255.255.255 is not the address of one machine"
+    text = "sensor_board: 127.255.255.255 is not the address of a single machine"
     assert found == (Grade.PROBLEM, "endpoints", text, "broadcast and multicast are not supported")
 
 

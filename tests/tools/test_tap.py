@@ -34,7 +34,9 @@ def test_repairs_are_told(wire: Wire) -> None:
 
 def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> None:
     told = tapped_datagram(0, "127.0.0.1:5", b"\xff\xff", wire)
-    assert told.line(with_hex=False).split(" ", 1)[1] == "127.0.0.1:5 undecodable (malformed: no PBEnvelope): ffff"
+    assert told.line(with_hex=False).split(" ", 1)[1] == (
+        "127.0.0.1:5 undecodable (malformed: does not parse as PBEnvelope): ffff"
+    )
     assert json.loads(told.json(with_hex=False))["hex"] == "ffff"
 
 

@@ -30,14 +30,17 @@ def test_later_lines_win_and_a_field_wins_over_its_message(tmp_path: Path) -> No
     ("line", "finding"),
     [
         ("A.x", "no option after the name; write for example 'max_size:16'"),
-        ("A.x 16", "'16' is no option of nanopb; write for example 'max_size:16'"),
-        ("A.x max_size:", "'max_size:' is no option of nanopb; write for example 'max_size:16'"),
+        ("A.x 16", "'16' is not a nanopb option; write for example 'max_size:16'"),
+        ("A.x max_size:", "'max_size:' is not a nanopb option; write for example 'max_size:16'"),
         ("A.x max_size:many", "max_size cannot be 'many'"),
         ("A.x max_size:-1", "max_size cannot be '-1'"),
         ("A.x fixed_count:3", "fixed_count cannot be '3'"),
         ("A.x type:FT_STATC", "type cannot be 'FT_STATC'"),
-        ("A.x max_szie:3", "the router cannot tell sizes with nanopb's option 'max_szie'; did you mean 'max_size'?"),
-        ("A.x no_unions:true", "the router cannot tell sizes with nanopb's option 'no_unions'"),
+        (
+            "A.x max_szie:3",
+            "the router cannot compute sizes with the nanopb option 'max_szie'; did you mean 'max_size'?",
+        ),
+        ("A.x no_unions:true", "the router cannot compute sizes with the nanopb option 'no_unions'"),
     ],
 )
 def test_line_that_cannot_be_understood_is_a_finding(tmp_path: Path, line: str, finding: str) -> None:
@@ -205,6 +208,6 @@ def test_field_held_by_callback_and_recursion_are_findings(load: Load) -> None:
     schema = load({"parts.proto": text, "parts.options": "Part.name max_size:3\nParts.raw max_size:3 type:FT_CALLBACK"})
     findings = board_findings(find_envelope(schema, ONEOF).cases["parts"], schema, 1000, SPAN)
     assert [finding.message for finding in findings] == [
-        "a board cannot take parts.first.more: it contains itself",
-        "a board cannot take parts.raw: it is held by pointer or callback",
+        "a board cannot decode parts.first.more: it contains itself",
+        "a board cannot decode parts.raw: it is stored by pointer or callback",
     ]

@@ -82,21 +82,21 @@ def said(findings: Sequence[Diagnostic]) -> list[str]:
             "State state = 2", "repeated State state = 2",
             "motor.proto:10:12: error[wire-number-conflict]: Motor.state is of type repeated enum State instead of "
             "enum State; the lock says `enum State state = 2`; to change it, reserve 2 and add a field; "
-            "if it is intended, `router schema lock --protos . --accept Motor.state`",
+            "if it is intended, run `router schema lock --protos . --accept Motor.state`",
             id="repeated",
         ),
         pytest.param(
             "float rpm = 1", "float speed = 1",
             "motor.proto:9:17: error[wire-number-conflict]: number 1 of Motor belongs to 'rpm', not to 'speed'; "
-            "the lock says `float rpm = 1`; call it that, or reserve the number and take a free one; "
-            "if it is intended, `router schema lock --protos . --accept Motor.speed`",
+            "the lock says `float rpm = 1`; keep that name, or reserve the number and use a free one; "
+            "if it is intended, run `router schema lock --protos . --accept Motor.speed`",
             id="renamed",
         ),
         pytest.param(
             "  BUSY = 1;\n", "",
-            "motor.proto:3:6: error[wire-number-conflict]: number 1 of State, which was 'BUSY', is free to be reused; "
+            "motor.proto:3:6: error[wire-number-conflict]: number 1 of State, formerly 'BUSY', is not reserved; "
             "the lock says `BUSY = 1`; write `reserved 1;` there; "
-            "if it is intended, `router schema lock --protos . --accept State.BUSY`",
+            "if it is intended, run `router schema lock --protos . --accept State.BUSY`",
             id="enum value removed",
         ),
     ],
@@ -140,8 +140,8 @@ def test_number_stays_taken_after_its_reservation_is_gone(record: Record, compar
 @pytest.mark.parametrize(
     ("old", "reserved", "new", "error"),
     [
-        ("float voltage = 3;", "reserved 7, 9 to 12;", "bool on = 10;", "number 10 of Motor is reserved, and"),
-        ("BUSY = 1;", "reserved 5;", "DONE = 5;", "number 5 of State is reserved, and given to 'DONE'"),
+        ("float voltage = 3;", "reserved 7, 9 to 12;", "bool on = 10;", "number 10 of Motor is reserved, but"),
+        ("BUSY = 1;", "reserved 5;", "DONE = 5;", "number 5 of State is reserved, but used for 'DONE'"),
     ],
 )
 def test_number_that_was_reserved_before_the_first_lock_stays_taken(
@@ -215,17 +215,17 @@ message Envelope { oneof payload { Motor motor = 1; } }
     [
         (
             "oneof a { bool x = 1; bool y = 2; }", "oneof b { bool x = 1; bool y = 2; }",
-            ["warning the lock has Motor.a for what is Motor.b now"],
+            ["warning the lock still has Motor.b as Motor.a"],
         ),
         (
             "oneof a { bool x = 1; bool y = 2; }", "oneof b { bool x = 1; } oneof c { bool y = 2; }",
             ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
-             "warning the lock has Motor.a for what is Motor.b now"],
+             "warning the lock still has Motor.b as Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof c { bool x = 1; bool y = 2; }",
             ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
-             "warning the lock has Motor.a for what is Motor.c now"],
+             "warning the lock still has Motor.c as Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof b { bool x = 1; } oneof a { bool y = 2; }",
@@ -236,7 +236,7 @@ message Envelope { oneof payload { Motor motor = 1; } }
             "oneof a { bool x = 1; } bool y = 2;", "bool x = 1; oneof a { bool y = 2; bool z = 3; }",
             ["error Motor.x is in no oneof instead of in the oneof 'a'",
              "error Motor.y is in the oneof 'a' instead of in no oneof",
-             "warning the lock does not know Motor.z"],
+             "warning Motor.z is not in the lock"],
         ),
         ("bool x = 1;", "optional bool x = 1;", []),  # which protoc makes a oneof of
     ],
@@ -279,8 +279,8 @@ def test_number_of_what_came_back_under_another_stays_taken(record: Record, comp
         "error number 1 of Motor belongs to 'float rpm', not to 'bool on'",
     ]
     assert said(compare(back.replace("reserved 1;", "")).findings()) == [
-        "error number 1 of State, which was 'BUSY', is free to be reused",
-        "error number 1 of Motor, which was 'rpm', is free to be reused",
+        "error number 1 of State, formerly 'BUSY', is not reserved",
+        "error number 1 of Motor, formerly 'rpm', is not reserved",
     ]
 
 
@@ -290,8 +290,8 @@ def test_unresolved_merge_of_the_lock_says_so(record: Record, compare: Compare) 
     path.write_text(path.read_text().replace('        "2":', '<<<<<<< HEAD\n        "2":'))
     (finding,) = compare(PROTO).findings()
     assert str(finding) == (
-        "envelope.lock.json:18:1: error[bad-file]: an unresolved merge; "
-        "take one side; `router validate` then says how to record what the other one had"
+        "envelope.lock.json:18:1: error[bad-file]: unresolved merge conflict; "
+        "keep one side; `router validate` then says how to record what the other side had"
     )
 
 

@@ -13,7 +13,7 @@ from tests.types.conftest import Refused, Write, refusal, settings
 
 
 def test_folder_without_protos_is_a_finding(write: Write) -> None:
-    with pytest.raises(TableError, match=r"holds no \.proto file"):
+    with pytest.raises(TableError, match=r"contains no \.proto file"):
         load_protos(*settings(write({"readme.txt": "nothing here"})))
 
 
@@ -49,7 +49,7 @@ def test_file_that_protoc_cannot_import_is_a_finding(refused: Refused, name: str
 @pytest.mark.parametrize("text", ["", "message A {}", "// syntax = nothing\nmessage A {}"])
 def test_proto_without_syntax_is_a_finding(refused: Refused, text: str) -> None:
     assert [str(finding) for finding in refused({"a.proto": text})] == [
-        'a.proto:1:1: error[bad-proto]: the file does not say its syntax; begin it with `syntax = "proto3";`'
+        'a.proto:1:1: error[bad-proto]: the file does not declare its syntax; start it with `syntax = "proto3";`'
     ]
 
 

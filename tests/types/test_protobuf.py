@@ -147,7 +147,7 @@ STRAY = {
 @pytest.mark.parametrize(("stray", "warning"), STRAY.values(), ids=STRAY.keys())
 def test_file_that_the_envelope_does_not_import_is_a_warning(write: Write, stray: str, warning: str) -> None:
     schema = load_protos(*settings(write({"a.proto": ENVELOPE, "b.proto": f'syntax = "proto3";\n{stray}'})))
-    said = "the envelope does not use this file, and it is left out"
+    said = "the envelope does not use this file, so it is left out"
     (found,) = schema.warnings
     hint, _, otherwise = found.hint.partition("; or, ")
     assert str(replace(found, hint=hint.removesuffix("repair it"))) == warning.format(said)
@@ -186,7 +186,7 @@ def test_excluded_files_and_folders_are_as_if_they_were_not_there(write: Write) 
         ),
         (
             "a.proto", Code.BAD_VALUE, 3, "no .proto file declares a message 'Envelope'",
-            "does a file declare it that `exclude` leaves out (a.proto)?",
+            "is it in a file that `exclude` leaves out (a.proto)?",
         ),
         ("b.proto", Code.BAD_FILE, 5, ". has no file or folder 'b.proto' to exclude", "did you mean 'c/b.proto'?"),
     ],
@@ -301,7 +301,7 @@ def test_of_two_files_that_declare_the_envelope_the_locked_one_counts(
     (finding,) = refusal(root, message)
     assert str(finding) == (
         "table.yaml:3:12: error[duplicate-message]: several files declare a message 'Envelope': a.proto and b.proto; "
-        "remove all but one, or give its full name if they have packages"
+        "remove all but one, or write the full name if they have packages"
     )
 
 
@@ -315,16 +315,16 @@ DEEP = {
 @pytest.mark.parametrize(
     ("folder", "said"),
     [
-        ("protos/rover", "`protos` is one folder too deep: common/envelope.proto imports 'rover/imu/imu.proto'; take"),
-        ("protos/rover/common", "`protos` is two folders too deep: envelope.proto imports 'rover/imu/imu.proto'; take"),
-        ("protos/rover/imu", "`protos` is two folders too deep: imu.proto imports 'rover/imu/axis.proto'; take"),
+        ("protos/rover", "`protos` is one folder too deep: common/envelope.proto imports 'rover/imu/imu.proto'; use"),
+        ("protos/rover/common", "`protos` is two folders too deep: envelope.proto imports 'rover/imu/imu.proto'; use"),
+        ("protos/rover/imu", "`protos` is two folders too deep: imu.proto imports 'rover/imu/axis.proto'; use"),
     ],
 )
 def test_wrong_folder_of_protos_is_said_to_be_it(write: Write, folder: str, said: str) -> None:
     root = write({f"protos/{name}": text for name, text in DEEP.items()})
     (finding,) = refusal(root / folder)
     assert (finding.code, finding.span.line) == (Code.BAD_VALUE, 2)
-    assert f"{finding.message}; {finding.hint}".startswith(f"{said} protos, to which imports are relative")
+    assert f"{finding.message}; {finding.hint}".startswith(f"{said} protos, because imports are relative to it")
     load_protos(*settings(root / "protos"))
 
 

@@ -29,7 +29,7 @@ def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, m
         (root / "a.proto").write_text("message")
 
     monkeypatch.setattr("router.types.protoc._protoc_compiler.get_protos", break_off)  # the first look
-    with pytest.raises(TableError, match=r"perhaps they changed meanwhile: try again"):
+    with pytest.raises(TableError, match=r"try again: the files may have changed in the meantime"):
         load_protos(*settings(root))
 
 
@@ -40,9 +40,9 @@ def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch:
         raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/']")
 
     monkeypatch.setattr("router.types.protoc.tempfile.TemporaryDirectory", refuse)
-    with pytest.raises(StartError, match=r"none can be written to: No usable temporary directory") as refused:
+    with pytest.raises(StartError, match=r"none is writable: No usable temporary directory") as refused:
         load_protos(*settings(root))
-    assert refused.value.hint == "make /tmp writable, or set TMPDIR to a folder that is"
+    assert refused.value.hint == "make /tmp writable, or set TMPDIR to a writable folder"
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def test_unknown_name_is_none(interfaces: Interfaces, name: str) -> None:
 @pytest.mark.parametrize(
     ("text", "code", "place", "message"),
     [
-        ("float32 x\nfloatt y", Code.BAD_FILE, (2, 1, 7), "'floatt' is no type"),
+        ("float32 x\nfloatt y", Code.BAD_FILE, (2, 1, 7), "'floatt' is not a type"),
         ("float32 x\nNothing y", Code.UNKNOWN_ROS_TYPE, (2, 1, 1), "there is no ROS message type 'p/msg/Nothing'"),
         ("A x", Code.BAD_FILE, (1, 1, 1), "p/msg/A contains itself: p/msg/A > p/msg/A"),
         ("\nB x", Code.BAD_FILE, (1, 1, 1), "p/msg/A contains itself: p/msg/A > p/msg/B > p/msg/A"),

@@ -23,7 +23,9 @@ def called_name(node: ast.Call, text: Parsed) -> str:
         known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
         known = "write has(x)" if name == HAS else known
         hint = known or did_you_mean("", FUNCTIONS)
-        raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
+        raise ExpressionError(
+            text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only the listed functions can be called", hint
+        )
     if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
         message = f"{node.func.id}() takes its arguments by position"
         hint = f"write {FUNCTIONS[node.func.id].signature}" if node.func.id in FUNCTIONS else ""
@@ -81,7 +83,7 @@ def _parameters(function: Function, count: int) -> list[Parameter]:
 
 def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Node]:
     if not isinstance(expected, Int):
-        message = f"{function.name}() needs bounds here, where no integer field is filled"
+        message = f"{function.name}() needs bounds here, because it fills no integer field"
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
     return [whole(expected.low, span), whole(expected.high, span)]
 

@@ -101,7 +101,7 @@ def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> N
         return constant(scope.message.constants[name.value], name.span)
     checked = check(Expression(name.value, TextPlace(name.span)), scope)
     if constant_of(checked) is None:
-        message = f"'{name.value}' is no constant"
+        message = f"'{name.value}' is not a constant"
         raise ExpressionError(name.span, Code.TYPE_MISMATCH, message, "the keys of a map are values, not fields")
     return checked
 
@@ -127,14 +127,14 @@ def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
 
 def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
     """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
-    hint = "list them, or say what they become: `else: VALUE`"
+    hint = "list them, or add `else: VALUE`"
     covered = {constant_of(key) for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
         return
     if is_source(subject) and scope.sources and covered == {*scope.sources}:
         return
     if not isinstance(subject.kind, EnumKind):
-        message = f"{subject.kind} has more values than those of this map"
+        message = f"the map does not cover all values of {subject.kind}"
         raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
     missing = [name for name, number in subject.kind.enum.values if number not in covered]
     if missing:

@@ -67,7 +67,7 @@ def _to_int(convert: Callable[[float], int], x: float) -> int:
     if isinstance(x, int):
         return x
     if not math.isfinite(x):
-        raise NonFiniteError(f"{x} is no integer")
+        raise NonFiniteError(f"{x} is not an integer")
     return _within_64_bits(convert(x))
 
 
@@ -157,7 +157,7 @@ def _rounded(compute: Callable[[float], int]) -> Rule:
             return replace(INT64, is_rounded=True)
         low, high = map(compute, kind.limits)
         if low > INT64.high or high < INT64.low:
-            raise ValueError(f"no integer of 64 bits is between {kind.low} and {kind.high}")
+            raise ValueError(f"no 64-bit integer is between {kind.low} and {kind.high}")
         return IntKind(max(low, INT64.low), min(high, INT64.high), is_rounded=True)
 
     return result
@@ -238,7 +238,7 @@ def _between(bounds: Sequence[IntKind]) -> IntKind:
     """From the lowest to the highest of these."""
     low, high = min(bound.low for bound in bounds), max(bound.high for bound in bounds)
     if low < 0 and high > INT64.high:
-        raise ValueError(f"the bounds go from {low} to {high}, which is more than 64 bits hold")
+        raise ValueError(f"the bounds {low} to {high} do not fit 64 bits")
     return IntKind(low, high)
 
 
@@ -250,7 +250,7 @@ def _want_ordered(low: IntKind, high: IntKind) -> None:
 def _written(nodes: Sequence[Node]) -> Kind:
     digits = constant_of(nodes[1])
     if not isinstance(digits, int) or isinstance(digits, bool) or not 0 <= digits <= MOST_DIGITS:
-        raise ValueError(f"the number of decimals is a literal from 0 to {MOST_DIGITS}")
+        raise ValueError(f"the number of decimals must be a literal from 0 to {MOST_DIGITS}")
     return StringKind()
 
 
@@ -315,34 +315,33 @@ def _real(
 _DECLARED = (
     Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
     Function("min", (_number("a"), _number("b")), _extreme(min), min,
-             "The smallest argument, or the smallest element of a list. An empty list has none, and the target is "
+             "The smallest argument, or the smallest element of a list. An empty list has none: the message is "
              "dropped.",
              (("min(2, 1.5)", 1.5), ("min([3, 1, 2])", 1)), variadic=True, gives_an_argument=True,
              of_list=_extreme_of_list),
     Function("max", (_number("a"), _number("b")), _extreme(max), max,
-             "The largest argument, or the largest element of a list, likewise.",
+             "The largest argument, or the largest element of a list; an empty list drops the message.",
              (("max(2, 3, 1)", 3), ("max([0.5, 2])", 2.0)), variadic=True, gives_an_argument=True,
              of_list=_extreme_of_list),
     Function("sum", (Parameter("x", (), "a list of numbers"),), _double, sum,
-             "The sum of a list, added in order; 0 of an empty one.", (("sum([1, 2, 3])", 6), ("sum([1, 0.5])", 1.5)),
+             "The sum of a list, added in order; 0 for an empty list.", (("sum([1, 2, 3])", 6), ("sum([1, 0.5])", 1.5)),
              of_list=_sum_of_list),
     Function("round", (_number(),), _rounded(round), round_half_even,
-             "The nearest integer, the even one of two. NaN, infinities and what 64 bits do not hold drop the target.",
+             "The nearest integer; of two, the even one. NaN, infinities and results beyond 64 bits drop the message.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
-    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The integer towards zero.",
+    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The next integer towards zero.",
              (("trunc(-2.7)", -2),)),
-    Function("floor", (_number(),), _rounded(math.floor), floor, "The integer at or below.", (("floor(-2.5)", -3),)),
-    Function("ceil", (_number(),), _rounded(math.ceil), ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
+    Function("floor", (_number(),), _rounded(math.floor), floor, "The largest integer <= x.", (("floor(-2.5)", -3),)),
+    Function("ceil", (_number(),), _rounded(math.ceil), ceil, "The smallest integer >= x.", (("ceil(2.1)", 3),)),
     Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
-             "The number, held between two bounds; without bounds, those of the integer field that it fills.",
+             "The number limited to two bounds, by default those of the integer field that it fills.",
              (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2, gives_an_argument=True),
     Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped, wrap,
-             "The integer, counted on from the low bound when it passes the high one; without bounds, those of "
-             "the integer field that it fills.",
+             "The integer wrapped around between two bounds, by default those of the integer field that it fills.",
              (("wrap(256, 0, 255)", 0), ("wrap(-1, 0, 255)", 255), ("wrap(190, -180, 179)", -170)), optional=2),
     _real(math.radians, "Degrees to radians.", ("radians(180)", math.pi)),
     _real(math.degrees, "Radians to degrees.", ("degrees(0.0)", 0.0)),
-    _real(math.sqrt, "The square root; of a negative number there is none, and the target is dropped.",
+    _real(math.sqrt, "The square root. A negative number has none: the message is dropped.",
           ("sqrt(9)", 3.0)),
     _real(math.sin, "The sine of an angle in radians.", ("sin(0)", 0.0)),
     _real(math.cos, "The cosine of an angle in radians.", ("cos(0)", 1.0)),
@@ -351,28 +350,28 @@ _DECLARED = (
           names=("y", "x")),
     _real(hypot, "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), names=("x", "y")),
     Function("float32", (_number(),), _always(FloatKind(32)), to_float32,
-             "Says that a double, or a large integer, may lose digits in a float32.", (("float32(0.5)", 0.5),)),
+             "The number as a float32; digits of a double or a large integer may be lost.", (("float32(0.5)", 0.5),)),
     Function("float64", (_number(),), _always(FloatKind(64)), float,
-             "Says that a large integer may lose digits in a double.", (("float64(3)", 3.0),)),
+             "The number as a double; digits of a large integer may be lost.", (("float64(3)", 3.0),)),
     Function("int", (Parameter("x", (BoolKind, IntKind, EnumKind), "a bool, an integer or an enum"),),
              _integer_or_bool, int, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
     Function("str", (Parameter("x", (BoolKind, IntKind, EnumKind, StringKind), "an integer, an enum, a bool or text"),),
-             _always(StringKind()), str, "An integer, the number of an enum, True or False, as text.",
+             _always(StringKind()), str, "An integer, the number of an enum, or a bool (True, False) as text.",
              (("'wheel_' + str(3)", "wheel_3"),)),
     Function("text", (Parameter("x", Number, "a number", becomes=FloatKind(64)), _whole("digits")), _written, fixed,
-             "A number as text, with this many decimals, 0 to 17, which are a literal.",
+             "A number as text with `digits` decimals, a literal from 0 to 17.",
              (("text(2.675, 1)", "2.7"), ("text(3, 2)", "3.00"))),
     Function("strip", (Parameter("x", (StringKind,), "a string"),), _always(StringKind()), strip,
-             "Text without the NULs and blanks at both of its ends: spaces, tabs, ends of lines. Firmware fills "
-             "texts of fixed length with NULs, and a ROS string holds none.",
+             "Text without NULs, spaces, tabs and line ends at its start and end. Firmware pads text of fixed "
+             "length with NULs, which a ROS string cannot contain.",
              (("strip('  left ')", "left"), ("strip('a b')", "a b"))),
     Function("len", (Parameter("x", (StringKind,), "a list, a string or bytes"),), _always(UINT32),
-             len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),),
+             len, "The number of elements of a list or bytes, or of characters of a string.", (("len([1, 2])", 2),),
              of_list=lambda _: UINT32),
     Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)), seconds,
              "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
     Function("time_from_seconds", (_number(),), _always(TimeKind()), time_from_seconds,
-             "Seconds since 1970 as a time, which has 64 bits in nanoseconds.",
+             "Seconds since 1970 as a time, in 64-bit nanoseconds.",
              (("time_from_seconds(2)", 2_000_000_000),)),
     Function("time_from_milliseconds", (_number(),), _always(TimeKind()), time_from_milliseconds,
              "Milliseconds since 1970 as a time, likewise.",

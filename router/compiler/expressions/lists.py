@@ -38,11 +38,11 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
     """`holder[index]`."""
     element, length, position = element_of(holder.kind), length_of(holder.kind), constant_of(index)
     if element is None:
-        raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {holder.kind} has no elements", "only lists are indexed")
+        raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {holder.kind} has no elements", "only lists can be indexed")
     if not isinstance(position, int) or isinstance(position, bool) or position < 0:
-        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
+        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index must be a literal integer, 0 or greater")
     if length is not None and position >= length:
-        raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} of {length} elements")
+        raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} is out of range for {length} elements")
     if isinstance(holder, Listed) and isinstance(element, MessageKind):
         return holder.items[position]
     return Element(element, span, as_value(holder, scope), position)
@@ -81,8 +81,8 @@ def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
     """The length of all these lists, None if none is known."""
     lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
     if len(lengths) > 1:
-        message = f"lists of {' and '.join(map(str, lengths))} elements cannot go side by side"
-        hint = "give them one length"
+        message = f"lists of {' and '.join(map(str, lengths))} elements cannot be combined"
+        hint = "give them the same length"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return lengths[0] if lengths else None
 
@@ -91,7 +91,7 @@ def _want_known_lengths(lists: Sequence[Node]) -> None:
     """Refuse a list of any length beside a literal."""
     for each in lists:
         if length_of(each.kind) is None:
-            message = "only a list of known length can stand beside a list literal"
+            message = "only a list of known length can be combined with a list literal"
             hint = "index it, as in [a * x[0], b * x[1]]"
             raise ExpressionError(each.span, Code.TYPE_MISMATCH, message, hint)
 

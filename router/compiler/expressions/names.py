@@ -71,12 +71,12 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
         return _no_constant(text, span, _of_an_enum(text, scope, expected), expected)
     if isinstance(expected, String):
         close = one_of(_ways(scope, (text,))) or (f"did you mean '{near}'?" if (near := nearest(text, known)) else "")
-        hint = f"{close} as text it is {{text: {text}}}".strip()
+        hint = f"{close} for text, write {{text: {text}}}".strip()
         return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
     hint = (
         _of_an_enum(text, scope, expected)
         or spellings.NAMES.get(text.lower())
-        or (f"an endpoint's name is text: '{text}'" if text in scope.sources else "")
+        or (f"quote the name of an endpoint: '{text}'" if text in scope.sources else "")
         or _presence(text, scope)
         or (one_of(_ways(scope, (text,))) if not nearest(text, known, _MISSPELT) else "")
         or did_you_mean(text, known)
@@ -105,9 +105,12 @@ def _presence(text: str, scope: Scope) -> str:
 def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) -> ExpressionError:
     """For a name in a message of constants."""
     example = f"{expected}.{expected.values[0][0]}" if isinstance(expected, Enum) else "0"
-    message = f"'{text}' is no constant"
+    message = f"'{text}' is not a constant"
     return ExpressionError(
-        span, Code.UNKNOWN_FIELD, message, hint or f"a deadman sends constants, such as {example}, and reads no message"
+        span,
+        Code.UNKNOWN_FIELD,
+        message,
+        hint or f"a deadman sends constants, such as {example}, and cannot read a message",
     )
 
 
@@ -146,7 +149,7 @@ def want_senders(operands: Sequence[Node], scope: Scope) -> None:
     ):
         name = constant_of(each)
         if isinstance(name, str) and name not in scope.sources:
-            message = f"'{name}' is no source of this route"
+            message = f"'{name}' is not a source of this route"
             raise ExpressionError(each.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, scope.sources))
 
 
@@ -176,17 +179,17 @@ def is_null(node: ast.expr, scope: Scope) -> bool:
 
 def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -> ExpressionError:
     """For a comparison of `written` with null."""
-    hint = f"'{written}' is always there"
+    hint = f"'{written}' is always present"
     if isinstance(compared, Read) and compared.field.has_presence:
         hint = f"write `{'not ' * is_equal}has({written})`"
     elif not isinstance(compared.kind, MessageKind):
-        hint += ": one that is left out has its default"
+        hint += ": an omitted field has its default"
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, "expressions have no null", hint)
 
 
 _OF_OTHERS = {
     ListKind: "only messages have fields: name an element, as in x[0].y",
-    TimeKind: "seconds(x) makes a number of a time",
+    TimeKind: "convert a time with seconds(x)",
 }
 
 
@@ -211,7 +214,7 @@ def _of_elements(kind: Kind, node: ast.Attribute) -> str:
     element = kind.element if isinstance(kind, ListKind) else None
     if not isinstance(element, MessageKind) or element.type.field(node.attr) is None:
         return ""
-    return f"its elements have one: did you mean '{ast.unparse(node.value)}[0].{node.attr}'?"
+    return f"its elements do: did you mean '{ast.unparse(node.value)}[0].{node.attr}'?"
 
 
 def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str]:
@@ -247,7 +250,7 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, hint)
     if len({value for _, value in found}) > 1:
         names = ", ".join(sorted(holder.name for holder, _ in found))
-        message = f"'{holder_name}.{node.attr}' may be of {names}"
+        message = f"'{holder_name}.{node.attr}' is ambiguous between {names}"
         raise ExpressionError(text.span(node), Code.UNKNOWN_ENUM_VALUE, message, "write the enum's full name")
     holder, value = found[0]
     literal = constant(value, text.span(node))
@@ -301,6 +304,6 @@ def presence(argument: Node, path: tuple[str, ...], span: SourceSpan) -> Present
     if not isinstance(argument, Read) and len(path) > 1:
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
     if not isinstance(argument, Read) or not argument.field.has_presence:
-        hint = "has() is for a payload's submessages and optional fields"
-        raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
+        hint = "use has() for submessages and optional fields of a payload"
+        raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always present", hint)
     return Present(BoolKind(), span, argument.holder, argument.field)

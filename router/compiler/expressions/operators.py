@@ -62,7 +62,7 @@ def constant(value: object, span: SourceSpan) -> Constant:
             return Constant(integer([value], span)[0], span, value)
         case float():
             if not math.isfinite(value):
-                raise ExpressionError(span, Code.OUT_OF_RANGE, "a literal this large is infinite")
+                raise ExpressionError(span, Code.OUT_OF_RANGE, "this literal is too large for a float64")
             return Constant(FloatKind(32), span, value)
         case str():
             return Constant(StringKind(), span, value)
@@ -79,7 +79,7 @@ def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False)
     kind, is_checked = within_64_bits(found, is_rounded)
     if kind is None or (is_checked and min(found) == max(found)):
         message = "this integer never fits 64 bits"
-        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"integers are {INT64.low} to {UINT64.high}")
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"integers range from {INT64.low} to {UINT64.high}")
     return kind, is_checked
 
 
@@ -152,7 +152,9 @@ def binary(op: Operator, left: Node, right: Node, span: SourceSpan) -> Node:
     if op is Operator.ADD and isinstance(left.kind, StringKind) and isinstance(right.kind, StringKind):
         return folded(Binary(StringKind(), span, op, left, right))
     if isinstance(left.kind, TimeKind) or isinstance(right.kind, TimeKind):
-        raise ExpressionError(span, Code.TYPE_MISMATCH, "times are not computed with", "use seconds(time) and back")
+        raise ExpressionError(
+            span, Code.TYPE_MISMATCH, "arithmetic does not take times", "convert with seconds(x), and back"
+        )
     _want_number(left)
     _want_number(right)
     if op in _DIVISIONS and constant_of(right) == 0:
@@ -185,7 +187,7 @@ def folded(made: Binary) -> Binary | Constant:
         raise ExpressionError(made.span, Code.OUT_OF_RANGE, str(error)) from None
     if isinstance(value, float) and not math.isfinite(value):
         raise ExpressionError(
-            made.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is meant"
+            made.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is intended"
         )
     return constant(value, made.span)
 
@@ -207,8 +209,8 @@ def _exponent(node: Node) -> IntKind:
     """The range of an exponent, which is a literal."""
     value = constant_of(node)
     if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
-        message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
-        hint = "sqrt(x) is the root, 1 / x ** 2 has a negative exponent"
+        message = f"an exponent must be a literal integer from 0 to {LARGEST_EXPONENT}"
+        hint = "write sqrt(x) for a root, 1 / x ** 2 for a negative exponent"
         raise ExpressionError(node.span, Code.FORBIDDEN_EXPRESSION, message, hint)
     return IntKind(value, value)
 
@@ -219,14 +221,14 @@ def _division_by_zero(span: SourceSpan) -> ExpressionError:
 
 def _want_number(operand: Node) -> None:
     if not isinstance(operand.kind, Number):
-        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str(x), or text(x, 2), makes text of a number"}
+        hint = {BoolKind: "convert a bool with int()", StringKind: "convert a number to text with str(x) or text(x, 2)"}
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
                       hint.get(type(operand.kind), "") or fields_hint(operand.kind))  # fmt: skip
 
 
 # truth
 
-_OF_LISTS = "of a list, compare an element, len(x), min(x) or max(x), or write `value in x`"
+_OF_LISTS = "compare an element, len(x), min(x) or max(x), or write `value in x`"
 
 
 def boolean(op: ast.boolop, operands: Sequence[Node], span: SourceSpan) -> Logic:
@@ -283,15 +285,13 @@ def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -
         raise forbidden(op, span)
     if any(value != value for value in map(constant_of, (left, right))):  # noqa: PLR0124 - NaN
         raise ExpressionError(
-            span, Code.TYPE_MISMATCH, "nan equals nothing, not even nan", "x != x is true where x is NaN"
+            span, Code.TYPE_MISMATCH, "nan equals nothing, not even nan", "to test for NaN, write x != x"
         )
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
         if not is_list(right.kind):
-            hint = "texts are compared as a whole, with ==" if isinstance(right.kind, StringKind) else ""
-            raise ExpressionError(
-                right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}", hint
-            )
+            hint = "compare whole texts with ==" if isinstance(right.kind, StringKind) else ""
+            raise ExpressionError(right.span, Code.TYPE_MISMATCH, f"'in' takes a list, not {right.kind}", hint)
         other = element_of(right.kind)
     if other is None or isinstance(left.kind, MessageKind) or is_list(left.kind) or join(left.kind, other) is None:
         message = f"{left.kind} cannot be compared with {right.kind}"
@@ -304,13 +304,13 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
     """`body if test else orelse`, where `test` is a bool."""
     kind = join(body.kind, orelse.kind)
     if kind is None:
-        message = f"this is {body.kind} or {orelse.kind}, which no field holds"
+        message = f"no field can hold both {body.kind} and {orelse.kind}"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
     if isinstance(kind, MessageKind):
-        message, hint = f"a choice cannot give a whole {kind}", "choose at each field, as in a.x if c else b.x"
+        message, hint = f"a choice cannot yield a whole {kind}", "choose for each field, as in a.x if c else b.x"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     if isinstance(element_of(kind), MessageKind):
-        message, hint = f"a choice cannot give a {kind}", "only lists of scalars are chosen: use one of the two"
+        message, hint = f"a choice cannot yield a {kind}", "use one of the two: only lists of scalars can be chosen"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     return Choice(kind, span, test, as_kind(body, kind, scope), as_kind(orelse, kind, scope))
 

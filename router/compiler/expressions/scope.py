@@ -81,7 +81,7 @@ def want_readable(node: Node) -> None:
     what = _unreadable(node.field)
     if what is not None:
         kind, hint = what
-        message = f"'{node.field.name}' is a {kind}, which expressions do not read"
+        message = f"'{node.field.name}' is a {kind}, which expressions cannot read"
         raise ExpressionError(node.span, Code.FORBIDDEN_EXPRESSION, message, hint)
 
 
@@ -89,9 +89,9 @@ def _unreadable(member: Field) -> tuple[str, str] | None:
     """For a field that expressions cannot read, its kind and what to do instead; None for all others."""
     declared = member.type.element if isinstance(member.type, List) else member.type
     if isinstance(declared, MessageType) and declared.is_map_entry:
-        return "map", "destinations get it as it came; for a topic, declare a list of messages with key and value"
+        return "map", "destinations receive it unchanged; for a topic, declare a list of messages with key and value"
     if member.is_group:
-        return "group", "destinations get it as it came; for a topic, declare it as a message"
+        return "group", "destinations receive it unchanged; for a topic, declare it as a message"
     if isinstance(declared, String) and declared.wide:
         return "wstring", "declare it as a string"
     return None

@@ -7,17 +7,15 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 CONDITIONAL = "write `b if a else c`"
-LEFT_OUT = (
-    "has(x) asks whether a field is set; one that is left out keeps its default; `when` keeps a message from being sent"
-)
+LEFT_OUT = "has(x) tells whether a field is set; an omitted field keeps its default; `when` withholds a message"
 ARRIVAL = "write received_at, the time of arrival"
-INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
-WRAPPED = "round(x) makes an integer of it; x % 360 wraps a float"
+INTEGERS = "convert it with round(x), trunc(x), floor(x) or ceil(x)"
+WRAPPED = "convert it with round(x), or wrap a float with x % 360"
 DECIMALS = "write text(x, 2) for two decimals"
 POWER = "write x ** 2"
-SQUARE = "x ** 2 is the square; of bools, write a != b"
+SQUARE = "for a square, write x ** 2; for exclusive or, a != b"
 SHIFT = "write x * 2 ** 3 for x << 3, x // 2 ** 3 for x >> 3"
-BITS = "there are no operations on bits; `{}` is for bools"
+BITS = "there are no bit operations; use `{}` for bools"
 FLOAT = "write float64(x), or float32(x)"
 
 _SYNTAX = (
@@ -30,7 +28,7 @@ _SYNTAX = (
     (r"=!", "write `!=`"),
     (r"=>", "write `>=`"),
     (r"->", "write `.` for `->`"),
-    (r"(?-i:\b(?:AND|OR|NOT)\b)", "write and, or, not in small letters"),
+    (r"(?-i:\b(?:AND|OR|NOT)\b)", "write and, or, not in lower case"),
     ("\u00b2", "write `** 2` for a square"),
     ("\u00b3", "write `** 3` for a cube"),
     (r"<>", "write `!=`"),
@@ -39,17 +37,17 @@ _SYNTAX = (
     (r"<\w+>\s*\(|\((?:unsigned )?(?:float|double|int|u?int\d+_t)\)\s*\w", f"{FLOAT}, round(x) or int(x) for a cast"),
     (r"\d[fFuUlL]\b", "write the number without its suffix"),
     (r"^\s*return\b", "write the value alone, without `return`"),
-    (r"//.*\w\s+\w", "a comment begins with `#`, after a space and outside of quotes"),
+    (r"//.*\w\s+\w", "start a comment with `#`, after a space and outside quotes"),
     (r";\s*$", "remove the `;`"),
     ("[\u00d7\u00b7]", "write `*`"),
     ("[\u2212\u2013]", "write `-`"),
     (r"^\s*if\b", f"{CONDITIONAL} for `if a then b else c`"),
     (r"\bif\b(?!.*\belse\b)", CONDITIONAL),
-    (r"(?<![<>=!])=(?!=)", "`==` compares; an expression assigns nothing"),
+    (r"(?<![<>=!])=(?!=)", "use `==` to compare; expressions cannot assign"),
     (r"^\s*[-+]?\.(?:nan|inf)\s*$", "write nan, inf or -inf"),
     (r"\$\w", "write the field's name without `$`"),
-    (r"^[^(]*\)", "a bracket is closed that was not opened"),
-    (r"\w\s+\w", "an operator is missing there, or the brackets of a function: abs(x)"),
+    (r"^[^(]*\)", "remove the closing bracket, or open it"),
+    (r"\w\s+\w", "add the missing operator, or the brackets of a function: abs(x)"),
 )
 """What to search in an expression that Python cannot parse, in this order."""
 
@@ -78,10 +76,10 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
         unit = found["unit"]
         if unit not in names:
             value = _word_before(bare[: found.start()]) or "x"
-            hint = "remove it, and write the value in the field's own unit"
+            hint = "remove it, and write the value in the field's unit"
             hint = f"write radians({value})" if unit in _DEGREES else hint
-            hint = f"write {value} / 100 for a share" if unit == "%" else hint
-            return Slip(found.span("unit"), f"'{unit}' is a unit, and expressions have none", hint)
+            hint = f"write {value} / 100 for a fraction" if unit == "%" else hint
+            return Slip(found.span("unit"), f"'{unit}' is a unit, which expressions do not support", hint)
     if sign := _WITHOUT_VALUE.search(bare):
         return Slip(sign.span("sign"), f"a value is missing after '{sign['sign']}'", "")
     return None
@@ -99,7 +97,7 @@ _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 NULLS = ("null", "nil", "none", "undefined", "nullptr")
 NAMES = {
     **dict.fromkeys(NULLS, LEFT_OUT),
-    **dict.fromkeys(("pi", "m_pi"), "write 3.141592653589793; radians(x) and degrees(x) turn angles"),
+    **dict.fromkeys(("pi", "m_pi"), "write 3.141592653589793; radians(x) and degrees(x) convert angles"),
     **dict.fromkeys(("now", "time", "stamp", "timestamp"), ARRIVAL),
     **dict.fromkeys(("infinity", "infinityf"), "write inf"),
     "static_cast": FLOAT,
@@ -114,12 +112,12 @@ FUNCTIONS = {
     "fmod": "write x % y",
     "float": FLOAT,
     "double": "write float64(x)",
-    "isnan": "x != x is true where x is NaN",
+    "isnan": "to test for NaN, write x != x",
     "sign": "write 1 if x > 0 else -1 if x < 0 else 0",
     "atan": "write atan2(y, x)",
     "asin": "write atan2(x, sqrt(1 - x * x))",
     "acos": "write atan2(sqrt(1 - x * x), x)",
-    "map": "values are chosen by {map: FIELD, VALUE: ..., else: ...}",
+    "map": "choose a value with {map: FIELD, VALUE: ..., else: ...}",
     "received_at": "write it without brackets",
     "bool": "compare: x != 0",
     "constrain": "write clamp(x, low, high)",
@@ -139,5 +137,5 @@ def of_syntax(text: str) -> str:
     """The hint for an expression that cannot be parsed; empty where it looks like nothing known."""
     bare = _QUOTED.sub("", text)
     if bare.count("(") > bare.count(")"):
-        return "close every bracket; inside {} and [] quote the expression, or a comma ends it"
+        return "close every bracket; inside {} and [] quote the expression, because a comma ends it"
     return next((hint for pattern, hint in _SYNTAX if re.search(pattern, bare, re.IGNORECASE)), "")

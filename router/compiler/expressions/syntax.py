@@ -37,8 +37,8 @@ class Parsed:
     def _parse(self, text: str) -> ast.expr:
         if "#" in text and (at := _comment(text)) is not None:
             span = self._expression.place.part(self._indent + at, self._indent + at + 1)
-            message = "a '#' ends the expression, and the rest is not used"
-            hint = "remove it: in quotes, and in a text of several lines, '#' begins no comment of YAML"
+            message = "'#' ends the expression, and the rest is ignored"
+            hint = "remove it: in quoted and in multi-line text, '#' does not start a YAML comment"
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint)
         try:
             with warnings.catch_warnings():
@@ -176,9 +176,9 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.GeneratorExp: "expressions have no loops",
     ast.SetComp: "expressions have no loops",
     ast.DictComp: "expressions have no loops",
-    ast.NamedExpr: "expressions assign nothing",
+    ast.NamedExpr: "expressions cannot assign",
     ast.JoinedStr: "join strings with +, str() and text()",
-    ast.Tuple: "remove the ',', or write a list, [a, b]; a decimal number has a point, 9.81",
+    ast.Tuple: "remove the ',', or write a list, [a, b]; write decimal numbers with a point, 9.81",
     ast.Is: "use ==",
     ast.IsNot: "use ==",
 }

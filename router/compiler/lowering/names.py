@@ -66,5 +66,5 @@ class Names:
         """Raise TooLargeError if there is no room for so many bytes of text more."""
         self.joined += most
         if self.joined > MOST_TEXT:
-            message = f"the text joined here may have {self.joined} bytes, and at most {MOST_TEXT} are possible"
+            message = f"the text joined here can reach {self.joined} bytes; the limit is {MOST_TEXT}"
             raise TooLargeError(span, message, "join fewer fields")

@@ -75,9 +75,9 @@ class _Source:
         routine = chained(Op.AND, [lowering.value(each) for each in given])
         _want_small([(operation, given[-1].span) for operation in routine])
         if is_bounded and (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
-            limit = f"and a destination's `when` takes at most {MOST_CONDITION_OPERATIONS:,}"
-            message = f"this could take {most:,} operations on the longest datagram, {limit}"
-            hint = f"a list counts with {MAX_DATAGRAM:,} elements: look into fewer lists, or fewer times"
+            limit = f"the limit for a destination's `when` is {MOST_CONDITION_OPERATIONS:,}"
+            message = f"this could take {most:,} operations on the longest datagram; {limit}"
+            hint = f"a list counts as {MAX_DATAGRAM:,} elements: use fewer lists, or use them less often"
             raise TooLargeError(given[-1].span, message, hint)
         return routine, ", or ".join(f"{each.span}: when" for each in given)
 
@@ -125,8 +125,8 @@ class Datagram(_Source):
         """Return the layout of all routines that have been made. Raises TooLargeError."""
         for section in (self.root, *self.elements):
             if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
-                message = f"this reads a field {depth} messages deep, and at most {MOST_SECTIONS_DEEP - 1} are possible"
-                raise TooLargeError(span, message, "read fields that are less deep")
+                message = f"this reads a field {depth} messages deep; the limit is {MOST_SECTIONS_DEEP - 1}"
+                raise TooLargeError(span, message, "read less deeply nested fields")
         return _small(protobuf_layout(self.temporaries, self.root, self.elements), span)
 
 
@@ -224,9 +224,9 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
         return
     loops, opened = (nesting(operations, *kinds) for kinds in ((Op.REPEAT, Op.AGAIN), (Op.OPEN, Op.CLOSE)))
     limits = (
-        (depths(operations), MOST_STACKED - 1, "intermediate values are needed here", "use fewer brackets in brackets"),
-        (loops, MOST_LOOPS, "lists are nested here", "fill fewer lists in lists"),
-        (opened, MOST_OPEN, "messages are nested here", "fill fewer messages in messages"),
+        (depths(operations), MOST_STACKED - 1, "intermediate values are needed here", "nest fewer brackets"),
+        (loops, MOST_LOOPS, "lists are nested here", "nest fewer lists"),
+        (opened, MOST_OPEN, "messages are nested here", "nest fewer messages"),
     )
     for counts, most, what, hint in limits:
         for (_, span), count in zip(placed, counts, strict=True):
@@ -238,6 +238,6 @@ def _small(layout: Layout, span: SourceSpan) -> Layout:
     """The layout. Raises TooLargeError if its slots or sections cannot be numbered."""
     most = max(len(layout.defaults), len(layout.sections))
     if most > _MOST_SLOTS:
-        message = f"these mappings use {most} values, and at most {_MOST_SLOTS} are possible"
-        raise TooLargeError(span, message, "make several routes of it, or map less")
+        message = f"these mappings use {most} values; the limit is {_MOST_SLOTS}"
+        raise TooLargeError(span, message, "split it into several routes, or map fewer fields")
     return layout

@@ -115,7 +115,7 @@ class _Steps:
     def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
         if self.loops == MOST_LOOPS:
             message = f"this type nests more than {MOST_LOOPS} lists of messages"
-            raise TooLargeError(self.span, message, "take another type of message")
+            raise TooLargeError(self.span, message, "use another message type")
         self._add(each, slot)
         inside = _Steps(self.layout, self.span, Offset(), self.loops + 1)
         body(inside)
