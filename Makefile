@@ -15,7 +15,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup tools install-service test test-all demo bench pictures docs validate lint clean
+.PHONY: help setup tools install-service test test-all demo bench pictures docs validate lint dist clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 17
@@ -67,6 +67,9 @@ lint: tools  ## ruff, mypy, and what the C compiler warns of
 	@.venv/bin/ruff check
 	@$(ENV) .venv/bin/python router/carrier/build.py --rcl --lint
 	@$(ENV) .venv/bin/mypy
+
+dist: tools  ## build sdist and wheel of the last commit into dist/, and try them with each Python found here
+	@$(ENV) deploy/dist.sh
 
 clean:  ## remove .venv and what tools left behind
 	rm -rf .venv router/carrier/native/libcarrier.so router/declared.py build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

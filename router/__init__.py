@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 NO_CACHE = "--no-cache"
 """Of `router run`: without a head start."""

@@ -1,4 +1,4 @@
-"""What holds for every test: a ROS domain of this run alone that never leaves the machine, and the carrier."""
+"""Set-up for every test: a current build of the carrier, and a private ROS domain that stays on this computer."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from hypothesis import settings
 
 from router.carrier.build import build, is_current
 
-# Routers of tests run on the library of the sources that there are now.
+# Tests run with a library built from the current sources.
 if not is_current():
     build()
 
 from tests.gateway.browser import Browser, executable
 from tests.lanes import LANE
 
-# Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
+# Before anything imports rclpy. Domains above 101 would use the kernel's ephemeral ports.
 os.environ["ROS_DOMAIN_ID"] = str(1 + LANE)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
@@ -31,15 +31,15 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 _recordings = tempfile.TemporaryDirectory(prefix="recordings-")
 os.environ["RECORDINGS"] = _recordings.name
 
-# Routers keep what they compile.
+# Routers keep compiled programs there.
 _cache = tempfile.TemporaryDirectory(prefix="cache-")
 os.environ["XDG_CACHE_HOME"] = _cache.name
 
-# A shell lets what it starts in the background ignore Ctrl-C, and children inherit that; tests send it to them.
+# Shells make background jobs ignore SIGINT, and children inherit that; tests send SIGINT to children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No deadline: how long an example takes says more about the machine than about the code.
+# No deadline: the time of an example depends on the machine more than on the code.
 settings.register_profile("quick", deadline=None, max_examples=25)
 settings.register_profile("full", deadline=None, max_examples=200)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
@@ -47,7 +47,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 _ROOT = Path(__file__).parents[1]
 TEAMS = (f"{_ROOT}/routes/", f"{_ROOT}/protos/")
-"""What a team edits. A test that reads it would fail with the next basestation: tests/tables.py has other tables."""
+"""Folders that a team edits. Tests must not read them, or every edit could break tests: use tests/tables.py."""
 
 
 def _leave_to_the_team(event: str, arguments: tuple[object, ...]) -> None:
@@ -61,7 +61,7 @@ sys.addaudithook(_leave_to_the_team)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mix files from both ends of the list, for workers that take one after the other: most of the first ones wait."""
+    """Alternate between files from both ends of the list: most tests at its beginning wait, and workers go in order."""
     if not hasattr(config, "workerinput"):
         return
     files: dict[Path, list[pytest.Item]] = {}
@@ -73,7 +73,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def _in_the_checkout() -> None:
-    """Wherever the tests were started: files below here are told by their path from here."""
+    """Run from the checkout's root, wherever pytest was started: tests name files relative to it."""
     os.chdir(Path(__file__).parent.parent)
 
 

@@ -1,4 +1,4 @@
-"""The blocks of a page: commands with what they print, files, and what is neither. CONTRIBUTING.md has the rules."""
+"""The code blocks of a page: commands with their output, files, and others. CONTRIBUTING.md has the rules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ANY = "..."
 
 @dataclass(frozen=True)
 class Block:
-    """What stands between two fences; `line` is the number of its first line in the page."""
+    """The text between two fences; `line` is the number of its first line in the page."""
 
     language: str
     line: int
@@ -42,7 +42,7 @@ class Command:
         return self.text.endswith(" &")
 
     def is_printed(self, output: str) -> bool:
-        """Whether the output is the one that is shown; of a background process, begins with it."""
+        """Whether the output matches the page. The output of a background process only has to begin with it."""
         lines = [line.rstrip() for line in output.rstrip().splitlines()]
         shown = "".join(r"(?:.*\n)*?" if line == ANY else f"{_line(line)}\n" for line in self.printed)
         more = r"(?:.*\n)*" if self.is_background else ""
@@ -71,7 +71,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def steps(page: Path) -> list[File | Command]:
-    """What a reader does, from top to bottom."""
+    """The steps of a reader, from top to bottom."""
     found: list[File | Command] = []
     for block in blocks(page):
         if not block.is_run:
@@ -90,18 +90,18 @@ def typed(page: Path) -> list[str]:
 
 
 def written(page: Path) -> dict[str, str]:
-    """The files that a page has whole, by path."""
+    """The complete files on a page, by path."""
     return {step.path: step.text for step in steps(page) if isinstance(step, File)}
 
 
 def file_name(first_line: str) -> str | None:
-    """The file that a block is, which its first line names in a comment."""
+    """The path in the comment on a block's first line, if the block is a file."""
     named = _FILE.fullmatch(first_line)
     return named[1] if named else None
 
 
 def commands(block: Block) -> Iterator[Command]:
-    """Raises ValueError where the block is none of commands."""
+    """The commands of a block. Raises ValueError if the block has none."""
     number = 0
     while number < len(block.lines):
         first = number

@@ -1,4 +1,4 @@
-"""Envelopes at random, written by hand: every payload case of the rover, and fields that the router does not know."""
+"""Random envelopes, encoded by hand: every payload case of the rover, and fields unknown to the router."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.tables import PROTOS
 VARINT, I64, LEN, I32 = 0, 1, 2, 5
 
 UNKNOWN_NUMBER = 30
-"""Promised to `uint32 timeout`, which this router does not know."""
+"""Reserved for `uint32 timeout`, which this router does not know."""
 
 
 @cache
@@ -26,7 +26,7 @@ def rover_envelope() -> Envelope:
 
 
 def varint(value: int) -> bytes:
-    """Minimal, as every encoder writes it."""
+    """The shortest encoding, which every encoder writes."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -49,7 +49,7 @@ _FLOATS = st.floats(width=32) | st.sampled_from([0.0, -0.0, 1e-45])
 
 @st.composite
 def field(draw: st.DrawFn, numbers: st.SearchStrategy[int]) -> bytes:
-    """One field of any wire type but the groups."""
+    """One field of any wire type except groups."""
     number = draw(numbers)
     kind = draw(st.sampled_from([VARINT, I64, LEN, I32]))
     if kind == VARINT:
@@ -64,7 +64,7 @@ unknown_fields = field(st.integers(27, 40) | st.sampled_from([500, 2048, 2**29 -
 
 @st.composite
 def payloads(draw: st.DrawFn, descriptor: Descriptor) -> bytes:
-    """The encoding of some message: any of its fields, zeros written out at times, in any order, unknown ones too."""
+    """An encoded message: any of its fields and unknown ones, in any order, sometimes with explicit zeros."""
     parts = [draw(_value(known)) for known in descriptor.fields if draw(st.booleans())]
     if draw(st.integers(0, 9)) == 0:
         parts.append(draw(unknown_fields))
@@ -87,7 +87,7 @@ def _value(draw: st.DrawFn, known: FieldDescriptor) -> bytes:
 
 @st.composite
 def envelopes(draw: st.DrawFn) -> bytes:
-    """Mostly one payload; sometimes none, several, one in two pieces, and unknown fields around it."""
+    """Envelopes, most of them with one payload; some with none, several, one in two pieces, or unknown fields."""
     descriptor = cast("Descriptor", rover_envelope().message_class.DESCRIPTOR)
     cases = st.sampled_from([field.name for field in descriptor.fields])
     chosen = draw(st.sampled_from([0, 1, 1, 1, 1, 2]))
@@ -98,7 +98,7 @@ def envelopes(draw: st.DrawFn) -> bytes:
 
 @st.composite
 def damaged(draw: st.DrawFn) -> bytes:
-    """An envelope, and what happens to one on its way: cuts, padding, flipped bits, a stretched varint, garbage."""
+    """An envelope that may be damaged: cut, padded, with flipped bits, a stretched varint or garbage."""
     data = bytearray(draw(envelopes()))
     for _ in range(draw(st.sampled_from([0, 0, 1, 1, 2]))):
         at = draw(st.integers(0, len(data)))

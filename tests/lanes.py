@@ -1,4 +1,4 @@
-"""A lane for each process that runs tests: a ROS domain and ports that no other test process on this network uses."""
+"""One lane per test process: a ROS domain and ports that no other test process in this network namespace uses."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ LANES = 50
 def _claim() -> int:
     """Bind the name of the first free lane for as long as this process lives.
 
-    A name in Linux's abstract namespace belongs to the network namespace, as domains and ports do: a container that
-    shares the network, but no file, sees it.
+    A name in Linux's abstract namespace belongs to the network namespace, as domains and ports do, so containers
+    that share the network but no files see it.
     """
     for lane in range(LANES):
         held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -30,4 +30,4 @@ def _claim() -> int:
 
 _held: list[socket.socket] = []
 LANE = _claim()
-"""From 0 up to `LANES`, exclusive."""
+"""This process's lane, from 0 to `LANES` - 1."""

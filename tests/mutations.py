@@ -34,7 +34,7 @@ def trim(noise: random.Random, data: bytes, other: bytes) -> bytes:
 
 
 def relength(noise: random.Random, data: bytes, other: bytes) -> bytes:
-    """Another byte among the first three: the tag, the length."""
+    """Change one of the first three bytes: the tag or the length."""
     at = noise.randrange(min(3, len(data)))
     return data[:at] + bytes((noise.randrange(256),)) + data[at + 1 :]
 

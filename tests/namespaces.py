@@ -1,4 +1,4 @@
-"""Network namespaces for tests: computers with networks of their own, from which nothing gets out."""
+"""Network namespaces for tests: computers in isolated networks."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Computer:
-    """A network namespace. What `inside` opens there stays there, whoever uses it afterwards."""
+    """A network namespace. Sockets opened by `inside` stay in it, whichever thread uses them later."""
 
     def __init__(self, name: str) -> None:
         self.namespace = f"router{os.getpid()}-{next(_numbers)}-{name}"
 
     def run(self, *command: object, check: bool = True) -> str:
-        """Runs a command there, and returns what it printed."""
+        """Run a command in the namespace and return its output."""
         return _run("ip", "netns", "exec", self.namespace, *command, check=check)
 
     def ip(self, *arguments: object) -> str:
         return _run("ip", "-n", self.namespace, *arguments)
 
     def nft(self, *arguments: object) -> str:
-        """Changes the firewall; skips the test where there is no `nft`."""
+        """Change the firewall; skip the test if there is no `nft`."""
         if shutil.which("nft") is None:
             pytest.skip("needs nft (nftables)")
         return self.run("nft", *arguments)
 
     def inside(self, call: Callable[[], T]) -> T:
-        """What `call` returns in a thread that is there."""
+        """Return the result of `call` in a thread that has entered the namespace."""
 
         def enter_and_call() -> T:
             with Path("/run/netns", self.namespace).open() as namespace:
@@ -56,9 +56,9 @@ class Computer:
 
 @contextmanager
 def computers(*names: str) -> Iterator[list[Computer]]:
-    """New ones, with nothing but a loopback interface that is up; skips the test where there can be none.
+    """New namespaces in which only the loopback interface is up; skip the test if they cannot be created.
 
-    They believe every source address (rp_filter 0): that is the kernel's default, and what an attacker hopes for.
+    They accept every source address (rp_filter 0), the kernel's default and the worst case for an attack.
     """
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("needs root and `ip`, for network namespaces")
@@ -74,7 +74,7 @@ def computers(*names: str) -> Iterator[list[Computer]]:
 
 
 def cable(one: Computer, end: str, address: str, other: Computer, other_end: str, other_address: str) -> None:
-    """A veth pair with an interface of that name and that address (`10.78.1.1/24`) at each end."""
+    """Connect two computers by a veth pair, with an interface name and an address (`10.78.1.1/24`) at each end."""
     one.ip("link", "add", end, "type", "veth", "peer", "name", other_end, "netns", other.namespace)
     for computer, name, network in ((one, end, address), (other, other_end, other_address)):
         computer.ip("address", "add", network, "dev", name)

@@ -1,7 +1,7 @@
-"""ROS child processes of tests: `RosProcess` is their handle in the test, the other functions serve the child.
+"""ROS child processes of tests: `RosProcess` is the test's handle; the other functions run in the child.
 
-Importing rclpy takes most of the start of such a process. One process for each test process, the forker (this file run
-as a script), has imported it and forks the children.
+Importing rclpy takes most of a child's start. So each test process has a forker (this file run as a script), which has
+imported rclpy and forks the children.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from typing import Any, TextIO
 _LARGEST_REQUEST = 1 << 20
 
 _PIPE = 1 << 20
-"""Bytes that a child may print before somebody reads: one that has to wait loses messages."""
+"""Bytes that a child can print before the test reads: a blocked child loses messages."""
 
 
 class ForkedProcess:
-    """A child of the forker, with as much of the interface of `subprocess.Popen` as tests need."""
+    """A child of the forker, with the part of `subprocess.Popen`'s interface that tests use."""
 
     def __init__(self, *command: str) -> None:
         stdin, self._to_stdin = os.pipe()
@@ -56,7 +56,7 @@ class ForkedProcess:
         return code
 
     def _has_ended(self, timeout: float) -> bool:
-        from tests.readable import readable  # the forker, which is this file as well, has no `tests`
+        from tests.readable import readable  # this file is also the forker, which cannot import `tests`
 
         return readable(self._pidfd, timeout)
 
@@ -68,7 +68,7 @@ class ForkedProcess:
         self.send_signal(signal.SIGKILL)
 
     def communicate(self) -> str:
-        """End its standard input, wait for its end, and return the rest of its output."""
+        """Close the child's stdin, wait for it to exit, and return the remaining output."""
         if self.stdout.closed:
             return ""
         self.stdin.close()
@@ -79,17 +79,17 @@ class ForkedProcess:
 
 
 class RosProcess:
-    """A running child, talked to line by line; close it."""
+    """A running child with a line protocol on stdin and stdout. Close it after use."""
 
     def __init__(self, script: str, *arguments: str) -> None:
         self.process = ForkedProcess(script, *arguments)
 
     def line(self) -> str:
-        """The next line that it prints; waits for it."""
+        """Wait for the child's next line and return it."""
         return self.process.stdout.readline().strip()
 
     def kill(self) -> None:
-        """As `kill -9` does: ROS is told nothing."""
+        """Kill the child with SIGKILL, so that it does not announce its end to ROS."""
         self.process.kill()
         self.process.communicate()
 
@@ -101,7 +101,7 @@ class RosProcess:
 @cache
 def _forker() -> socket.socket:
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # of its threads, a fork would lose those of numpy
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # a fork would lose numpy's threads
     subprocess.Popen([sys.executable, __file__, str(its.fileno())], pass_fds=[its.fileno()], env=environment)
     its.close()
     return ours
@@ -114,7 +114,7 @@ def _ask(request: dict[str, Any], *descriptors: int) -> int:
 
 
 def fork_on_request(requests: socket.socket) -> None:
-    """What the forker does, until its parent has gone."""
+    """The forker's loop: fork a child per request until the parent exits."""
     while True:
         request, descriptors, _, _ = socket.recv_fds(requests, _LARGEST_REQUEST, 2)
         if not request:
@@ -150,9 +150,9 @@ def _run(asked: dict[str, Any], stdin: int, stdout: int) -> int:
 
 
 def own_stdout() -> TextIO:
-    """What was standard output, for our lines alone; everything else that is printed goes to standard error.
+    """The original stdout, for protocol lines only; all other output goes to stderr.
 
-    Fast DDS is C++ and writes its complaints (a lock file that a killed process left in /dev/shm) to
+    Fast DDS writes its warnings (for example of a lock file that a killed process left in /dev/shm) to
     descriptor 1.
     """
     lines = os.fdopen(os.dup(1), "w", buffering=1)
@@ -161,7 +161,7 @@ def own_stdout() -> TextIO:
 
 
 def spin_until_stdin_ends(node: Any, heard: Callable[[str], None] = lambda _: None) -> None:
-    """Each line from standard input goes to `heard`, on a thread of its own."""
+    """Spin until stdin ends, and pass each line to `heard` on a separate thread."""
     import rclpy
     from rclpy.task import Future
 
@@ -170,7 +170,7 @@ def spin_until_stdin_ends(node: Any, heard: Callable[[str], None] = lambda _: No
     def listen() -> None:
         for line in sys.stdin:
             heard(line.strip())
-        ended.set_result(None)  # not rclpy.shutdown(): it would pull the context from under the thread that spins
+        ended.set_result(None)  # not rclpy.shutdown(): it would destroy the context while the other thread spins
 
     threading.Thread(target=listen, daemon=True).start()
     rclpy.spin_until_future_complete(node, ended)

@@ -1,4 +1,4 @@
-"""Small tables of the rover's messages for tests, what they are counted by, and envelopes for them."""
+"""Small tables with the rover's messages, their counters, and envelopes for them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ endpoints:
   right_tool: {address: 192.168.0.60:7002, kind: tool, source_port: 8002}
 routes:
 """
-"""Every table of these tests begins like this; what follows are its routes, indented by two."""
+"""The beginning of each table. Its routes follow, indented by two."""
 
 HEAD_OF_LISTENERS = (
     HEAD.replace("kind: basestation}", "kind: basestation, listener: exact}")
@@ -38,7 +38,7 @@ HEAD_OF_LISTENERS = (
     .replace("source_port: 8002}", "source_port: 8002, listener: exact}")
     .replace("  recorder:", "  impostor: {address: 192.168.0.10:9001, kind: tool, listener: trimmed}\n  recorder:")
 )
-"""With endpoints that are believed by one listener; `impostor` has the basestation's address on the other one."""
+"""Each endpoint is accepted by one listener only; `impostor` has the basestation's address on the other one."""
 
 SENSOR_BOARD = ("192.168.0.30", 8)
 DRIVING_BOARD = ("192.168.0.222", 8)
@@ -62,7 +62,7 @@ def _definitions() -> Definitions:
 
 
 def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = None) -> Program:
-    """The compiled table. What is wrong with it fails the test; a case that is not covered is fine."""
+    """The compiled table. Findings fail the test, except payload cases without a route."""
     path = folder / "table.yaml"
     path.write_text(head.replace("PROTOS", str(protos or PROTOS)) + routes)
     checked = check_table(path, {}, _definitions())
@@ -71,14 +71,14 @@ def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = N
 
 
 class Ledger:
-    """The counters of a program with their counts at the time of each call; timestamps and histograms left out."""
+    """The counters of a program at the time of each call, without timestamps and histograms."""
 
     def __init__(self, program: Program, counts: Sequence[int]) -> None:
         self._program = program
         self._counts = counts
 
     def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
-        """What is not zero, by metric and labels, of the metrics whose name starts like one of these."""
+        """The nonzero counts, by metric and labels, of metrics whose names begin with one of the prefixes."""
         return {
             (series.metric, *series.labels): self._counts[index]
             for series, index in self._program.counters.series()
@@ -86,11 +86,11 @@ class Ledger:
         }
 
     def total(self, metric: str, *labels: str) -> int:
-        """The sum over all series of a metric whose labels begin like this."""
+        """The sum over all series of a metric whose labels begin with these."""
         return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
 
     def imbalances(self) -> Iterator[str]:
-        """Expects that no frame is open, and nothing is held back for later."""
+        """Errors in the balance of the counters. Valid only while no frame is open and no message is held back."""
         inbound = [plan for plans in self._program.inbound.values() for plan in plans]
         outbound = [plan for plans in self._program.outbound.values() for plan in plans]
         received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")

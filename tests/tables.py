@@ -1,6 +1,6 @@
-"""The rover that tests are about: `tests/rover/`, with tables and protos of its own.
+"""The rover of the tests: `tests/rover/`, with its own tables and protos.
 
-A team edits `routes/` and `protos/`; tests of the product read neither. tests/test_own_tables.py sees to that.
+Teams edit `routes/` and `protos/`, so tests of the router read neither; tests/test_own_tables.py checks that.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ PROTOS = RIG / "protos"
 
 
 def ship(folder: Path) -> None:
-    """Replaces the tables and protos in a package, which are those that a team edits, by those of the tests."""
+    """Replace the team's tables and protos in a package with those of the tests."""
     for ours in (ROUTES, PROTOS):
         shutil.rmtree(folder / ours.name)
         shutil.copytree(ours, folder / ours.name)

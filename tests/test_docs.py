@@ -1,4 +1,4 @@
-"""The generated reference pages are up to date, and examples do what the text says of them."""
+"""The generated reference pages are up to date, and examples do what the text says."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_every_key_of_a_schema_is_on_its_page(page: str, schema: str) -> None:
 
 
 def keys(schema: object) -> Iterator[str]:
-    """The keys that a schema declares, apart from what it says of whole tables."""
+    """The keys that a schema declares, without those for whole tables."""
     if not isinstance(schema, dict):
         return
     for name, value in schema.items():
@@ -69,11 +69,11 @@ def keys(schema: object) -> Iterator[str]:
 
 
 OTHER_YAML = ("guides/test-tables.md",)
-"""Pages whose YAML is no table. A block that is a whole file, tests/test_docs_commands.py writes."""
+"""Pages whose YAML blocks are not tables. tests/test_docs_commands.py writes the blocks that are whole files."""
 
 
 def table_examples() -> Iterator[str]:
-    """Some show routes without the key above them."""
+    """The YAML blocks of a page as tables. Some blocks show routes without the key above them."""
     user_pages = (
         str(page.relative_to(DOCS))
         for folder in ("start", "guides", "troubleshooting")
@@ -90,7 +90,7 @@ def table_examples() -> Iterator[str]:
 @pytest.mark.parametrize("example", [*table_examples()])
 def test_each_example_of_a_table_is_good_in_place_of_what_the_rover_has(tmp_path: Path, example: str) -> None:
     table = tmp_path / "table.yaml"
-    package = "" if "defaults:" in example else "defaults: {package: comms}\n"  # as the rover's own table says
+    package = "" if "defaults:" in example else "defaults: {package: comms}\n"  # as in the rover's table
     table.write_text(f"extends: {ROVER}\n{package}{example}")
     assert list(map(str, check_table(table).diagnostics)) == []
 
@@ -121,7 +121,7 @@ TEXTS = [*DOCS.parent.glob("*.md"), *DOCS.rglob("*.md")]
 
 
 def anchors(page: Path) -> set[str]:
-    """Those that code hosts give to headings."""
+    """The anchors that code hosts generate for headings."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
@@ -179,7 +179,7 @@ def test_schema_and_documents_are_as_they_are_shown() -> None:
 
 @contextmanager
 def program(folder: Path, name: str, *arguments: object) -> Iterator[IO[str]]:
-    """What an example that begins with its own name prints, while it runs."""
+    """Run the example that begins with this file name; yields its output."""
     [text] = (text for text in examples(PROTOCOL, "python") if text.startswith(f"# {name}: python {name} "))
     (folder / name).write_text(text)
     command = [sys.executable, name, *map(str, arguments)]
@@ -206,7 +206,7 @@ def test_the_client_shows_data_whose_schema_it_has(tmp_path: Path) -> None:
 
 @contextmanager
 def sent_again_and_again(packets: Sequence[bytes], port: int) -> Iterator[None]:
-    """As a gateway does, which does not know when its client is there."""
+    """Send again and again, as a gateway does, because the client may not have started."""
     ended = threading.Event()
 
     def send() -> None:

@@ -1,4 +1,4 @@
-"""Every command of the README and of the pages for users, run from top to bottom of a page in a fresh clone."""
+"""Run each command of the README and of the users' pages, from top to bottom, in a fresh clone."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ FOLDERS = ("start", "guides", "troubleshooting")
 PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted((ROOT / "docs" / folder).glob("*.md")))]
 NEEDS = ("git", "tar", "ip", "unshare")
 PATIENCE = 60.0
-"""Seconds that one command may take."""
+"""Timeout of one command, in seconds."""
 
 FIRST_LINE = 10.0
-"""Seconds that a background process has for its first line before the next command."""
+"""Seconds to wait for the first line of a background process before the next command."""
 
 UNSAID = ("", "sh", "bash", "shell")
 
@@ -105,9 +105,9 @@ def test_a_page_that_is_wrong_fails(lines: tuple[str, ...], said: str, tmp_path:
 
 
 def fresh_clone(folder: Path) -> None:
-    """The checkout as it is, with changes that are not committed; its environment and library are built already.
+    """A copy of the checkout, including uncommitted changes, with its environment and library already built.
 
-    By other programs, since tests may not read the tables of a team.
+    Made by other programs, because tests may not read a team's tables.
     """
     folder.mkdir()
     copying = f"""
@@ -123,7 +123,7 @@ def fresh_clone(folder: Path) -> None:
 
 
 class Job(NamedTuple):
-    """A process in the background. `ended` has its exit code as soon as there is one."""
+    """A background process. `ended` gets its exit code."""
 
     place: str
     command: Command
@@ -132,7 +132,7 @@ class Job(NamedTuple):
 
 
 class Shell:
-    """A shell that goes through a page. `cd` and `export` last."""
+    """A shell that runs the commands of a page. `cd` and `export` persist."""
 
     def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
         self._process = process
@@ -141,7 +141,7 @@ class Shell:
         self._jobs: list[Job] = []
 
     def write(self, file: File) -> None:
-        """Where the shell is: an example may go on in a folder that a command has made."""
+        """Write a file relative to the shell's working directory, which commands may have changed."""
         text = self._folder / "file"
         text.write_text(file.text, encoding="utf-8")
         path = f"'{file.path}'"
@@ -159,7 +159,7 @@ class Shell:
             self._fail(place, command.text, "\n".join(["expected:", *command.printed, "", "got:", output]))
 
     def _start(self, command: Command, place: str) -> str:
-        """Return what a process in the background has printed until the next command."""
+        """Start a background process and return its output until the next command."""
         log, ended = self._output(self._number + 1), self._folder / f"{self._number + 1}.ended"
         self._jobs.append(Job(place, command, log, ended))
         self._enter(f"{{ {command.text.removesuffix(' &')}\necho $? > {ended}\n}} &", place)
@@ -172,7 +172,7 @@ class Shell:
         pytest.fail("\n".join([f"{place}: $ {text}", what, *beside]), pytrace=False)
 
     def end_jobs(self) -> None:
-        """As Ctrl-C does. None may have ended with another code than the page's."""
+        """Send SIGINT to all jobs, and check that none has exited with a code that the page does not name."""
         for job in self._jobs:
             if (code := read(job.ended)) and int(code) != job.command.code:
                 self._fail(job.place, job.command.text, f"it ended with exit code {code}")
@@ -180,7 +180,7 @@ class Shell:
             self._enter("kill -INT $(jobs -p | sed 's/^/-/'); wait", patience=10.0)
 
     def _enter(self, text: str, place: str = "", patience: float = PATIENCE) -> tuple[int, str]:
-        """Exit code and output of a command."""
+        """Run a command and return its exit code and output."""
         self._number += 1
         log, ended = self._output(self._number), self._folder / f"{self._number}.code"
         assert self._process.stdin is not None
@@ -211,7 +211,7 @@ def read(file: Path) -> str:
 
 @contextmanager
 def shell(clone: Path, folder: Path) -> Iterator[Shell]:
-    """In a network and among processes of its own, all of which end with it."""
+    """A shell in its own network and PID namespaces; all its processes end with it."""
     home, logs = folder / "home", folder / "logs"
     home.mkdir()
     logs.mkdir()
@@ -237,9 +237,7 @@ def shell(clone: Path, folder: Path) -> Iterator[Shell]:
         )
         try:
             assert process.stdin is not None
-            process.stdin.write(
-                "set -m\n. .venv/env.sh\n"
-            )  # with job control, Ctrl-C reaches what is in the background
+            process.stdin.write("set -m\n. .venv/env.sh\n")  # with job control, SIGINT reaches background processes
             there = Shell(process, logs)
             yield there
             there.end_jobs()

@@ -1,4 +1,4 @@
-"""What a compile reads is noted, all of it, and any other value of it is found again."""
+"""Everything that a compile reads is recorded, and every later change of it is detected."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ routes:
   reading: {source: board, destinations: station, topic: {topic: reading, type: our_msgs/msg/Reading}}
 """
 NO_TABLE = argparse.Namespace(table=None, subject=None)
-"""A command line that names none."""
+"""A command line without a table."""
 
 MSG = "string name\nint32 value\n"
 
@@ -80,7 +80,7 @@ def compiled(known: Program | None = None) -> tuple[Program, Plain]:
 
 
 def changed_in_new_process(plain: Plain) -> str:
-    """What a start finds, which looks at the installation anew."""
+    """The changes that a new process finds, which checks the installation afresh."""
     inputs._process.cache_clear()
     return inputs.changed(plain)
 
@@ -325,7 +325,7 @@ def test_the_language_reads_nothing_past_the_inputs() -> None:
 
 
 def _read_by(node: ast.AST) -> str:
-    """The attribute of another module or object, or the built-in function, by which a node reads."""
+    """The attribute or built-in function with which a node reads, or an empty text."""
     if isinstance(node, ast.Attribute) and node.attr in _READING:
         is_ours = isinstance(node.value, ast.Name) and node.value.id in {"inputs", "ast"}
         return "" if is_ours else node.attr

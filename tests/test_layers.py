@@ -1,4 +1,4 @@
-"""Which package may import which, and where the outside world is touched."""
+"""Which package may import which, and which may use sockets, threads and ROS."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def modules() -> dict[Path, ast.Module]:
 
 
 def imports(tree: ast.Module) -> Iterator[tuple[str, str | None, int]]:
-    """The imports anywhere in a module, also those for types: (module, name or None, line)."""
+    """All imports of a module, including imports for type checking: (module, name or None, line)."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, None, node.lineno) for alias in node.names)
@@ -61,7 +61,7 @@ def imports(tree: ast.Module) -> Iterator[tuple[str, str | None, int]]:
 
 
 def package(path: Path) -> str | None:
-    """The package of a module, or None for `router/__init__.py` and `router/__main__.py`, which are in none."""
+    """The package of a module, or None for `router/__init__.py` and `router/__main__.py`."""
     part = path.relative_to(ROUTER).parts[0].removesuffix(".py")
     return None if part.startswith("__") else part
 

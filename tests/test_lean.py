@@ -1,4 +1,4 @@
-"""Imports that come later, or not at all."""
+"""Postponed and suppressed imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log's summaries: first at once, then counted."""
+"""Summaries in the log: the first event is logged at once, the following ones are counted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from router.log import SUMMARY_INTERVAL_NS, FloodLog
 
 
 class Lines:
-    """Stands where a logger's method is called, and a clock that stands still until told otherwise."""
+    """Stands in for a logger's method and for the clock, which advances only when the test sets it."""
 
     def __init__(self) -> None:
         self.now = 0

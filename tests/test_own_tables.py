@@ -1,4 +1,4 @@
-"""Tests of the product use tables of their own, so that a team may edit `routes/` and `protos/`."""
+"""Tests of the router use their own tables, so that a team may edit `routes/` and `protos/`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("name", ["routes/rover.yaml", "protos/envelope.lock.json"])
 def test_no_test_reads_what_a_team_edits(name: str) -> None:
-    """Programs that tests start are not watched."""
+    """Does not see the programs that tests start."""
     for path in (Path(name), ROOT / name):
         with pytest.raises(AssertionError, match="which is the team's"):
             path.read_bytes()

@@ -1,4 +1,4 @@
-"""`make pictures` takes each picture from the running program while it shows what the picture is of."""
+"""`make pictures` takes each picture from the running program while the program shows its subject."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.gateway.browser import executable
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 300_000
-"""Bytes of a picture in the README."""
+"""Largest picture in the README, in bytes."""
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The tables that other tests rely on: who gets what, and whether the standard messages are in SI units."""
+"""The tables that other tests rely on: the targets of each payload case, and SI units in standard messages."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tests.tables import ROUTES
 
 Publish = Callable[..., dict[str, bytes]]
 EPHEMERAL = 32_768
-"""From this port on, Linux hands them out by itself."""
+"""First ephemeral port of Linux."""
 
-# As the system's list of payload cases has it: H a hardware board, R ROS on the rover, B the basestation.
+# As in the system's list of payload cases: H is a hardware board, R is ROS on the rover, B is the basestation.
 DIRECTIONS = """
     ph_info H to R (and B) sensor
     arm_ctrl R to H arm
@@ -77,7 +77,7 @@ def depths(table: RouteTable) -> dict[str, tuple[str, int | None]]:
 
 
 def flow(route: Route) -> tuple[set[str], set[str], bool]:
-    """Sources, destinations, and whether ROS hears of it."""
+    """The sources and destinations of a payload case, and whether it is published to ROS."""
     return (
         {source.value for source in route.sources} or {"ros"},
         {destination.endpoint.value for destination in route.destinations},
@@ -158,7 +158,7 @@ def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: 
 
 @pytest.fixture
 def published(rover: Program) -> Publish:
-    """A function that routes one payload and gives what was published, CDR bytes by topic."""
+    """A function that routes one payload and returns the published messages: CDR bytes by topic."""
 
     def route(case: str, **values: object) -> dict[str, bytes]:
         rehearsal = Rehearsal(rover)

@@ -1,4 +1,4 @@
-"""What is imported before a head start's threads run: on the rover's computer a module of medium size takes 3 ms."""
+"""Imports before a head start's threads run. A medium-sized module takes 3 ms on the rover's computer."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SLOW = {
     "argparse", "asyncio", "dataclasses", "hashlib", "inspect", "json", "logging", "pathlib", "pickle", "re",
     "subprocess", "tempfile", "typing", "yaml",
 }  # fmt: skip
-"""Modules of the standard library, which others import as well."""
+"""Modules of the standard library that other modules import anyway."""
 
 GROUND = {"router", "router.clock", "router.declared", "router.log"}
 NET = {"router.net", "router.net.kernel", "router.net.sockets"}
 
 
 def imported(script: str) -> set[str]:
-    """The modules that a script imports, without third parties: it finds none, nor what they have loaded at a start."""
+    """The modules that a script imports, without third-party packages, which it cannot find."""
     told = "\nimport sys; print(*sys.modules)"
     command = [sys.executable, "-S", "-c", script + told]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Background scheduling, threads that nothing can hold up, and the end of the process in spite of what is stuck."""
+"""Background scheduling, threads that nothing can block, and an exit in spite of stuck threads."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_process_ends_though_a_call_does_not() -> None:
 
 
 class StillbornThread(Thread):
-    """Python's part of it never runs, as if there were no memory for it, until `late`."""
+    """A thread whose Python code does not run until `late` is called, as when there is no memory for it."""
 
     late: Callable[[], None]
 

@@ -1,4 +1,4 @@
-"""Words on a command line set fields, and printed fields are such words."""
+"""Command-line words set fields, and fields are printed as such words."""
 
 from __future__ import annotations
 

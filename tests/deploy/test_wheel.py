@@ -137,6 +137,18 @@ def test_without_a_compiler_it_is_for_any_platform_and_says_what_it_lacks(tmp_pa
     assert "was not built, and nothing runs without it; install the router again where there is a C compiler" in said
 
 
+def test_the_sdist_makes_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=PATIENCE)
+    [sdist] = tmp_path.glob("*.tar.gz")
+    shutil.unpack_archive(sdist, tmp_path)
+    made = build(tmp_path / "dist", tmp_path / sdist.name.removesuffix(".tar.gz"))
+    assert made.name == wheel.name
+    files, expected = (zipfile.ZipFile(path) for path in (made, wheel))
+    assert files.namelist() == expected.namelist()
+    assert [name for name in files.namelist() if files.read(name) != expected.read(name)] == []
+
+
 @pytest.fixture
 def moved(tmp_path: Path) -> Path:
     """A checkout whose tables name protos of somebody else, with the lock beside them."""

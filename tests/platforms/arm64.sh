@@ -24,11 +24,7 @@ pip wheel -q --no-deps -w dist ./checkout
 ls dist
 pip install -q dist/*.whl
 du -sh venv
-say "init, validate, test"
-router init --rover rover
-(cd rover && router validate routes/ && router test routes/)
-say "a router from UDP to UDP"
-python3 checkout/tests/platforms/udp_to_udp.py venv/bin/router
+checkout/tests/platforms/installed.sh venv/bin/router
 say "the carrier: tests"
 pip install -q pytest pytest-xdist hypothesis
 cd checkout

@@ -8,16 +8,7 @@
 set -euo pipefail
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 folder=${ROUTER_PYTHONS:-$HOME/.cache/rover-router/pythons}
-
-find_python() {  # VERSION: prints the path of such an interpreter, on PATH or pyenv's
-  local candidate
-  for candidate in "$(command -v "python$1")" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$1".*/bin/python; do
-    if "$candidate" -c "import sys; sys.exit('%d.%d' % sys.version_info[:2] != '$1')" 2>/dev/null; then
-      printf '%s' "$candidate"
-      return
-    fi
-  done
-}
+. "$repository/deploy/find-python.sh"
 
 test_with() {  # VERSION PYTHON VARIABLE=VALUE...
   local clone=$folder/python$1 python=$2
@@ -31,15 +22,14 @@ test_with() {  # VERSION PYTHON VARIABLE=VALUE...
 mkdir -p "$folder"
 results=()
 status=0
-for version in 3.10 3.11 3.12 3.13; do
-  python=$(find_python $version)
-  if [ -z "$python" ]; then
+for version in "${supported_pythons[@]}"; do
+  if ! python=$(find_python "$version"); then
     results+=("Python $version: not found")
     continue
   fi
   log=$folder/python$version.log
-  printf 'Python %s: %s, writing to %s ...\n' $version "$python" "$log"
-  if test_with $version "$python" "$@" >"$log" 2>&1; then outcome=passed; else outcome=FAILED status=1; fi
+  printf 'Python %s: %s, writing to %s ...\n' "$version" "$python" "$log"
+  if test_with "$version" "$python" "$@" >"$log" 2>&1; then outcome=passed; else outcome=FAILED status=1; fi
   summary=$(grep -E '[0-9]+ (passed|failed|errors?)' "$log" | tail -n 1) || true
   results+=("Python $version: $outcome: ${summary:-$(tail -n 1 "$log")}")
 done
