@@ -93,7 +93,7 @@ def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Statu
     drawn = shown.map()
     assert (drawn["name"], drawn["keeps"]) == ("rover_router", None)
     assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
-    assert drawn["deadmen"]["manual_drive"] == "manual_brake"
+    assert drawn["deadmen"]["manual_drive"] == {"case": "manual_brake", "to": ["driving_board"]}
     board = next(node for node in drawn["nodes"] if node["key"] == "from:@sensor_board")
     assert (board["address"], board["role"]) == ("127.0.0.30:25008", "board")
 

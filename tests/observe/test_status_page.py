@@ -311,7 +311,7 @@ def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning
     running.count("messages_published", "imu_info", "imu_data", to=9)
     running.count("messages_filtered", "imu_info", "imu/mag", to=9)
     running.count("messages_filtered", "gps_info", "gps_data", to=9)
-    page.until(f"/◆\\s*1 of 3/.test({box('case:imu_info')}.innerText)")
+    page.until(f"/◆imu_data\\s*◇imu.mag/.test({box('case:imu_info')}.innerText)")
     page.until(f"{box('case:gps_info')}.innerText.includes('◇')")
     until_said(page, "All is well", "good")
     choose(page, "case:imu_info")
@@ -477,7 +477,7 @@ def test_a_reload_without_the_chosen_route_closes_its_details_and_one_with_it_op
       const key = "case:imu_info";
       const nodes = map.nodes.filter((node) => node.key !== key);
       const links = map.links.filter(({ start, end }) => start !== key && end !== key);
-      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links });
+      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links }, []);
       [chosen, pointedAt, document.querySelector("#name").textContent]"""
     assert page.evaluate(f"{{{without}}}") == [None, None, "Details"]
     page.until("document.querySelector('#name').textContent === 'imu_info'")
