@@ -500,7 +500,7 @@ def test_the_form_starts_at_the_defaults_and_sends_what_was_typed(gateway: FakeG
     assert before - 1 <= sent.pop("time") <= time.time() + 1
     data = {"linear": {"x": 0.25, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": -1}}
     assert sent == {"op": "publish", "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "data": data}
-    page.until("document.querySelector('#sent').textContent.startsWith('Sent 1, none refused.')")
+    page.until("document.querySelector('#sent').textContent.startsWith('Sent 1, none rejected.')")
 
 
 def test_every_kind_of_field_can_be_filled_in_and_integers_are_exact(gateway: FakeGateway, page: Page) -> None:
@@ -597,10 +597,10 @@ def test_a_refusal_is_shown_with_reason_and_detail(gateway: FakeGateway, page: P
     page.click("[form=form]")
     received(gateway)
     gateway.say({"op": "rejected", "reason": "stale", "detail": f"0.5 s old {HOSTILE}", "topic": "/cmd_vel"})
-    page.until("document.querySelector('#sent').textContent.includes('1 refused. Refused (stale): 0.5 s old <img')")
+    page.until("document.querySelector('#sent').textContent.includes('1 rejected. Rejected (stale): 0.5 s old <img')")
     assert page.evaluate("document.querySelector('#sent').className") == "bad"
     page.click("[form=form]")
-    page.until("document.querySelector('#sent').textContent.trim() === 'Sent 2, 1 refused.'")
+    page.until("document.querySelector('#sent').textContent.trim() === 'Sent 2, 1 rejected.'")
     assert page.evaluate("document.querySelector('#sent').className") == "good"
 
 

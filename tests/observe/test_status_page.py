@@ -413,7 +413,7 @@ def test_a_case_shows_its_numbers_and_its_last_value(running: FakeRunning, page:
     page.until("document.querySelector('#value')?.textContent.includes('accel_x: 1.5')")
     page.until("document.querySelector('#facts').textContent.includes('1\\u202f234')")
     assert "from sensor_board" in page.text("#facts")
-    assert "no subscriber (34 left out)" in page.text("#facts")
+    assert "no subscriber (34 filtered)" in page.text("#facts")
 
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
@@ -467,7 +467,7 @@ def test_texts_of_payloads_and_names_are_text_and_nothing_else(
         assert HOSTILE in page.text("#table")
         for case in cases:
             choose(page, f"case:{case}")
-            assert "None has come" in page.text("#facts")
+            assert "None received" in page.text("#facts")
             hostile.receive(
                 hostile.program.envelope.message_class(**{case: note}).SerializeToString(), ("127.0.0.2", 8)
             )
@@ -588,7 +588,7 @@ def assert_lost(page: Page) -> None:
     """Nobody can take what is shown for what is."""
     assert (page.text("#state"), page.evaluate("document.querySelector('#state').className")) == ("no answer", "bad")
     assert page.evaluate("document.title") == "▲ rover_router: connection to the router lost"
-    assert "What is shown below is of " in page.text("#todo")
+    assert "The numbers below are from " in page.text("#todo")
     for selector in ("#tiles", "#flow", "#facts"):
         style = page.evaluate(f"getComputedStyle(document.querySelector('{selector}')).filter")
         assert style == "grayscale(1)"
