@@ -1,6 +1,6 @@
 """HTTP of a running router: metrics, health, the status page; and for programs on the same computer taps and orders.
 
-    GET  /             the status page; /status.json and /map.json are what it asks for
+    GET  /             the status page, which asks for /status.json, /recent.json and /map.json
     GET  /metrics      for Prometheus
     GET  /health.json  what is wrong, for `router status`, `top` and doctor
     GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck

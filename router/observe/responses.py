@@ -108,6 +108,7 @@ class Responder:
         self._get: Mapping[str, Callable[[Query], Response]] = {
             "/": lambda _: self._page,
             "/status.json": lambda _: self._cache.get("status", self._numbers),
+            "/recent.json": lambda _: self._cache.get("recent", lambda: _json(HTTPStatus.OK, self._status.recent())),
             "/map.json": lambda _: self._map(),
             "/health.json": lambda _: self._cache.get("health", lambda: _json(HTTPStatus.OK, self._status.health())),
             "/healthz": lambda _: self._healthz(),

@@ -103,17 +103,17 @@ def _sources(route: Route, table: RouteTable) -> Iterator[Node]:
         if source.value == ANY:
             yield Node(f"from:@{ANY}", 0, NodeKind.ANYONE, "any sender")
         else:
-            yield _endpoint(table.endpoints[source.value], "from", 0)
+            yield endpoint_node(table.endpoints[source.value], "from", 0)
 
 
 def _targets(route: Route, table: RouteTable) -> Iterator[Node]:
     for destination in route.destinations:
-        yield _endpoint(table.endpoints[destination.endpoint.value], "to", 2)
+        yield endpoint_node(table.endpoints[destination.endpoint.value], "to", 2)
     for topic in route.topics:
         yield Node(f"to:{topic.topic.value}", 2, NodeKind.TOPIC, topic.topic.value, topic.type_name)
 
 
-def _endpoint(endpoint: Endpoint, side: str, column: int) -> Node:
+def endpoint_node(endpoint: Endpoint, side: str, column: int) -> Node:
     address, role = str(endpoint.address.value), endpoint.kind.value
     return Node(
         f"{side}:@{endpoint.name}", column, NodeKind.ENDPOINT, endpoint.name, f"{role}, {address}", address, role

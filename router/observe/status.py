@@ -8,7 +8,7 @@ from typing import Any
 from router.clock import wall_ns
 from router.compiler.metrics import INTENDED_REASONS
 from router.observe.last_values import LastValues
-from router.observe.route_map import nodes_and_edges
+from router.observe.route_map import endpoint_node, nodes_and_edges
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
 from router.observe.watch import Health
@@ -26,6 +26,7 @@ PATHS = {
     "messages_collected": "routes {route} targets {target} collected",
     "route_last_message_timestamp_seconds": "routes {route} last",
     "deadman_trips": "routes {route} deadman_trips",
+    "deadman_datagrams_sent": "routes {route} deadman_sent {destination}",
     "gateway_clients": "routes {route} clients",
     "gateway_topics": "routes {route} topics {state}",
     "client_messages_dropped": "routes {route} clients_missed {reason}",
@@ -75,6 +76,12 @@ class Status:
             "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }
+
+    def recent(self) -> Json:
+        """The numbers of the last seconds, oldest first and without latencies: a page that opens has rates at once."""
+        snapshots = self._health.look().snapshots
+        boot = wall_ns() / 1e9 - snapshots[-1].at  # a look has the boot clock
+        return {"numbers": [{"at": boot + each.at, **numbers(each)} for each in snapshots]}
 
     def health(self) -> Json:
         """What is wrong. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
@@ -137,8 +144,10 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 def _map_json(table: RouteTable) -> Json:
     """`pages`: the gateways that are a page for browsers, with the address that they wait at. `deadmen`: the payload
-    case that each route's deadman sends."""
+    case that each route's deadman sends, and the endpoints that get it."""
     nodes, edges = nodes_and_edges(table)
+    deadmen = {route.name: route.deadman for route in table.routes if route.deadman is not None}
+    halted = [endpoint_node(table.endpoints[to.value], "to", 2) for each in deadmen.values() for to in each.to]
     return {
         "name": table.node.name,
         "listeners": {name: str(listener.address.value) for name, listener in table.listeners.items()},
@@ -147,7 +156,9 @@ def _map_json(table: RouteTable) -> Json:
             for gateway in table.gateways.values()
             if gateway.transport.value is Transport.WEBSOCKET and gateway.address is not None
         },
-        "deadmen": {route.name: route.deadman.case.value for route in table.routes if route.deadman is not None},
-        "nodes": [{**asdict(node), "kind": node.kind.value} for node in nodes],
+        "deadmen": {
+            route: {"case": each.case.value, "to": [to.value for to in each.to]} for route, each in deadmen.items()
+        },
+        "nodes": [{**asdict(node), "kind": node.kind.value} for node in dict.fromkeys([*nodes, *halted])],
         "links": [asdict(edge) for edge in edges],
     }

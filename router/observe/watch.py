@@ -19,6 +19,7 @@ METRICS = {kind.metric for kind in Kind} | {
     "deadman_datagrams_sent",
     "deadman_trips",
     "gateway_clients",
+    "messages_filtered",
     "messages_received",
     "mirror_dropped",
     *DELIVERED,

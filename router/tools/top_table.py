@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, INTENDED_REASONS
 from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered
 from router.values import age_text, rate_text, shortened
@@ -94,10 +94,11 @@ def _name(row: RouteRow, width: int) -> Text:
 
 
 def targets_text(targets: Sequence[TargetRow], width: int) -> Text:
-    """Each with its rate, and with `!` while it loses messages.
+    """Each target with its rate; those that lose messages now come first, with a `!`.
 
-    Where that is too wide, names are shortened, and then the last targets only counted.
+    If that is too wide, names are shortened, and then the last targets are only counted.
     """
+    targets = sorted(targets, key=lambda target: not target.is_losing)
     text = Text()
     longest = max((len(target.name) for target in targets), default=0)
     for count in range(len(targets), 0, -1):
@@ -138,8 +139,8 @@ def _drops(row: RouteRow) -> Text:
 
 
 def reasons_text(dropped: Mapping[str, int]) -> str:
-    """`12 stale, 3 queue_full`, the largest first."""
-    by_count = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
+    """`12 stale, 3 queue_full`, the largest first, and those that the table asks for last."""
+    by_count = sorted(dropped.items(), key=lambda item: (item[0] in INTENDED_REASONS, -item[1], item[0]))
     return ", ".join(f"{count} {reason}" for reason, count in by_count)
 
 

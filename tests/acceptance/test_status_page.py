@@ -46,12 +46,12 @@ def test_a_page_says_that_its_router_is_gone_and_recovers(tmp_path: Path, browse
             page = browser.open(f"http://127.0.0.1:{place.metrics}/")
             page.until("answers.length > 2")
             until_well(page)
-            assert page.evaluate(RECEIVED) == "30 in all"
+            assert page.evaluate(RECEIVED) == "30 total"
             assert router.stop(signal.SIGKILL) == -signal.SIGKILL
         until_lost(page)
         with RouterProcess(tmp_path, table) as router:  # at the same port, with counters from 0
             feed(place, 40)
-            page.until(f"{RECEIVED} === '40 in all' && answers.length > 2")
+            page.until(f"{RECEIVED} === '40 total' && answers.length > 2")
             until_well(page)
             assert page.evaluate("answers.every(({started}) => started === now().started)")  # nothing compares two runs
             router.process.send_signal(signal.SIGSTOP)  # its port goes on taking connections

@@ -124,13 +124,82 @@ def test_a_topic_that_stops_is_stale_and_one_that_left_the_list_is_gone(gateway:
     for value in range(4):
         gateway.data("/imu", {"x": value})
         time.sleep(0.1)
+    choose(page, "/once")
     page.until(f"{row('/imu')}.className === 'stale' && {row('/imu')}.innerText.includes('stale')")
-    assert page.evaluate(f"{row('/once')}.className") == ""
+    assert page.evaluate(f"{row('/once')}.className") == "chosen"
     gateway.list_topics(["/once"])
     page.until(f"{row('/imu')}.className === 'gone' && {row('/imu')}.innerText.includes('gone')")
     gateway.list_topics(["/imu", "/once"])
     gateway.data("/imu", {"x": 9})
     page.until(f"{row('/imu')}.className === ''")
+
+
+def test_a_topic_on_which_nothing_is_published_is_dimmed(gateway: FakeGateway, page: Page) -> None:
+    gateway.rows = [{"topic": f"/{name}", "type": "a/msg/B", "rate": rate} for name, rate in (("dead", 0), ("on", 9))]
+    gateway.data("/on", {"x": 0})
+    choose(page, "/on")
+    page.until(f"{row('/dead')}?.className === 'dead'")
+    faint, text = (page.evaluate(f"getComputedStyle({row(name)}).color") for name in ("/dead", "/on"))
+    assert faint != text
+    gateway.data("/dead", {"x": 0})  # the last value of a latched topic
+    page.until(f"{row('/dead')}.className === ''")
+    page.evaluate("topics.get('/dead').arrived -= 60000")
+    page.until(f"{row('/dead')}.className === 'dead'")
+
+
+def test_types_and_names_are_not_cut(gateway: FakeGateway, page: Page) -> None:
+    long = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+    gateway.list_topics(["/a"], type_name=long)
+    gateway.data("/a", {"x": 1}, long)
+    cell = f"{row('/a')}?.querySelector('.type')"
+    for size in ((1366, 768), (1920, 1080)):
+        show_at(page, size)
+        page.until(f"{cell}?.textContent === '{long}' && {cell}.scrollWidth <= {cell}.clientWidth")
+
+
+STAMP = schema("Time", field("sec", "int32"))
+IMU = schema(
+    "Imu",
+    field("header", schema("Header", field("stamp", STAMP), field("frame_id", "string"))),
+    field("orientation", schema("Quaternion", *(field(axis, "float64") for axis in "xyzw"))),
+    field("angular_velocity", schema("Vector3", *(field(axis, "float64") for axis in "xyz"))),
+    field("parts", schema("Part", field("name", "string"), field("id", "uint8")), is_array=True),
+)
+SORTED = {
+    "angular_velocity": {"x": 4, "y": 5, "z": 6},
+    "header": {"frame_id": "imu_link", "stamp": {"sec": 7}},
+    "orientation": {"w": 1, "x": 0, "y": 0, "z": 0},
+    "parts": [{"id": 1, "name": "a"}],
+}
+
+
+def test_fields_are_in_the_order_of_the_message(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/imu", SORTED)
+    choose(page, "/imu")
+    keys = "[...document.querySelectorAll('#tree .inner .key')].map(e => e.textContent.replace(': ', ''))"
+    page.until(f"{keys}[0] === 'angular_velocity'")
+    gateway.say({"op": "schema", "type": "sensor_msgs/msg/Imu", "time": 1.0, "schema": IMU})
+    ordered = ["header", "stamp", "sec", "frame_id", "orientation", *"xyzw", "angular_velocity", *"xyz", "parts", "[0]"]
+    page.until(f"{keys}.join() === {json.dumps(','.join([*ordered, 'name', 'id']))}")
+    page.until(f"{row('/imu')}.querySelector('.preview').textContent.startsWith('orientation: {{x: 0, y: 0')")
+
+
+def test_on_a_wide_screen_the_first_topic_with_a_rate_is_open(gateway: FakeGateway, page: Page) -> None:
+    show_at(page, PHONE)
+    gateway.rows = [{"topic": f"/{name}", "type": "a/msg/B", "rate": 5 * (name != "a")} for name in "abc"]
+    gateway.say(*(data_document(f"/{name}", {"x": 1}) for name in "abc"))
+    page.until(f"{row('/b')}?.innerText.includes('5.0 Hz')")
+    assert page.evaluate("chosen") is None
+    show_at(page, (1366, 768))
+    page.until("document.querySelector('#chosen').textContent === '/b'")
+    page.until("document.querySelector('#tree').textContent.includes('x: 1')")
+
+
+def test_on_a_phone_sending_does_not_outshine_the_topics(page: Page) -> None:
+    show_at(page, PHONE)
+    ground = "getComputedStyle(document.querySelector('{}')).backgroundColor"
+    page.until("document.querySelector('#open-send').checkVisibility()")
+    assert page.evaluate(ground.format("#open-send")) == page.evaluate(ground.format("body"))
 
 
 def test_only_rows_in_sight_are_rendered(gateway: FakeGateway, page: Page) -> None:
@@ -252,6 +321,7 @@ def test_numbers_are_plotted_with_the_keyboard(gateway: FakeGateway, page: Page)
 
 
 def test_a_gap_in_the_values_is_a_gap_in_the_plot(gateway: FakeGateway, page: Page) -> None:
+    show_at(page, (1920, 1080))
     gateway.data("/imu", {"x": 1.0})
     choose(page, "/imu")
     plot(page, "/imu", "x")
@@ -430,7 +500,7 @@ def test_the_form_starts_at_the_defaults_and_sends_what_was_typed(gateway: FakeG
     assert before - 1 <= sent.pop("time") <= time.time() + 1
     data = {"linear": {"x": 0.25, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": -1}}
     assert sent == {"op": "publish", "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "data": data}
-    page.until("document.querySelector('#sent').textContent.startsWith('Sent 1, none refused.')")
+    page.until("document.querySelector('#sent').textContent.startsWith('Sent 1, none rejected.')")
 
 
 def test_every_kind_of_field_can_be_filled_in_and_integers_are_exact(gateway: FakeGateway, page: Page) -> None:
@@ -527,10 +597,10 @@ def test_a_refusal_is_shown_with_reason_and_detail(gateway: FakeGateway, page: P
     page.click("[form=form]")
     received(gateway)
     gateway.say({"op": "rejected", "reason": "stale", "detail": f"0.5 s old {HOSTILE}", "topic": "/cmd_vel"})
-    page.until("document.querySelector('#sent').textContent.includes('1 refused. Refused (stale): 0.5 s old <img')")
+    page.until("document.querySelector('#sent').textContent.includes('1 rejected. Rejected (stale): 0.5 s old <img')")
     assert page.evaluate("document.querySelector('#sent').className") == "bad"
     page.click("[form=form]")
-    page.until("document.querySelector('#sent').textContent.trim() === 'Sent 2, 1 refused.'")
+    page.until("document.querySelector('#sent').textContent.trim() === 'Sent 2, 1 rejected.'")
     assert page.evaluate("document.querySelector('#sent').className") == "good"
 
 

@@ -6,10 +6,12 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from router.compiler import check_table
 from router.compiler.metrics import METRICS
 from router.observe import last_values
 from router.observe.responses import PAGE
@@ -17,6 +19,7 @@ from router.observe.status import IF_ANY, PATHS, Status
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeHealth, FakeRunning, sim_program
+from tests.tables import PROTOS
 
 PROGRAM = sim_program()
 BOARD, STRANGER = ("127.0.0.30", 25008), ("127.0.0.99", 1)
@@ -48,8 +51,8 @@ def imu(**fields: Any) -> bytes:
 
 @pytest.mark.parametrize(
     "shared",
-    [r"^const \$ = [^\n]*$", r"^function make\(.*?^}$", r"^function setText\(.*?^}$"],
-    ids=["$", "make", "setText"],
+    [r"^const \$ = [^\n]*$", *(rf"^function {name}\(.*?^}}$" for name in ("make", "setText", "rulerOf"))],
+    ids=["$", "make", "setText", "rulerOf"],
 )
 def test_what_both_pages_have_is_the_same_in_both(shared: str) -> None:
     """Each page is one file, so that it needs nothing else; what they share must not drift apart."""
@@ -93,9 +96,53 @@ def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Statu
     drawn = shown.map()
     assert (drawn["name"], drawn["keeps"]) == ("rover_router", None)
     assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
-    assert drawn["deadmen"]["manual_drive"] == "manual_brake"
+    assert drawn["deadmen"]["manual_drive"] == {"case": "manual_brake", "to": ["driving_board"]}
     board = next(node for node in drawn["nodes"] if node["key"] == "from:@sensor_board")
     assert (board["address"], board["role"]) == ("127.0.0.30:25008", "board")
+
+
+ALSO_HALTED = f"""\
+version: 1
+envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
+listen: {{here: {{address: 127.0.0.1:25000}}}}
+endpoints:
+  basestation: {{address: 127.0.0.10:9, kind: tool}}
+  driving_board: {{address: 127.0.0.20:9, kind: board}}
+  arm_board: {{address: 127.0.0.30:9, kind: board}}
+routes:
+  manual_drive:
+    source: basestation
+    destinations: driving_board
+    ttl: 200ms
+    deadman: {{timeout: 1s, send: {{manual_brake: {{brake: true}}}}, to: [driving_board, arm_board]}}
+"""
+
+
+def test_the_map_has_a_board_that_only_a_deadman_sends_to(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(ALSO_HALTED)
+    program = check_table(table).program
+    assert program is not None
+    running = FakeRunning(program)
+    with closing(Status(running, cast("Health", FakeHealth(running)))) as shown:
+        drawn = shown.map()
+    running.mirror.close()
+    assert drawn["deadmen"]["manual_drive"]["to"] == ["driving_board", "arm_board"]
+    assert [node["key"] for node in drawn["nodes"] if node["column"] == 2] == ["to:@driving_board", "to:@arm_board"]
+
+
+def test_the_numbers_of_the_last_seconds_have_what_the_page_compares(running: FakeRunning, shown: Status) -> None:
+    running.count("messages_received", "imu_info", "sensor_board", to=9)
+    running.count("messages_filtered", "imu_info", "imu_data", to=3)
+    running.count("deadman_datagrams_sent", "manual_drive", "driving_board", to=2)
+    found, after = shown.recent()["numbers"], shown.numbers()
+    assert [each["at"] for each in found] == sorted(each["at"] for each in found)
+    assert found[-1]["at"] == pytest.approx(after["at"], abs=1)
+    assert found[0]["routes"]["imu_info"]["sources"] == {"sensor_board": 0}
+    newest = found[-1]["routes"]
+    assert newest["imu_info"]["sources"] == {"sensor_board": 9}
+    assert newest["imu_info"]["targets"] == after["routes"]["imu_info"]["targets"]
+    assert newest["manual_drive"]["deadman_sent"] == {"driving_board": 2}
 
 
 def test_the_map_says_how_much_can_be_saved(running: FakeRunning) -> None:

@@ -282,6 +282,28 @@ def test_a_silent_operator_is_said_before_the_deadmen_that_act(running: FakeRunn
         assert "▲ silent" in page.evaluate(f"{box(key)}.innerText")
 
 
+def test_a_deadman_that_sends_is_drawn_from_its_commands_to_the_board(
+    running: FakeRunning, health: FakeHealth, page: Page
+) -> None:
+    until_compared(page)
+    drawn = "links.find((link) => link.isDeadman && link.route === 'manual_drive')"
+    is_seen = f"{drawn}.line.checkVisibility() && {drawn}.mark.checkVisibility()"
+    assert not page.evaluate(is_seen)
+    running.count("deadman_active", "manual_drive", to=1)
+    running.count("deadman_datagrams_sent", "manual_drive", "driving_board", to=40)
+    page.until(f"{drawn}.state === 'sending' && {is_seen}")
+    commands = line("case:manual_drive", "to:@driving_board")
+    assert page.evaluate(f"{drawn}.line.getAttribute('d') === {commands}.line.getAttribute('d')")
+    assert page.evaluate(f"getComputedStyle({drawn}.line).strokeDasharray") == "3px, 3px"
+    page.until(f"/[0-9]\\/s/.test({box('to:@driving_board')}.textContent)")
+    choose(page, "case:manual_drive")
+    assert "manual_brake, sent by the deadman" in page.text("#facts")
+    health.parked = 27 * 60
+    page.until(f"{drawn}.state === 'calm' && {is_seen}")
+    running.count("deadman_active", "manual_drive", to=0)
+    page.until(f"!({is_seen})")
+
+
 def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
     running: FakeRunning, health: FakeHealth, page: Page
 ) -> None:
@@ -311,7 +333,7 @@ def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning
     running.count("messages_published", "imu_info", "imu_data", to=9)
     running.count("messages_filtered", "imu_info", "imu/mag", to=9)
     running.count("messages_filtered", "gps_info", "gps_data", to=9)
-    page.until(f"/◆\\s*1 of 3/.test({box('case:imu_info')}.innerText)")
+    page.until(f"/◆imu_data\\s*◇imu.mag/.test({box('case:imu_info')}.innerText)")
     page.until(f"{box('case:gps_info')}.innerText.includes('◇')")
     until_said(page, "All is well", "good")
     choose(page, "case:imu_info")
@@ -320,6 +342,20 @@ def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning
     assert page.evaluate("getComputedStyle(nodes.get('case:gps_info').chip).color") != page.evaluate(
         "getComputedStyle(document.querySelector('#legend .bad')).color"
     )
+
+
+def test_topics_are_named_as_far_as_there_is_room(page: Page) -> None:
+    shown = f"{box('case:imu_info')}.querySelector('.chip').innerText"
+    for size, text in (
+        ((1920, 1080), "^·imu_data·imu/data_raw·imu/mag$"),
+        (DESKTOP, r"^·imu_data.*\+[12]$"),
+        ((800, 600), "^·3$"),
+        (PHONE, "^·imu_data"),
+    ):
+        accessibility.show_at(page, size)
+        page.until(f"/{text.replace('/', '.')}/.test({shown})")
+    accessibility.show_at(page, DESKTOP)
+    assert page.evaluate(f"{box('case:drive_motor')}.innerText.includes('←drive_motor')")
 
 
 def test_a_topic_of_a_case_that_falls_silent_keeps_its_state(running: FakeRunning, page: Page) -> None:
@@ -377,7 +413,7 @@ def test_a_case_shows_its_numbers_and_its_last_value(running: FakeRunning, page:
     page.until("document.querySelector('#value')?.textContent.includes('accel_x: 1.5')")
     page.until("document.querySelector('#facts').textContent.includes('1\\u202f234')")
     assert "from sensor_board" in page.text("#facts")
-    assert "no subscriber (34 left out)" in page.text("#facts")
+    assert "no subscriber (34 filtered)" in page.text("#facts")
 
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
@@ -431,7 +467,7 @@ def test_texts_of_payloads_and_names_are_text_and_nothing_else(
         assert HOSTILE in page.text("#table")
         for case in cases:
             choose(page, f"case:{case}")
-            assert "None has come" in page.text("#facts")
+            assert "None received" in page.text("#facts")
             hostile.receive(
                 hostile.program.envelope.message_class(**{case: note}).SerializeToString(), ("127.0.0.2", 8)
             )
@@ -450,13 +486,41 @@ def test_texts_of_payloads_and_names_are_text_and_nothing_else(
     assert hostile.failures == []
 
 
-def test_before_there_is_a_second_answer_no_rate_is_told(page: Page) -> None:
+TILES = "[...document.querySelectorAll('#tiles dd > span')].map((each) => each.textContent)"
+
+
+def test_rates_are_there_with_the_first_answer(browser: Browser, running: FakeRunning, health: FakeHealth) -> None:
+    with closing(served(running, health=health)) as server:
+        time.sleep(0.6)  # the router has counted before the page opens
+        running.count("messages_received", "imu_info", "sensor_board", to=600)
+        running.count("datagrams_received", "rover", to=600)
+        page = browser.open("about:blank")
+        hold = "const get = window.fetch; let asked = 0; window.fetch = (path, ...more) => "
+        once = "path === '/status.json' && asked++ ? new Promise(() => {}) : get(path, ...more);"
+        page.call("Page.addScriptToEvaluateOnNewDocument", source=hold + once)
+        page.go(f"http://{server.address}/")
+        page.until("document.querySelector('#state').textContent === 'running'")
+        assert page.evaluate("asked") == 1
+        assert page.evaluate(f"{TILES}[0]") not in ("\N{EM DASH}", "0/s")
+        assert page.evaluate(f"{box('case:imu_info')}.innerText").endswith("/s")
+        page.close()
+
+
+def test_what_nobody_counted_is_not_drawn_as_zero(page: Page) -> None:
     page.until("answers.length > 1")
-    numbers = "[...document.querySelectorAll('#tiles dd > span')].map((each) => each.textContent)"
-    first = page.evaluate(f"answers = [now()]; render(); {numbers}")
-    assert first == ["—", "—", "4 of 4", "—", "—", "—"]
-    page.until(f"answers.length > 1 && {numbers}[0] === '0/s'")
-    assert page.evaluate(numbers) == ["0/s", "0/s", "4 of 4", "0", "0", "0"]
+    start = f"parseFloat({box('case:imu_info')}.querySelector('.base').getAttribute('d').slice(1))"
+    page.evaluate("take({ ...now(), at: now().at + 20 }, []); render()")
+    assert 30 < page.evaluate(start) < 40  # of 60 s
+    page.evaluate("answers = [now()]; render()")
+    assert page.evaluate(f"{box('case:imu_info')}.querySelector('.base').getAttribute('d')") == ""
+
+
+def test_where_nothing_can_be_compared_no_rate_is_told(page: Page) -> None:
+    page.until("answers.length > 1")
+    first = page.evaluate(f"answers = [now()]; render(); {TILES}")
+    assert first == ["\N{EM DASH}", "\N{EM DASH}", "4 of 4", "\N{EM DASH}", "\N{EM DASH}", "\N{EM DASH}"]
+    page.until(f"answers.length > 1 && {TILES}[0] === '0/s'")
+    assert page.evaluate(TILES) == ["0/s", "0/s", "4 of 4", "0", "0", "0"]
 
 
 def test_pointing_shows_for_a_moment_and_clicking_keeps(page: Page) -> None:
@@ -477,7 +541,7 @@ def test_a_reload_without_the_chosen_route_closes_its_details_and_one_with_it_op
       const key = "case:imu_info";
       const nodes = map.nodes.filter((node) => node.key !== key);
       const links = map.links.filter(({ start, end }) => start !== key && end !== key);
-      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links });
+      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links }, []);
       [chosen, pointedAt, document.querySelector("#name").textContent]"""
     assert page.evaluate(f"{{{without}}}") == [None, None, "Details"]
     page.until("document.querySelector('#name').textContent === 'imu_info'")
@@ -524,7 +588,7 @@ def assert_lost(page: Page) -> None:
     """Nobody can take what is shown for what is."""
     assert (page.text("#state"), page.evaluate("document.querySelector('#state').className")) == ("no answer", "bad")
     assert page.evaluate("document.title") == "▲ rover_router: connection to the router lost"
-    assert "What is shown below is of " in page.text("#todo")
+    assert "The numbers below are from " in page.text("#todo")
     for selector in ("#tiles", "#flow", "#facts"):
         style = page.evaluate(f"getComputedStyle(document.querySelector('{selector}')).filter")
         assert style == "grayscale(1)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import pty
+import re
 import sys
 from dataclasses import replace
 
@@ -146,6 +147,17 @@ def test_targets_are_shortened_in_their_middle_and_then_counted() -> None:
     assert targets_text(targets, 42).plain == "sensor_…/raw_0 120  sensor_…/raw_1 120  +1"
     assert targets_text(targets, 10).plain == "se…0 120 …"
     assert targets_text((), 16).plain == ""
+
+
+def test_a_target_that_loses_messages_is_shown_first() -> None:
+    row = route("imu_info", 2, 3)
+    *others, last = row.targets
+    losing = replace(last, is_losing=True, dropped={"rate_limited": 500, "queue_full": 12})
+    seen = replace(FULL, routes=(replace(row, targets=(*others, losing)),))
+    lines = printed(Screen(seen, "title", Order.TABLE, 24), 80)
+    line = next(line for line in lines if line.startswith("imu_info"))
+    assert re.search(r"!sen\S+2 120 \+2 ", line), line
+    assert "!12 queue_full" in line
 
 
 def test_latencies_are_left_out_where_there_is_no_room() -> None:
