@@ -13,6 +13,7 @@ from typing import NamedTuple, NoReturn
 
 import pytest
 
+from tests.boards.board import skip_without_nanopb
 from tests.docs_commands import Block, Command, File, blocks, commands, steps
 from tests.namespaces import computers
 
@@ -72,6 +73,8 @@ def test_commands_of_a_page_print_what_it_shows(page: Path, tmp_path: Path) -> N
         pytest.skip("it has no commands")
     if missing := [program for program in NEEDS if shutil.which(program) is None]:
         pytest.skip(f"needs {', '.join(missing)}")
+    if any(isinstance(step, Command) and "-lprotobuf-nanopb" in step.text for step in todo):
+        skip_without_nanopb()
     clone = tmp_path / "rover-router"
     fresh_clone(clone)
     go_through(todo, clone, name(page), tmp_path)

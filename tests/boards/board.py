@@ -24,10 +24,14 @@ _HEADERS = (Path("/usr/include"), Path("/usr/include/nanopb"))
 """Where Debian's packages have nanopb's, by version."""
 
 
-def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
-    """The board for a message `envelope` of the `.proto` file `header`, as a program in `folder`."""
+def skip_without_nanopb() -> None:
     if not any((headers / "pb_decode.h").exists() for headers in _HEADERS):
         pytest.skip("needs nanopb's library for C (libnanopb-dev)")
+
+
+def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
+    """The board for a message `envelope` of the `.proto` file `header`, as a program in `folder`."""
+    skip_without_nanopb()
     names = [path.relative_to(protos).as_posix() for path in sorted(protos.rglob("*.proto"))]
     generator = [sys.executable, "-m", "nanopb.generator.nanopb_generator", "-q", "-I", ".", "-D", str(folder)]
     subprocess.run([*generator, *names], cwd=protos, check=True, capture_output=True, timeout=60)
