@@ -104,7 +104,7 @@ class SchemaPage:
             yield f"At `{section.path}`. {prose(outer.get('description', found.get('description', '')))}"
             yield ""
             if "then" not in section.schema and (examples := outer.get("examples")):
-                yield from (f"Such as `{section.path.rpartition('.')[2].lower()}: {flow(examples[0])}`.", "")
+                yield from (f"For example `{section.path.rpartition('.')[2].lower()}: {flow(examples[0])}`.", "")
             yield from self._table(found, section.schema)
 
     def _table(self, found: Schema, name: str) -> Iterator[str]:
