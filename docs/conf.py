@@ -1,4 +1,4 @@
-"""Sphinx builds the site of these pages: `make docs`. The pages are Markdown that code hosts show as well."""
+"""Sphinx builds the site of these pages: `make docs`. Code hosts also show these Markdown pages."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ source_suffix = {".md": "markdown"}
 exclude_patterns = ["pictures/*"]
 smartquotes = False
 
-# Anchors are those of code hosts, which MyST's own function gives; tests/test_docs.py compares.
+# MyST's own function gives the same anchors as code hosts; tests/test_docs.py compares them.
 myst_heading_anchors = 4
 
-# An example may leave out what does not matter (`...`), which its language does not allow.
+# An example may leave out irrelevant parts (`...`), which its language does not allow.
 suppress_warnings = ["misc.highlighting_failure"]
 highlight_language = "text"
 
@@ -38,7 +38,7 @@ html_theme_options = {
     "navigation_with_keys": True,
 }
 
-# Only commands are copied, without their prompts.
+# The copy button copies only commands, without prompts.
 copybutton_prompt_text = r"\$ |> "
 copybutton_prompt_is_regexp = True
 copybutton_line_continuation_character = "\\"

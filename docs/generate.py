@@ -1,6 +1,6 @@
-"""Writes the reference pages that have their truth in the code: `python docs/generate.py`.
+"""Writes the reference pages that come from the code: `python docs/generate.py`.
 
-tests/test_docs.py fails when a page is not what this would write.
+tests/test_docs.py fails if a page differs from what this would write.
 """
 
 from __future__ import annotations
@@ -38,46 +38,46 @@ RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _KEYS = """\
-How they work together is in [the route table](table.md). Keys inside a key are written with a dot.
+[The route table](table.md) explains how they work together. A dot separates a key from the keys inside it.
 
-A **time** has its unit: `500us`, `20ms`, `1.5 s`, `10min`, `1h`. A **size** is in `B`, `kB`, `KiB`, `MB`, `MiB`, on
-disk also `GB`, `GiB`. A **rate** is in `Hz`, or a number. `${NAME}` and `${NAME:-default}` may stand in any value.
+A **time** has a unit: `500us`, `20ms`, `1.5 s`, `10min`, `1h`. A **size** is in `B`, `kB`, `KiB`, `MB`, `MiB`, on
+disk also `GB`, `GiB`. A **rate** is in `Hz`, or a number. Any value may contain `${NAME}` and `${NAME:-default}`.
 
-At the top:"""
+At the top level:"""
 _TEST_KEYS = """\
-[Testing tables](../guides/test-tables.md) says how they work together. A **time** has its unit: `300ms`, `2 s`.
+[Testing tables](../guides/test-tables.md) explains how they work together. A **time** has a unit: `300ms`, `2 s`.
 
-At the top:"""
+At the top level:"""
 _COMMANDS = """\
-`router VERB --help` says the same. Every command is about `routes/rover.yaml`, unless `-t TABLE` or the variable
-`ROUTER_TABLE` names another table. `eval "$(router --completion bash)"`, or `zsh`, has the shell complete verbs and
-options, and the table's payload cases, fields, endpoints and topics; in fish it is
+`router VERB --help` prints the same text. Every command uses `routes/rover.yaml`, unless `-t TABLE` or the variable
+`ROUTER_TABLE` names another table. `eval "$(router --completion bash)"`, or `zsh`, lets the shell complete verbs and
+options, and the table's payload cases, fields, endpoints and topics; in fish, use
 `router --completion fish | source`.
 """
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
-and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
-frames, the queue of a `bandwidth`, what `on_limit: latest` holds. Delivered is sent or published. With `for_each`,
-each element is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
+and target, accepted = delivered + dropped + filtered + collected + waiting + held. Held messages are in open frames,
+in the queue of a `bandwidth`, or held by `on_limit: latest`. Delivered means sent or published. With `for_each`, each
+element is a message. A deadman's datagrams are counted only in its own metrics, and their bytes nowhere."""
 _COMMANDED = """\
-`command` is `true` for messages that go to a board or feed a deadman, and for what clients of a gateway publish where
-`inbound` has a `ttl` or a deadman; else `false`."""
+`command` is `true` for messages that go to a board or feed a deadman, and for messages of gateway clients if `inbound`
+has a `ttl` or a deadman; else `false`."""
 _GATEWAYS = """\
-A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
-its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
-For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
-topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
-rejected nor accepted. [Gateways](gateway-protocol.md#counters) has how these counters balance."""
+The name of a [gateway](table.md#gateways) is the `listener` and the `route` of its metrics. Messages to clients have
+`clients` as target, and the transport (`udp`, `tcp`, `websocket`, `zenoh`) as destination; messages from clients have
+`clients` as source, and the reasons of routes if they are dropped. The `route` of an inbound topic's deadman is gateway
+and topic: `vr_headset:/cmd_vel`. Answered requests for schemas count as received, and neither as rejected nor as
+accepted. The [gateway protocol](gateway-protocol.md#counters) says how these counters balance."""
 _OWN = """\
-[Recordings](../guides/record-and-replay.md) and taps get datagrams beside routing: what they miss is counted here only.
-A reload keeps all counters: the series of a route that is gone stays as long as the process, if it counted anything."""
+[Recordings](../guides/record-and-replay.md) and taps do not affect routing: datagrams that they miss are counted only
+here. A reload keeps all counters: the series of a removed route remain until the process ends, unless they are 0."""
 _LOG = """\
-The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
-the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
-last line comes; metrics are up to date."""
+The first drop of a kind (route, target, reason) is logged at once, further ones in at most one line per 10 s. That line
+shows the last drop, and the number of drops (`more`) in the `in_seconds` before it. So a flood may be over when its
+last line appears; metrics are up to date."""
 _DURATION = """\
-`router_route_duration_seconds` ends when a datagram is forwarded, and waits for the thread that publishes it on topics;
-of a message from ROS, when all targets are served. Its upper bounds, in microseconds:"""
+`router_route_duration_seconds` ends when a datagram has been forwarded and queued for the thread that publishes it on
+topics; for a message from ROS, when all targets are served. Its upper bounds, in microseconds:"""
 
 
 def keys_page() -> str:
@@ -116,13 +116,13 @@ def metrics_page() -> str:
         name = f"router_{metric.name}_total" if kind == "counter" else f"router_{metric.name}"
         lines.append(f"| `{name}` | {kind} | {', '.join(metric.exported_labels)} | {metric.help} |")
     lines += [
-        "| `router_build_info` | gauge | version, table_sha256, protos_sha256, start | Always 1: what is running. |",
+        "| `router_build_info` | gauge | version, table_sha256, protos_sha256, start | Always 1; labels: what runs. |",
         "",
         fill(_COUNTERS, WIDTH),
         "",
         fill(_COMMANDED, WIDTH),
         "",
-        "`route` is the payload case, and where a case has several routes its first source as well:",
+        "`route` is the payload case. Where a case has several routes, it also has the first source:",
         "[names](table.md#several-routes-of-one-case).",
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
@@ -158,7 +158,7 @@ def _reasons(metric: str, reasons: Mapping[str, str], label: str = "reason") -> 
 
 
 def findings_page() -> str:
-    """The closed list of codes, each with a mistake and what to write in its place, of the tests' corpus."""
+    """All codes of findings, each with a mistake and its correction from the tests' corpus."""
     lines = ["# Codes of findings", "", _MADE, "| code | severity | meaning |", "|---|---|---|"]
     lines += [f"| [`{code.value}`](#{code.value}) | {code.severity.value} | {code.meaning} |" for code in Code]
     for code in Code:
@@ -171,15 +171,15 @@ def findings_page() -> str:
 
 
 def first_finding(mistake: BadTable) -> str:
-    """What is said of the first mistake in a table, without the folder of the tests."""
+    """The finding about the first mistake in a table, without the folder of the tests."""
     lines = mistake.said.splitlines()
     end = next(index for index, line in enumerate(lines) if index and not line.startswith((" ", "help: ")))
-    severity = Code(mistake.code).severity.value  # the tests take warnings as errors
+    severity = Code(mistake.code).severity.value  # the tests treat warnings as errors
     return "\n".join(lines[:end]).replace("bad_tables/", "").replace(": error[", f": {severity}[")
 
 
 def figures_page() -> str:
-    """What `make bench` measured."""
+    """The results of `make bench`."""
     found = json.loads(RESULTS.read_text(encoding="utf-8"))
     return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{figures(found)}"
 

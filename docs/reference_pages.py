@@ -1,4 +1,4 @@
-"""The pages of keys and commands, from the schemas of tables and test files and from the parsers of the verbs."""
+"""Generate the pages of keys and commands from the schemas of tables and test files and the parsers of the verbs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Schema = Mapping[str, Any]
 
 
 class Section(NamedTuple):
-    """Keys that stand together: at `path`, as `schema` (keys of the schema's document, with dots) declares them."""
+    """A group of keys: those at `path` in a table, declared at `schema` (a dotted path in the schema's document)."""
 
     heading: str
     path: str
@@ -75,7 +75,7 @@ UNITS = {
     "topic_pattern": "[patterns](#patterns-of-topics)",
     "constants": "fields with constants",
 }
-"""What values are, where a definition of the schema stands for a kind of them."""
+"""The kind of value that a definition of the schema stands for, in words."""
 _OR_EACH = re.compile(r"\^(never|each)\$")
 
 
@@ -104,7 +104,7 @@ class SchemaPage:
             yield f"At `{section.path}`. {prose(outer.get('description', found.get('description', '')))}"
             yield ""
             if "then" not in section.schema and (examples := outer.get("examples")):
-                yield from (f"Such as `{section.path.rpartition('.')[2].lower()}: {flow(examples[0])}`.", "")
+                yield from (f"For example `{section.path.rpartition('.')[2].lower()}: {flow(examples[0])}`.", "")
             yield from self._table(found, section.schema)
 
     def _table(self, found: Schema, name: str) -> Iterator[str]:
@@ -118,7 +118,7 @@ class SchemaPage:
             key_schema = self._resolved(declared)
             path = f"{prefix}{key}"
             value, meaning = self._value(declared, name, key), key_schema.get("description", "")
-            if "](" in value and "$ref" in declared:  # the rest is said there
+            if "](" in value and "$ref" in declared:  # the linked section has the rest
                 meaning = re.sub(r"(?<=\w\.) [A-Z].*", "", meaning)
             if key in required:
                 value += "; required"
@@ -138,7 +138,7 @@ class SchemaPage:
         return value.replace("|", r"\|")
 
     def _kind(self, declared: Schema) -> str:
-        """What a value is, in words."""
+        """Return the kind of a value, in words."""
         for reference in [declared, *declared.get("allOf", ())]:
             if "$ref" in reference:
                 return self._definition(reference["$ref"].rpartition("/")[2])
@@ -186,7 +186,7 @@ class SchemaPage:
         return self._kind(self.schema["definitions"][name])
 
     def _resolved(self, declared: Schema) -> Schema:
-        """The declaration with what a `$ref` in it adds."""
+        """Return the declaration merged with the target of its `$ref`."""
         for reference in [declared, *declared.get("allOf", ())]:
             if "$ref" in reference:
                 return {**self._resolved(self._at(reference["$ref"].removeprefix("#/").replace("/", "."))), **declared}
@@ -199,7 +199,7 @@ class SchemaPage:
         return found
 
     def _required(self, found: Schema, name: str) -> Iterator[tuple[str, list[str]]]:
-        """Which keys a whole table must have, by the place of their declaration."""
+        """The required keys of a complete table, by the path of their declaration."""
         complete = self.schema["definitions"]
         if not complete.get("complete"):
             return
@@ -230,7 +230,7 @@ def slug(heading: str) -> str:
 
 
 def flow(value: object) -> str:
-    """A value as a table writes it, in one line."""
+    """Return a value as written in a table, on one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)}: {flow(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
@@ -243,7 +243,7 @@ def _key(key: str) -> str:
 
 
 def prose(text: str) -> str:
-    """A description of a schema as Markdown in a table's cell: what it quotes is code."""
+    """Return a schema's description as Markdown for a table cell: quoted text becomes code."""
     text = re.sub(r"(?<!\w)'([^']+)'(?!\w)", r"`\1`", text)
     parts = re.split(r"(`[^`]*`)", text)
     plain = [part if part.startswith("`") else re.sub(r"([*<])", r"\\\1", part) for part in parts]

@@ -47,32 +47,32 @@ TERMINAL = (80, 36)
 """Columns and lines."""
 
 NOTHING = 255
-"""What is transparent, after so many colours in a picture."""
+"""Palette index of transparent pixels, and the number of colours in a picture."""
 
 SETTLED = 60.0
-"""Seconds that everything flows before a picture: pages show the last minute."""
+"""Seconds of normal traffic before a picture, because pages show the last minute."""
 
 TAKING = 40.0
-"""Seconds within which the pictures of a rover that is well are taken; then the basestation falls silent."""
+"""Seconds for the pictures of a healthy rover; then the basestation falls silent."""
 
 SILENCE = 12.0
-"""Seconds that the basestation has been silent in its picture, at least."""
+"""Least seconds of silence of the basestation in its picture."""
 
 PATIENCE = 60.0
 ATTEMPTS = 3
 
 COMMANDED = 4.0
-"""Seconds that the talker commands the boards, after which a busy browser makes no command stale."""
+"""Seconds for which the talker commands the boards; later, a busy browser cannot make a command stale."""
 
 WELL = r"all is well|nothing is wrong"
 UNWELL = r"silent (for )?\d|connecting|no answer|does not get"
-"""What pages say, in a page's text."""
+"""Patterns in the text of a page."""
 
 _INSIDE = "ROUTER_PICTURES_INSIDE"
 
 
 class PictureError(RouterError):
-    """A picture would not show what it is to show."""
+    """Raised if a picture would not show its subject."""
 
 
 def main() -> int:
@@ -169,13 +169,13 @@ class Rover:
             time.sleep(0.5)
 
     def until_said(self, child: Child, what: str) -> None:
-        """Until a child has printed a line."""
+        """Wait until a child has printed a line."""
         self.until(lambda _: bool(child.latest), what)
 
 
 @contextmanager
 def rover(scratch: Path, table: RouteTable, well: float) -> Iterator[Rover]:
-    """One whose basestation falls silent after so many seconds."""
+    """A rover whose basestation falls silent after this many seconds."""
     for attempt in range(ATTEMPTS):
         running = Rover(scratch, table)
         try:
@@ -223,7 +223,7 @@ def _take_all(folder: Path, running: Rover, browser: Browser, settled: float) ->
 
 
 def _flows(seen: View) -> bool:
-    """Every endpoint that ever sends does, and subscribers get what is published."""
+    """Return whether every endpoint that ever sends is heard, and subscribers receive the published topics."""
     heard = [age is not None and age < 2 for name, age in seen.silence.items() if name != "container_board"]
     topics = [target for row in seen.routes for target in row.targets if target.is_topic and row.rate]
     return bool(topics) and all(heard) and sum(target.rate > 0 for target in topics) > len(topics) / 2
@@ -246,7 +246,7 @@ def _page(browser: Browser, url: str, size: tuple[int, int], scheme: str) -> Pag
 
 
 def _expect(page: Page, wanted: str, unwanted: str) -> str:
-    """What the page says, on one line, as soon as it says what is wanted and nothing unwanted."""
+    """Return the page's text on one line, once it has the wanted texts and no unwanted ones."""
     limit = time.monotonic() + PATIENCE
     while True:
         text = " ".join(str(page.evaluate("document.body.innerText")).split())
@@ -273,7 +273,7 @@ img {{ position: absolute; display: block; border: 1px solid #474d57; box-sizing
 
 
 def _composed(browser: Browser, wide: str, narrow: str) -> str:
-    """The desktop's page, and the phone's over its lower right corner, on nothing."""
+    """Return the desktop page with the phone page over its lower right corner, on a transparent background."""
     width, height = DESKTOP[0] + 120, DESKTOP[1] + 85
     html = _COMPOSITION.format(
         width=width, height=height, desktop=DESKTOP[0], phone=PHONE[0] * 0.84 + 16, wide=wide, narrow=narrow
@@ -288,7 +288,7 @@ def _composed(browser: Browser, wide: str, narrow: str) -> str:
 
 
 def _write_terminal(file: Path, shown: Screen) -> None:
-    """A terminal of TERMINAL as SVG. rich's has fonts from the network, which ours does without."""
+    """Write a terminal of size TERMINAL as SVG, without the web fonts that rich's own SVG loads."""
     columns, _ = TERMINAL
     with Path(os.devnull).open("w", encoding="utf-8") as nothing:
         console = Console(width=columns, record=True, file=nothing, force_terminal=True, color_system="truecolor")
@@ -302,7 +302,7 @@ def _write_terminal(file: Path, shown: Screen) -> None:
 
 
 def _write(file: Path, picture: str, said: str) -> None:
-    """As a PNG of few colours, a third as large as the browser's. What is transparent stays so."""
+    """Write a PNG of few colours, a third as large as the browser's. Keeps transparency."""
     image = Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGBA")
     few = image.convert("RGB").quantize(NOTHING, kmeans=1, dither=Image.Dither.NONE)
     few.putpalette([*(few.getpalette() or ()), 0, 0, 0])
@@ -312,7 +312,7 @@ def _write(file: Path, picture: str, said: str) -> None:
 
 
 def _say(file: Path, text: str) -> None:
-    """What was made, and what it shows, in a line; on a terminal only what fits into one."""
+    """Print the picture's name and content on one line, truncated to the terminal's width."""
     line = f"{file.name}: {file.stat().st_size / 1000:.0f} kB; {' '.join(text.split())}"
     print(line[: shutil.get_terminal_size().columns - 1] if sys.stdout.isatty() else line, flush=True)
 
