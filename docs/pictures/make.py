@@ -49,8 +49,8 @@ TERMINAL = (80, 36)
 NOTHING = 255
 """Palette index of transparent pixels, and the number of colours in a picture."""
 
-SETTLED = 60.0
-"""Seconds of normal traffic before a picture, because pages show the last minute."""
+SETTLED = 70.0
+"""Seconds of normal traffic before a picture: pages show the last minute, and what came just before they opened."""
 
 TAKING = 40.0
 """Seconds for the pictures of a healthy rover; then the basestation falls silent."""

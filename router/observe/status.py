@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from router.clock import wall_ns
+from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import INTENDED_REASONS
 from router.observe.last_values import LastValues
 from router.observe.route_map import endpoint_node, nodes_and_edges
@@ -79,9 +79,8 @@ class Status:
 
     def recent(self) -> Json:
         """The numbers of the last seconds, oldest first and without latencies: a page that opens has rates at once."""
-        snapshots = self._health.look().snapshots
-        boot = wall_ns() / 1e9 - snapshots[-1].at  # a look has the boot clock
-        return {"numbers": [{"at": boot + each.at, **numbers(each)} for each in snapshots]}
+        booted = (wall_ns() - boottime_ns()) / 1e9  # snapshots of a look have the boot clock
+        return {"numbers": [{"at": booted + each.at, **numbers(each)} for each in self._health.look().snapshots]}
 
     def health(self) -> Json:
         """What is wrong. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
