@@ -172,7 +172,7 @@ def test_it_forwards_by_what_it_compiled_before(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     arguments = "--ros-args", "-p", f"routes_path:={table}"
     first = start(installed, *arguments)
-    wait_until(lambda: [*tmp_path.glob("cache/rover-router/*.program")], "the kept program")
+    wait_until(lambda: any(tmp_path.glob("cache/rover-router/*.program")), "the kept program")
     first.terminate()
     assert "forwarding by the kept program" not in output(first)
     second = start(installed, *arguments)
