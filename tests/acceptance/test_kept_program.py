@@ -9,7 +9,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
@@ -331,31 +331,51 @@ def test_a_stop_at_any_moment_of_the_start_leaves_no_board_driving(rover: Rover)
         assert DRIVE not in heard[-1:], (pause, code, router.text())
 
 
-def test_a_service_managers_sockets_are_served_in_the_order_of_arrival_behind_the_brake(rover: Rover) -> None:
+@contextmanager
+def restarted_by_a_service_manager(rover: Rover) -> Iterator[tuple[ServiceManager, Path]]:
+    """A router that was killed is at its gate again, whose file is given; three commands came in between."""
     gate = rover.folder / "gate"
     manager = ServiceManager(
         rover.folder, rover.table, (HOST, rover.site.listen), STATE_DIRECTORY=f"{rover.folder}/state", GATE=str(gate)
     )
     manager.module = "tests.acceptance.gated_router"
-    try:
-        manager.start()
-        manager.hear("READY=1")
-        wait_until(lambda: bool(rover.kept()), "a kept program")
-        manager.end(signal.SIGKILL)
-        rover.site.waiting()
-        for _ in range(3):
-            rover.drive()
-        gate.touch()
-        manager.start()
+    with closing(manager):
+        try:
+            manager.start()
+            manager.hear("READY=1")
+            wait_until(lambda: bool(rover.kept()), "a kept program")
+            manager.end(signal.SIGKILL)
+            rover.site.waiting()
+            for _ in range(3):
+                rover.drive()
+            gate.touch()
+            manager.start()
+            yield manager, gate
+        finally:
+            gate.unlink(missing_ok=True)
+
+
+def test_a_service_managers_sockets_are_served_in_the_order_of_arrival_behind_the_brake(rover: Rover) -> None:
+    with restarted_by_a_service_manager(rover) as (manager, gate):
         assert [rover.heard() for _ in range(4)] == [BRAKE, *[DRIVE] * 3]
         gate.unlink()
         manager.hear("READY=1")
         assert manager.end(signal.SIGTERM) == 0
         assert rover.heard() == BRAKE
         assert rover.site.waiting() == {}
-    finally:
-        gate.unlink(missing_ok=True)
-        manager.close()
+
+
+def test_a_service_managers_sockets_serve_another_table_after_the_head_start(rover: Rover) -> None:
+    with udp("127.0.0.222") as other, restarted_by_a_service_manager(rover) as (manager, gate):
+        assert [rover.heard() for _ in range(4)] == [BRAKE, *[DRIVE] * 3]
+        port = rover.site.endpoints["driving_board"].getsockname()[1]
+        rover.table.write_text(rover.table.read_text().replace(f":{port}", f":{other.getsockname()[1]}"))
+        gate.unlink()
+        assert other.recv(1000) == BRAKE
+        rover.drive()
+        assert other.recv(1000) == DRIVE
+        manager.hear("READY=1")
+        assert rover.site.waiting() == {"driving_board": [BRAKE]}
 
 
 def test_a_reload_keeps_the_new_program(rover: Rover) -> None:

@@ -22,6 +22,7 @@ from typing import Any
 import pytest
 
 from router import __version__
+from tests.acceptance.site import wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS, ship
 
@@ -163,6 +164,23 @@ def test_without_a_verb_it_routes_and_takes_parameters_as_nodes_do(installed: Pa
     said = started(start(installed, "--ros-args", "-p", f"routes_path:={table}", "-p", f"listen_port:={port}"))
     assert said["table"] == str(table)
     assert said["listening"] == {"rover": f"127.0.0.1:{port}"}
+
+
+def test_it_forwards_by_what_it_compiled_before(
+    installed: Path, table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    arguments = "--ros-args", "-p", f"routes_path:={table}"
+    first = start(installed, *arguments)
+    wait_until(lambda: any(tmp_path.glob("cache/rover-router/*.program")), "the kept program")
+    first.terminate()
+    assert "forwarding by the kept program" not in output(first)
+    second = start(installed, *arguments)
+    assert second.stderr
+    assert "forwarding by the kept program" in second.stderr.readline()
+    second.terminate()
+    output(second)
+    assert second.returncode == 0
 
 
 def test_without_a_table_it_takes_the_installed_one(installed: Path) -> None:

@@ -72,7 +72,7 @@ for address in 192.168.0.{1,10,30,40,50,222}; do ip address add "$address/24" de
 work=$(mktemp -d)
 clean() {
   podman rm --force --ignore "$container" >/dev/null 2>&1
-  podman volume rm --force rover_recordings >/dev/null
+  podman volume rm --force rover_recordings rover_state >/dev/null
   rm -rf "$work"
 }
 trap clean EXIT
