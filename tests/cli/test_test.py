@@ -204,7 +204,7 @@ def test_only_runs_the_tests_that_are_named_so(rover: Path, capsys: pytest.Captu
     assert 1 < some < int(capsys.readouterr().out.split()[0])
     assert main(["test", "--only", "the operator", "--coverage", "routes"]) == BAD_USAGE
     assert main(["test", "--only", "the oprator", "routes"]) == BAD_USAGE
-    assert "the name of no test contains 'the oprator'" in capsys.readouterr().err
+    assert "no test has 'the oprator' in its name" in capsys.readouterr().err
 
 
 def test_what_is_wrong_with_a_test_file_is_exit_code_78(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
