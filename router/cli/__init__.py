@@ -243,7 +243,9 @@ def _mistake(arguments: Sequence[str]) -> str:
     if first.startswith("-"):
         if first.partition("=")[0] in {"-h", "--help", "--version", "--completion"}:
             return ""
-        return with_help(f"'{first}' is not an option of the router itself", "write options after the verb: router VERB ...")
+        return with_help(
+            f"'{first}' is not an option of the router itself", "write options after the verb: router VERB ..."
+        )
     return "" if first in VERBS else with_help(f"there is no verb '{first}'", _suggestion(first, VERBS))
 
 

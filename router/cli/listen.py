@@ -52,7 +52,7 @@ _PLACES = """places:
   ws://HOST:PORT        a gateway's websocket server; reconnects
   zenoh://KEY           a gateway's key; ?connect=tcp/10.0.0.1:7447, also
                         listen=LOCATOR and mode=peer|client|router; or
-                        ?config=FILE, Zenoh's own, for certificates
+                        ?config=FILE of Zenoh, for example for TLS
   envelope://[HOST:]PORT    envelopes, as boards and basestation get them
   envelope://NAME       the same at the address of an endpoint or listener
   topic://NAME          a ROS topic"""

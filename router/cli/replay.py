@@ -91,7 +91,7 @@ def _advise(resent: Resent) -> int:
         hint = "name a table that has local addresses for them (-t TABLE), or one address for all (--from PLACE)"
         print(with_help(f"{what}: the router sees strangers", hint), file=sys.stderr)
     if resent.refused:
-        print("router replay: the port was closed for some of the datagrams", file=sys.stderr)
+        print("router replay: nobody listened for some of the datagrams", file=sys.stderr)
     return 1 if resent.refused else OK
 
 

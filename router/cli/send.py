@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--rate", type=hertz, metavar="RATE", help="for example 20Hz (default: as fast as possible)")
     add_count(parser, "how many (default: 1, with --rate until Ctrl-C)")
     parser.add_argument("--trim", action="store_true", help="remove trailing zero bytes, as the old boards do")
-    parser.add_argument("--pad", type=whole, default=0, metavar="N", help="pad with zeros to N bytes, as they do")
+    parser.add_argument("--pad", type=whole, default=0, metavar="N", help="pad with zeros to N bytes, as old boards do")
     add_wire_options(parser)
 
 

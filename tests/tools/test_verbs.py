@@ -51,7 +51,7 @@ def test_send_goes_from_endpoint_to_listener_and_says_when_the_router_will_not_t
         data, peer = router.recvfrom(100)
         assert (data, peer[0], capsys.readouterr().err) == (EMPTY_PLAIN, "127.0.6.10", "")
         assert main(words) == 0
-        assert "the table takes plain from station only\nhelp: add --from station" in capsys.readouterr().err
+        assert "the table accepts plain only from station\nhelp: add --from station" in capsys.readouterr().err
 
 
 def test_listen_prints_the_envelopes_that_arrive(table_path: Callable[..., Path]) -> None:
