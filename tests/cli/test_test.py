@@ -133,7 +133,7 @@ def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str
     assert lines[2].endswith("angular_velocity: {x: ~1.571, y: ~-3.142, z: ~0.785}")
     assert lines[3].strip(" |") == "^" * len("~-3.142")
     assert lines[4].startswith("routes/rover.yaml:")
-    assert lines[4].endswith(": what fills angular_velocity.y")
+    assert lines[4].endswith(": angular_velocity.y is filled here")
     assert lines[6].strip(" |") == "^" * len("radians(gyro_x)")
     assert re.fullmatch(r"1 of \d+ tests failed, in 1 file", lines[-1])
 
