@@ -364,8 +364,10 @@ def test_what_happened_in_a_failed_step_is_told_in_order_with_its_places(tmp_pat
         "imu_info {accel_x: 0.5} is sent to basestation (table.yaml:17:20)",
         "imu_info withholds a message from recorder (table.yaml:17:60)",
         "{accel_x: 0.5} is published on imu_data (table.yaml:19:10)",
-        "a message for imu/data_raw is dropped as mapping_error "
-        "(table.yaml:24:53: angular_velocity.y: division by zero)",
+        (
+            "a message for imu/data_raw is dropped as mapping_error "
+            "(table.yaml:24:53: angular_velocity.y: division by zero)"
+        ),
     ]
     assert [step.told for step in other.failed] == [[]]
 
