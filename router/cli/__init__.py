@@ -1,6 +1,6 @@
-"""The command line: which verbs there are. A verb's module is imported once the verb is chosen.
+"""The command line and its verbs. The module of a verb is imported only when the verb is chosen.
 
-A verb's module offers `add_parser(subparsers)`, which calls `add_verb`, and `run(args) -> int`.
+A verb's module provides `add_parser(subparsers)`, which calls `add_verb`, and `run(args) -> int`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NoReturn, TextIO, TypeAlias
 
 from router import __version__
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
-from router.log import ADDRESS_SPACE, address_space  # here, as nothing can be imported once memory is short
+from router.log import ADDRESS_SPACE, address_space  # imported here: imports fail once memory is short
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -29,7 +29,7 @@ BAD_USAGE = 2
 UNWRITTEN = 74
 """EX_IOERR: stdout is a file on a full disk."""
 BAD_TABLE = 78
-"""EX_CONFIG, after which the systemd unit does not restart."""
+"""EX_CONFIG: the systemd unit does not restart after it."""
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 
@@ -42,12 +42,12 @@ GROUPS = {
         "validate": "report the errors and warnings of route tables",
         "test": "run the tests of tables, without network or ROS",
         "explain": "show what a route does, field by field",
-        "graph": "draw what a table routes",
-        "doctor": "check this computer for what keeps a router from working",
+        "graph": "draw the routes of a table",
+        "doctor": "find what keeps a router from working on this computer",
     },
     "Run": {
         "run": "run a route table between UDP and ROS 2",
-        "status": "print in one line whether the router runs and is healthy",
+        "status": "print in one line whether the router is running and healthy",
         "reload": "make the running router reload its table",
     },
     "Watch": {
@@ -60,13 +60,13 @@ GROUPS = {
         "replay": "send a recording again, or run it through two tables",
     },
     "Try": {
-        "demo": "run router and simulated boards on this computer",
+        "demo": "run a router and simulated boards on this computer",
         "init": "write a first table into a folder",
         "sim": "simulate the boards and the basestation of a table",
         "send": "send envelopes with payloads of your choice",
     },
     "Protocol": {
-        "new": "add a message to a checkout of the rover, in all its files",
+        "new": "add a message to all files of a rover checkout",
         "schema": "lock the field numbers of the protobuf messages",
     },
 }
@@ -75,7 +75,7 @@ VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.i
 SHELLS = ("bash", "zsh", "fish")
 _OPTIONS = {
     "--version": "show the version and exit",
-    f"--completion {'|'.join(SHELLS)}": "print the shell's completion script, to be run by eval in its start-up file",
+    f"--completion {'|'.join(SHELLS)}": "print the completion script, for eval in the shell's start-up file",
 }
 _INDENT = " " * 12
 
@@ -87,7 +87,7 @@ class _Version(argparse.Action):
 
 
 class _Completion(argparse.Action):
-    """Prints what a shell has to evaluate so that it completes command lines of the router."""
+    """Prints the script with which a shell completes command lines of the router."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: object, shell: object, *rest: object) -> None:
         from argcomplete.shell_integration import shellcode
@@ -97,7 +97,7 @@ class _Completion(argparse.Action):
 
 
 class _MainParser(argparse.ArgumentParser):
-    """The verbs in groups, in place of one long list."""
+    """A parser whose help shows the verbs in groups instead of one long list."""
 
     def format_help(self) -> str:
         import shutil
@@ -109,14 +109,14 @@ class _MainParser(argparse.ArgumentParser):
             lines += ["", f"{group}:"]
             for verb, summary in verbs.items():
                 lines += textwrap.wrap(f"  {verb:9} {summary}", width, subsequent_indent=_INDENT)
-        lines += ["", *textwrap.wrap("'router VERB --help' has the options of a verb, with examples.", width), ""]
+        lines += ["", *textwrap.wrap("'router VERB --help' shows the options of a verb, with examples.", width), ""]
         for option, summary in _OPTIONS.items():
             lines += [f"  {option}", *textwrap.wrap(summary, width, initial_indent=_INDENT, subsequent_indent=_INDENT)]
         return "\n".join([*lines, ""])
 
 
 class _Help(argparse.HelpFormatter):
-    """Fills paragraphs to the terminal's width, except those with indented lines: examples."""
+    """Wraps paragraphs at the terminal's width, except those with indented lines (examples)."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return "\n\n".join(
@@ -128,7 +128,7 @@ class _Help(argparse.HelpFormatter):
 def add_verb(
     subparsers: Subparsers, name: str, description: str, *examples: str, more: str = ""
 ) -> argparse.ArgumentParser:
-    """Add the parser of a verb (or of an action of one). Its help ends with `more`, then with the examples."""
+    """Add the parser of a verb, or of an action of a verb. Its help ends with `more`, then the examples."""
     shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
     return subparsers.add_parser(
         name,
@@ -141,12 +141,12 @@ def add_verb(
 
 
 def with_help(what: str, hint: str = "") -> str:
-    """What is wrong, and what to do about it in a line of its own, as in findings of a table."""
+    """Return the problem, with the remedy on a line of its own, as in findings."""
     return f"{what}\nhelp: {hint}" if hint else what
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for the network."""
+    """Run one verb. Return the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for a network fault."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -154,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         try:
             code = _run(arguments)
-        finally:  # argparse prints, and exits
+        finally:  # also when argparse prints and exits
             sys.stdout.flush()
     except BrokenPipeError:
         _leave(sys.stdout, sys.stderr)
@@ -167,10 +167,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"router {_verb(arguments) or ''}".rstrip() + f": stdout: {error.strerror}", file=sys.stderr)
             return UNWRITTEN
         if isinstance(error, ImportError) and "declared" in error.msg:
-            what = f"router {_verb(arguments)}: router/declared.py was not made of the present headers"
+            what = f"router {_verb(arguments)}: router/declared.py does not match the headers of the carrier"
             print(with_help(what, "run 'make setup'"), file=sys.stderr)
             return BAD_TABLE
-        # Each of them may say that memory could not be had.
+        # Each of these errors can mean that memory could not be allocated.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise
         what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), which is not enough"
@@ -179,19 +179,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
             flush=True,
         )
-        os._exit(BAD_TABLE)  # threads that could be started when others could not would keep the process
+        os._exit(BAD_TABLE)  # threads that did start would keep the process alive
     return code
 
 
 def _leave(*streams: TextIO) -> None:
-    """Discard what is still buffered, or Python fails when it flushes at exit."""
+    """Discard buffered output: flushing it at exit would fail."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in streams:
         os.dup2(nowhere, stream.fileno())
 
 
 def _verb(arguments: Sequence[str]) -> str | None:
-    """The first argument, unless it is an option: those before a verb do without one."""
+    """Return the first argument unless it is an option, such as --version, which needs no verb."""
     return arguments[0] if arguments and not arguments[0].startswith("-") else None
 
 
@@ -238,12 +238,14 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _mistake(arguments: Sequence[str]) -> str:
-    """What is wrong with the first word, and what to do about it; "" if it is a verb, or an option without one."""
+    """Return what is wrong with the first word, and the remedy; "" for a verb or an option that needs no verb."""
     first = arguments[0] if arguments else "--help"
     if first.startswith("-"):
         if first.partition("=")[0] in {"-h", "--help", "--version", "--completion"}:
             return ""
-        return with_help(f"'{first}' is no option of the router itself", "options go after the verb: router VERB ...")
+        return with_help(
+            f"'{first}' is not an option of the router itself", "write options after the verb: router VERB ..."
+        )
     return "" if first in VERBS else with_help(f"there is no verb '{first}'", _suggestion(first, VERBS))
 
 
@@ -260,7 +262,7 @@ def _add_verbs(subparsers: Subparsers, chosen: str | None) -> ModuleType | None:
 
 
 def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoReturn:
-    """Answer a shell that completes what is typed: COMP_LINE."""
+    """Print the completions of COMP_LINE, the command line that is being typed in a shell."""
     import argcomplete
 
     _add_verbs(subparsers, _verb(os.environ.get("COMP_LINE", "").split()[1:]))
@@ -269,16 +271,16 @@ def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoRetu
 
 
 def _refuse(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
-    """Say which words a verb does not take, and which option the first of them may stand for."""
+    """Report the words that a verb does not take, and the option that the first one resembles."""
     option = unknown[0].partition("=")[0]
     options = re.findall(r"--\w[\w-]*", parser.format_help())
     close = nearest(option, options) if option.startswith("-") else None
     if option.endswith((".yaml", ".yml")) and "--table" in options:
-        parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", f"the table is named by -t {option}"))
-    hint = f"did you mean '{close}'?" if close else f"'{parser.prog} --help' lists what it takes"
+        parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", f"name the table with -t {option}"))
+    hint = f"did you mean '{close}'?" if close else f"'{parser.prog} --help' lists the arguments"
     parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", hint))
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
     close = nearest(name, known)
-    return f"did you mean '{close}'?" if close else "'router' lists them"
+    return f"did you mean '{close}'?" if close else "run 'router' for a list"

@@ -1,7 +1,7 @@
-"""What of a table a shell completes: payload cases and their fields, endpoints, listeners, gateways and topics.
+"""Words from a table that a shell completes: payload cases and fields, endpoints, listeners, gateways and topics.
 
-Most are completed as they are written, without a check of the table. Nothing is said of what cannot be read: the verb
-says it.
+Most are completed as they are written, without a check of the table. A table that cannot be read gives no words and no
+message: the verb reports the problem.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from router.types.model import Field, MessageType
 
 Words = Callable[[argparse.Namespace, str], Iterable[str]]
-"""Of the arguments before the word that is completed, and what is typed of that: what it may become."""
+"""A function from the arguments before a word, and the beginning of that word, to its possible completions."""
 
 
 def completes(action: argparse.Action, words: Words) -> None:
-    """Have the shell complete an argument by `words`."""
+    """Make the shell complete an argument with `words`."""
 
     def completer(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
         found: list[str] = []
@@ -52,7 +52,7 @@ def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
 
 
 def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """The endpoints of which a message may be."""
+    """The endpoints that may send messages."""
     from router.table.model import EndpointKind
 
     if table := _table(args):
@@ -60,7 +60,7 @@ def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 
 def places(args: argparse.Namespace, _: str = "") -> Iterable[str]:
-    """Where datagrams are sent to: listeners and endpoints."""
+    """Places to send datagrams to: listeners and endpoints."""
     return _names(args, "listen", "endpoints")
 
 
@@ -78,7 +78,7 @@ def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 
 def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
-    """Places of `router listen`: a scheme, then what of the table has it."""
+    """Places of `router listen`: the schemes, then names from the table for `envelope://` and `topic://`."""
     scheme, separator, _ = prefix.partition("://")
     if not separator:
         return [f"{name}://" for name in ("envelope", "topic", "udp", "tcp", "ws", "zenoh")]
@@ -91,7 +91,7 @@ def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
 
 
 def fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
-    """`accel_x=`, `bbox.x=` or `state=NAME` of the payload case that stands before."""
+    """`accel_x=`, `bbox.x=` or `state=NAME` for the payload case given before."""
     case = getattr(args, "case", None) or args.names[0]
     return _assignments(_wire(args).envelope.cases[case].type, prefix)
 
@@ -134,7 +134,7 @@ def _topics(table: RouteTable) -> Iterator[str]:
 
 
 def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
-    """The keys below these keys of the table, or of what it extends, whether they are valid or not."""
+    """The keys in these sections of the table and of the tables that it extends, valid or not."""
     from router.table.extends import load_chain
     from router.table.nodes import MappingNode
 
@@ -144,7 +144,7 @@ def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
 
 
 def _table(args: argparse.Namespace) -> RouteTable | None:
-    """The valid part of the table that is named before, or of the default one."""
+    """The valid part of the table named before, or of the default table."""
     from router.table import load_table
 
     path: Path | None = table_if_any(args)
@@ -152,7 +152,7 @@ def _table(args: argparse.Namespace) -> RouteTable | None:
 
 
 def _wire(args: argparse.Namespace) -> Wire:
-    """As `load_wire`, also of a table with errors elsewhere. Raises TableError, UsageError and FileNotFoundError."""
+    """Like `load_wire`, also for a table with errors elsewhere. Raises TableError, UsageError and FileNotFoundError."""
     from router.assets import asset
     from router.datagrams import wire_of_protos, wire_of_table
     from router.table import load_table

@@ -24,10 +24,10 @@ from router.cli.tool_options import good_table, say
 if TYPE_CHECKING:
     from router.compiler.program import Program
 
-_DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
-Nothing leaves this computer. The first lines say where to look with a browser or Foxglove, and the command that shows
-it in another terminal; 'ros2 topic list' and the other verbs look at it as well. What is recorded is in ./recordings.
-Where the rover's ROS messages are not installed, it is the table of 'router init'."""
+_DESCRIPTION = """Simulate the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
+Nothing leaves this computer. The first lines show the addresses for a browser and Foxglove, and a command for another
+terminal; 'ros2 topic list' and the other verbs also work. Recordings are written to ./recordings. If the rover's ROS
+messages are not installed, the demo runs the table of 'router init'."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -39,12 +39,12 @@ def run(args: argparse.Namespace) -> int:
     from router.log import configure_log
 
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, where the table is
+    os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, beside the table
     configure_log(coloured=is_coloured(sys.stderr))
     table = _table()
     _, program = good_table(table)
     if sys.stderr.isatty():
-        say(f"in another terminal: router top -t {shlex.quote(str(table))}; Ctrl-C ends this")
+        say(f"in another terminal: router top -t {shlex.quote(str(table))}; press Ctrl-C to stop")
     with _simulated(program):
         route(program, [], os.environ)
     return OK
@@ -53,15 +53,15 @@ def run(args: argparse.Namespace) -> int:
 def _table() -> Path:
     if find_spec("comms") is not None:
         return asset("routes/sim.yaml")
-    say("the rover's ROS messages (comms) are not installed: this is the table that `router init` writes")
+    say("the rover's ROS messages (comms) are not installed: running the table that `router init` writes")
     return FIRST_TABLE / "routes" / "rover.yaml"
 
 
 @contextmanager
 def _simulated(program: Program) -> Iterator[None]:
-    """Play the table's endpoints in a thread; an error there ends the process as SIGTERM does, and is raised here.
+    """Simulate the table's endpoints in a thread. An error there stops the process like SIGTERM and is raised here.
 
-    Raises UsageError where an address is taken.
+    Raises UsageError if an address is in use.
     """
     from router.datagrams import Wire
     from router.tools.simulator import Simulator
@@ -76,7 +76,7 @@ def _simulated(program: Program) -> Iterator[None]:
             os.kill(os.getpid(), signal.SIGTERM)
 
     simulator = Simulator(Wire(program.envelope), program.table, seed=1, deadmen=program.deadmen)
-    # The thread inherits this, and leaves the signals to the main thread.
+    # The thread inherits the signal mask, so that the main thread gets the signals.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1})
     thread = Thread(target=play, name="simulator")
     thread.start()

@@ -1,4 +1,4 @@
-"""`router doctor`: what keeps a router from working on this computer, and what to do about it."""
+"""`router doctor`: find what keeps a router from working on this computer, and print the remedies."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 SICK = 1
 
-_DESCRIPTION = f"""Look at the table, ROS, ports, buffers, clock, endpoints and the running router, if there is one.
-Exit code: {OK} nothing keeps it from working, {SICK} something does, {BAD_TABLE} the table cannot be read. What works
-less well is a warning only."""
+_DESCRIPTION = f"""Check the table, ROS, ports, buffers, clock, endpoints and the running router, if there is one.
+Exit code: {OK} no problems, {SICK} problems, {BAD_TABLE} the table cannot be read. Warnings do not change the exit
+code."""
 
 _STYLES = {"ok": GREEN, "warning": YELLOW, "problem": RED}
-"""By the value of a grade."""
+"""By value of a grade."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -33,9 +33,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--pre-start",
         action="store_true",
-        help="only what would make a start fail, and missing networks; nothing if all is well",
+        help="report only what would make the start fail, and missing networks; print nothing else",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object per line and result")
+    parser.add_argument("--json", action="store_true", help="print each result as JSON on one line")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown(result: CheckResult, *, coloured: bool) -> str:
-    """One line, and a second one with the remedy."""
+    """One line, then the remedy, if there is one, on a second line."""
     grade = Paint(coloured)(_STYLES[result.grade.value], f"{result.grade.value:8}")
     text = f"{grade} {result.about:10} {result.text}"
     return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text

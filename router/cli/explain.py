@@ -1,4 +1,4 @@
-"""`router explain`: routes and gateways as the router understands them, down to the code; two tables compared."""
+"""`router explain`: routes and gateways as the router understands them, and the differences between two tables."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from router.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from router.compiler.checked import CheckedRoute
 
-_DESCRIPTION = """Show where a route's messages come from and go, what each target checks and in which order, the whole
-mapping with the types on both sides, and largest sizes; with --code, also the operations that the router executes,
-with their places in the table, and with --given what each target gets of one payload. Of a gateway, show what it sends
-how often, and what it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or
-with --live of all that there are. Without a name, say at the end which compiled programs of this table 'router run' has
-kept for its next start, and whether a start with these variables uses them. With --diff, say what one table does
-otherwise than another, and nothing else."""
+_DESCRIPTION = """Show where a route's messages come from and where they go, what each target checks and in which
+order, the whole mapping with the types on both sides, and the largest sizes. --code adds the operations that the router
+executes, with their places in the table; --given shows what each target gets from one payload. For a gateway, show what
+it sends and how often, and what clients may publish; lines with ~ are the topics that its patterns match, among those
+in the table or, with --live, among all topics in the ROS network. Without a name, also show which compiled programs of
+this table 'router run' has kept for its next start, and whether a start with the current variables uses them. --diff
+shows only what two tables do differently."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -34,29 +34,29 @@ _EXAMPLES = (
     "router explain --diff routes/legacy.yaml routes/rover.yaml",
 )
 _LIVE = 2.0
-"""Seconds that discovery takes at most, as a rule."""
+"""Seconds; discovery rarely takes longer."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "explain", _DESCRIPTION, *_EXAMPLES)
-    everything = "payload cases and gateways; all of the table when none is named"
+    everything = "payload cases and gateways (default: all in the table)"
     completes(parser.add_argument("names", nargs="*", metavar="NAME", help=everything), routed)
     add_table(parser)
     parser.add_argument(
-        "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
+        "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="show what table NEW does differently from OLD"
     )
-    parser.add_argument("--code", action="store_true", help="list the operations that the router executes as well")
-    given = "show what each target gets of a payload with these fields, from the route's first source"
+    parser.add_argument("--code", action="store_true", help="also list the operations that the router executes")
+    given = "show what each target gets from a payload with these fields, sent by the route's first source"
     completes(parser.add_argument("--given", nargs="*", metavar="FIELD=VALUE", help=given), fields)
-    parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
-    add_for(parser, f"look for them for so long, as 5s (default: {_LIVE:g}s)")
+    parser.add_argument("--live", action="store_true", help="also look for topics in the ROS network")
+    add_for(parser, f"how long --live looks for topics, for example 5s (default: {_LIVE:g}s)")
 
 
 def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.live:
-        raise UsageError("--for belongs to --live")
+        raise UsageError("--for works only with --live")
     if args.diff is not None and (args.names or args.table or args.code or args.live or args.given is not None):
-        raise UsageError("--diff compares its two tables, whole; nothing else goes with it")
+        raise UsageError("--diff compares two whole tables and takes no other arguments")
     return _diff(*args.diff) if args.diff is not None else _explain(args)
 
 
@@ -100,7 +100,7 @@ def _explain(args: argparse.Namespace) -> int:
 
 
 def _kept(table: Path) -> Iterator[str]:
-    """What `router run` has kept that was made of this table, also by one that extends it."""
+    """Lines about the kept programs that were compiled from this table, or from a table that extends it."""
     from router.kept import store
 
     try:
@@ -112,7 +112,7 @@ def _kept(table: Path) -> Iterator[str]:
     real, is_any = os.path.realpath(table), False
     for path, kept, why in files:
         if kept is None:
-            yield f"{path} is no kept program that a start can use: {why}"
+            yield f"{path} cannot be used as a kept program: {why}"
         elif any(kind == "file" and os.path.realpath(name) == real for kind, name, _ in kept.inputs):
             is_any = True
             command, where, python = kept.identity
@@ -120,13 +120,13 @@ def _kept(table: Path) -> Iterator[str]:
             yield f"kept for: {shlex.join(command)}"
             yield f"  in {where}, since {since}"
             if python != sys.executable:
-                yield f"  of another Python, {python}, whose `router explain` says whether a start uses it"
+                yield f"  made by another Python, {python}: its `router explain` says whether a start uses it"
             elif why:
                 yield f"  a start does not use it: {why}"
             else:
                 yield "  a start uses it"
     if not is_any:
-        yield f"nothing of this table is kept in {folder}: a start compiles it first"
+        yield f"no program of this table is kept in {folder}: a start compiles the table first"
 
 
 def _diff(old: Path, new: Path) -> int:
@@ -136,5 +136,5 @@ def _diff(old: Path, new: Path) -> int:
     definitions = Definitions()
     (before, _), (after, _) = (good_table(path, definitions=definitions) for path in (old, new))
     lines = list(diff(before, after))
-    print(*([f"--- {old}", f"+++ {new}", *lines] if lines else [f"{new} does what {old} does"]), sep="\n")
+    print(*([f"--- {old}", f"+++ {new}", *lines] if lines else [f"{new} does the same as {old}"]), sep="\n")
     return OK

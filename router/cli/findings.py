@@ -62,7 +62,7 @@ def as_github(finding: Diagnostic, *, strict: bool) -> str:
 
 
 def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
-    """What is wrong, then the source line with a caret where the file still has it, then what to do about it."""
+    """The message, the source line with a caret if the file still has it, and the hint."""
     level = severity(finding, strict=strict)
     paint, colour = Paint(coloured), RED if level is Severity.ERROR else YELLOW
     head = paint(BOLD, f"{visible(str(finding.span))}: ") + paint(BOLD + colour, f"{level.value}[{finding.code.value}]")
@@ -72,7 +72,7 @@ def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
 
 
 def annotation(level: Severity, span: SourceSpan, title: str, text: str) -> str:
-    """A workflow command, with which GitHub shows a text beside a line in a pull request."""
+    """A workflow command that makes GitHub show a text beside a line of a pull request."""
     properties = {"file": span.file, "line": span.line, "col": span.column, "endColumn": span.end_column}
     listed = ",".join(f"{name}={_escaped(str(value), ':,')}" for name, value in (properties | {"title": title}).items())
     return f"::{level.value} {listed}::{_escaped(text)}"
@@ -84,7 +84,7 @@ def place(span: SourceSpan) -> dict[str, str | int]:
 
 
 class Paint:
-    """Puts text between the ANSI sequences of a style, where it is to be `coloured`."""
+    """Wraps text in the ANSI sequences of a style if `coloured`."""
 
     def __init__(self, coloured: bool) -> None:
         self._coloured = coloured
@@ -103,7 +103,7 @@ def visible(text: str) -> str:
 
 
 def excerpt(span: SourceSpan, paint: Paint, style: str) -> list[str]:
-    """The source line with carets below what is blamed; none where the file does not have it."""
+    """The source line with carets below the span; no lines if the file does not have it."""
     lines = _lines(span.file)
     text = lines[span.line - 1] if span.line <= len(lines) else ""
     if not text.strip():
@@ -117,7 +117,7 @@ def excerpt(span: SourceSpan, paint: Paint, style: str) -> list[str]:
 
 
 def _window(text: str, column: int) -> tuple[int, str]:
-    """What of a long line is shown, and where that begins."""
+    """The part of a long line that is shown, after the index of its first character."""
     if len(text) <= _LONGEST_LINE:
         return 0, text
     start = max(0, min(column - _LONGEST_LINE // 2, len(text) - _LONGEST_LINE))
@@ -125,7 +125,7 @@ def _window(text: str, column: int) -> tuple[int, str]:
 
 
 def _width(character: str) -> int:
-    """Columns of a terminal that a character takes; control characters are shown as escapes."""
+    """The width of a character in terminal columns; control characters are shown as escapes."""
     if _INVISIBLE.match(character):
         return len(visible(character))
     if unicodedata.combining(character):
@@ -134,7 +134,7 @@ def _width(character: str) -> int:
 
 
 def _lines(file: str) -> tuple[str, ...]:
-    """The lines of a file that has a finding; none if it cannot be read, which is the finding then."""
+    """The lines of a file with a finding; none if the file cannot be read."""
     path = Path(file)
     try:
         return _read_lines(path.absolute(), path.stat().st_mtime_ns) if path.is_file() else ()
@@ -144,7 +144,7 @@ def _lines(file: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _read_lines(path: Path, changed_at: int) -> tuple[str, ...]:
-    """The lines of a file as it was when it changed last, in ns."""
+    """The lines of a file. `changed_at` (ns) makes the cache read a changed file again."""
     with path.open("rb") as stream:
         data = stream.read(4 << 20)
     return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))

@@ -10,16 +10,16 @@ from router.cli.tool_options import add_table, good_table, say, table_path
 from router.errors import UsageError, plural
 
 SUFFIXES = (".svg", ".mmd", ".dot")
-_DESCRIPTION = """Draw who sends which payload cases, and where each goes, with a legend: text for Mermaid (.mmd) or
-Graphviz (.dot), or an SVG, light or dark as the viewer likes, with addresses and types under the pointer. An SVG needs
-Graphviz."""
+_DESCRIPTION = """Draw who sends which payload cases and where each goes, with a legend, as text for Mermaid (.mmd) or
+Graphviz (.dot), or as an SVG, which follows the viewer's light or dark theme and shows addresses and types as tooltips.
+An SVG needs Graphviz."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
     examples = ("router graph -o routes.svg", "router graph routes/legacy.yaml -o legacy.mmd")
     parser = add_verb(subparsers, "graph", _DESCRIPTION, *examples)
     add_table(parser, is_subject=True)
-    what = f"what to write; its name ends in {', '.join(SUFFIXES)}"
+    what = f"file to write; its name ends in {', '.join(SUFFIXES)}"
     parser.add_argument("-o", "--output", type=_output, required=True, metavar="FILE", help=what)
 
 

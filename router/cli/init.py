@@ -1,4 +1,4 @@
-"""`router init DIR`: write a first table with its protos and its test, or copy all that comes with the router."""
+"""`router init DIR`: write a first table with its protos and its test, or copy the rover's files."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ FIRST_TABLE = Path(__file__).parents[1] / "tools" / "first_table"
 
 _FIRST = {
     "routes": "rover.yaml, the table, and rover.test.yaml, its tests",
-    "protos": "what the board sends, and the lock of its numbers",
+    "protos": "the board's messages, and the lock of their field numbers",
 }
 _ROVER = {
     "routes": "the rover's tables and their test",
-    "protos": "what its boards and basestation send",
-    "schemas": "for editors, and 'comms', its ROS messages; colcon builds them (docs/guides/ros-workspace.md)",
+    "protos": "the messages of its boards and basestation",
+    "schemas": "schemas for editors, and its ROS messages, 'comms'; colcon builds them (docs/guides/ros-workspace.md)",
 }
 _DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
-the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change
-them. If one of the folders exists already, nothing is written."""
+the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run and change. If
+one of the folders already exists, nothing is written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "init", _DESCRIPTION, "router init robot", "router init --rover .")
-    parser.add_argument("folder", metavar="DIR", type=Path, help="made if it is not there")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="created if it does not exist")
     parser.add_argument("--rover", action="store_true", help="the rover's tables, protos and ROS messages")
 
 
 def _rover_parts() -> dict[str, str]:
-    """What comes with the router: in a wheel, the protos are in the folders that the tables name."""
+    """The files that come with the router. In a wheel, the protos are in the folders that the tables name."""
     folder = asset("routes").parent
     if not is_installed(folder):
         return _ROVER
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         for target in targets.values():
             if target.exists():
-                raise UsageError(f"{shown_path(target)} is there already; nothing was written")
+                raise UsageError(f"{shown_path(target)} already exists; nothing was written")
         for part, target in targets.items():
             source = asset(part) if args.rover else FIRST_TABLE / part
             if source.is_dir():
@@ -70,8 +70,8 @@ def _next_steps(folder: Path, *, is_rover: bool) -> str:
     steps = {
         f"cd {shlex.quote(str(folder))}": "" if folder.resolve() != Path.cwd() else None,
         "router validate && router test": "",
-        f"router run{table}": "    # until Ctrl-C; it says where its status page is",
-        f"router sim{table}": "    # in another terminal: plays the boards",
+        f"router run{table}": "    # until Ctrl-C; prints the address of its status page",
+        f"router sim{table}": "    # in another terminal: simulates the boards",
     }
     shown = [f"  {step}{note}" for step, note in steps.items() if note is not None]
     return "\n".join(["", "next:", *shown])

@@ -1,6 +1,6 @@
-"""`router listen PLACE`: what a gateway sends, what arrives at a UDP port, or what a ROS topic carries, one line each.
+"""`router listen PLACE`: print what a gateway sends, what arrives at a UDP port, or what a ROS topic carries.
 
-It has no part in a running router. For gateways it is the reference client of their formats.
+It does not use a running router. For gateways it is the reference client of their formats.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ _BELONGS_TO = {
 }
 """Options that only some places have."""
 
-_DESCRIPTION = """Listen at a place and print what comes, one line for each message, until Ctrl-C. Of a gateway, each
-message and schema: compressed and batched packets are understood, and how many there were is said at the end. At a
-UDP port, the payloads of envelopes: the port must be free, so that no router has part in it."""
+_DESCRIPTION = """Listen at a place and print one line per message, until Ctrl-C. From a gateway, print each message and
+schema, also of compressed and batched packets, and the counts at the end. At a UDP port, print the payloads of
+envelopes; the port must be free, so a router on this computer cannot be listening at it."""
 _PLACES = """places:
   udp://[HOST:]PORT     what a gateway sends to this address of this computer
-  tcp://HOST:PORT       a gateway's TCP, connected to again and again
-  ws://HOST:PORT        a gateway's websocket, likewise
+  tcp://HOST:PORT       a gateway's TCP server; reconnects
+  ws://HOST:PORT        a gateway's websocket server; reconnects
   zenoh://KEY           a gateway's key; ?connect=tcp/10.0.0.1:7447, also
                         listen=LOCATOR and mode=peer|client|router; or
-                        ?config=FILE of Zenoh's, as for certificates
+                        ?config=FILE of Zenoh, for example for TLS
   envelope://[HOST:]PORT    envelopes, as boards and basestation get them
   envelope://NAME       the same at the address of an endpoint or listener
   topic://NAME          a ROS topic"""
@@ -73,25 +73,25 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_count(parser)
     add_for(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON object per line, data as it is received")
-    parser.add_argument("--hex", action="store_true", help="envelopes and ROS: with the bytes of each")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line, with the data as received")
+    parser.add_argument("--hex", action="store_true", help="envelopes and ROS: also print the bytes")
     parser.add_argument("--type", metavar="TYPE", help="ROS: the topic's type (default: what its publishers say)")
-    about = "gateways: only such topics, as /loki_1/**; several are possible"
+    about = "gateways: only matching topics, for example /loki_1/**; may be repeated"
     completes(parser.add_argument("--topic", dest="topics", action="append", metavar="GLOB", help=about), topics)
-    parser.add_argument("--record", type=Path, metavar="FILE", help="gateways: append JSON lines to this file as well")
-    parser.add_argument("--format", choices=FORMATS, help="tcp: how it is split (default: what the first bytes say)")
-    parser.add_argument("--ask", metavar="HOST:PORT", help="udp: ask this 'receive' address of a gateway for schemas")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="gateways: also append JSON lines to this file")
+    parser.add_argument("--format", choices=FORMATS, help="tcp: framing (default: detected from the first bytes)")
+    parser.add_argument("--ask", metavar="HOST:PORT", help="udp: request schemas from this gateway's 'receive' address")
     add_wire_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     scheme, separator, rest = args.place.partition("://")
     if not separator:
-        forms = f"udp://{scheme} is where a gateway sends to, envelope://{scheme} where a router does"
-        raise UsageError(f"'{scheme}' does not say what it is: {forms}, topic://{scheme} is a ROS topic")
+        forms = f"udp://{scheme} (a gateway's packets), envelope://{scheme} (envelopes) or topic://{scheme} (a topic)"
+        raise UsageError(f"'{scheme}' has no scheme", f"write {forms}")
     for name, (option, schemes) in _BELONGS_TO.items():
         if getattr(args, name) and scheme not in schemes:
-            raise UsageError(f"{option} belongs to {', '.join(f'{each}://' for each in schemes)}")
+            raise UsageError(f"{option} works only with {', '.join(f'{each}://' for each in schemes)}")
     if scheme == "envelope":
         _listen_to_port(rest, args)
     elif scheme == "topic":
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         _listen_to_gateway(args)
     else:
         places = ", ".join(f"{each}://" for each in (*GATEWAYS, "envelope", "topic"))
-        raise UsageError(f"there are no places {scheme}://", f"there are {places}")
+        raise UsageError(f"there is no scheme '{scheme}://'", f"the schemes are {places}")
     return 0
 
 
@@ -116,7 +116,7 @@ def _listen_to_gateway(args: argparse.Namespace) -> None:
     gateway = destination(args.ask, None) if args.ask else None
     show = _printer(args.json)
     with _recorder(args.record) as record, closing(open_source(args.place, form, gateway, say)) as source:
-        say(f"listening: {source.place}; Ctrl-C ends it")
+        say(f"listening: {source.place}; press Ctrl-C to stop")
         rest = args.count
         try:
             with until_interrupted():
@@ -138,14 +138,14 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     wire, table = load_wire(args, place)
     with udp.open_udp(udp.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
-        say(f"listening on {host}:{port}; Ctrl-C ends it")
+        say(f"listening on {host}:{port}; press Ctrl-C to stop")
         with until_interrupted():
             print_batches(listen(receiver, wire, udp.peer_names(table)), args)
 
 
 def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
     if not topic:
-        raise UsageError("topic:// names no topic", "write topic://imu_data")
+        raise UsageError("topic:// lacks a name", "write topic://imu_data")
     from router.ros.environment import check_environment, ros_remedy
 
     try:
@@ -160,26 +160,26 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
     begun = time.monotonic()
     with until_interrupted():
         if args.type is None:
-            say(f"waiting for a publisher of {topic}; Ctrl-C ends it")
+            say(f"waiting for a publisher of {topic}; press Ctrl-C to stop")
         try:
             listener = TopicListener(topic, args.type, patience=args.seconds or math.inf)
         except StartError as error:
             raise UsageError(*error.args) from error
         with closing(listener):
-            say(f"listening to {topic} of {listener.type_name}; Ctrl-C ends it")
+            say(f"listening to {topic} of {listener.type_name}; press Ctrl-C to stop")
             print_batches(listen_to_topic(listener), args, time.monotonic() - begun)
 
 
 @contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
-    """A function that appends a line to the file, unbuffered."""
+    """Yield a function that appends a line to the file, unbuffered."""
     from router.tools.gateway_messages import json_line
 
     if path is None:
         yield lambda _: None
         return
     if path == Path("-"):
-        raise UsageError("--record takes a file", "--json prints the same")
+        raise UsageError("--record needs a file", "use --json to print the same lines")
     try:
         file = path.open("ab", buffering=0)
     except OSError as error:
@@ -196,7 +196,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
 
 
 def _printer(as_json: bool) -> Callable[[Heard], None]:
-    """A function that prints; on a terminal with colours and lines cut to its width."""
+    """A function that prints a line; on a terminal in colour, and cut to the width."""
     from router.tools.gateway_messages import json_line, pieces
 
     if as_json:

@@ -1,4 +1,4 @@
-"""`router new NAME --number N --board BOARD`: a message of its own, in every file that has to know of it."""
+"""`router new NAME --number N --board BOARD`: add a message to every file that must declare or use it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from router.tools.new_message import NewMessage, Site
     from router.tools.new_message_files import Written
 
-_DESCRIPTION = """Add a message of a board to a checkout of the rover: its .proto file, its number in
-the envelope and in the lock, the ROS message in schemas/comms, a route from the board to ROS and the basestation, and a
-test of it. Files keep their comments and their layout. What cannot be is refused, and then nothing is written. A table
-of your own, elsewhere, needs no such command: write message and route, then run 'router schema lock'."""
-_FIELDS = """such as `dose_rate:float state:SensorState`, or, with its unit, a single 'dose_rate:float # uSv/h'; types
-are bool, float, double, int32, int64, uint32, uint64, and enums and messages of the protos"""
+_DESCRIPTION = """Add a board's message to a checkout of the rover: its .proto file, its number in the
+envelope and in the lock, the ROS message in schemas/comms, a route from the board to ROS and the basestation, and a
+test of the route. Files keep their comments and layout. If anything about the message is invalid, nothing is written.
+In a project of your own, write message and route by hand, then run 'router schema lock'."""
+_FIELDS = """for example `dose_rate:float state:SensorState`, or one field with its unit: 'dose_rate:float # uSv/h';
+types are bool, float, double, int32, int64, uint32, uint64, and enums and messages of the protos"""
 
 _EXAMPLES = (
     "router new SensorBoardRadiationInfo --number 27 --board sensor",
@@ -34,11 +34,11 @@ _EXAMPLES = (
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "new", _DESCRIPTION, *_EXAMPLES)
-    parser.add_argument("name", metavar="NAME", help="of the message: its board, then what it is, as one word each")
-    parser.add_argument("--number", type=integer, required=True, metavar="N", help="in the envelope, never used before")
+    parser.add_argument("name", metavar="NAME", help="name of the message, in CamelCase, beginning with the board")
+    parser.add_argument("--number", type=integer, required=True, metavar="N", help="a number that was never used")
     completes(
         parser.add_argument(
-            "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
+            "--board", required=True, metavar="BOARD", help="its sender, an endpoint; `_board` may be omitted"
         ),
         senders,
     )
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
     if errors:
         print_findings(errors, sys.stderr)
-        print("router new: repair that first; nothing was written", file=sys.stderr)
+        print("router new: fix these errors first; nothing was written", file=sys.stderr)
         return BAD_TABLE
     site = _site(before[0])
     _check_schemas(path)
@@ -66,26 +66,26 @@ def run(args: argparse.Namespace) -> int:
         written.write(site.schema.lock, locked(site))
         after = _check(path)
         print_findings(_news(before, after), sys.stderr)
-    except BaseException:  # Ctrl-C, too
+    except BaseException:  # including Ctrl-C
         written.undo()
         raise
     if any(checked.has_errors for checked in after):
         written.undo()
-        print("router new: the message would be wrong like this; nothing was written", file=sys.stderr)
+        print("router new: the message would cause these errors; nothing was written", file=sys.stderr)
         return BAD_TABLE
     _report(message, written, planned.unrouted, site, _site(after[0]))
     return OK
 
 
 def _check(table: Path) -> list[Checked]:
-    """Check the table, and those beside it."""
+    """Check the table and the other tables in its folder."""
     from router.cli.validate import find_tables
     from router.compiler import check_table
     from router.compiler.lookup import Definitions
 
     definitions = Definitions()
     checked = check_table(table, definitions=definitions)
-    if checked.table is None:  # there may be no folder either
+    if checked.table is None:  # perhaps there is not even a folder
         return [checked]
     beside = [path for path in find_tables([table.parent]) if path.resolve() != table.resolve()]
     return [checked, *(check_table(path, definitions=definitions) for path in beside)]
@@ -112,7 +112,7 @@ def _site(checked: Checked) -> Site:
 
 
 def _news(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
-    """Findings that are new, compared by message, since lines have moved."""
+    """New findings. They are compared by message, since lines have moved."""
     known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
     found = {finding: None for checked in after for finding in checked.diagnostics}
     return [finding for finding in found if (finding.code, finding.message) not in known]
@@ -128,9 +128,9 @@ def _report(message: NewMessage, written: Written, unrouted: Sequence[Path], bef
     for path in written.changed:
         print(f"  changed  {shown_path(path)}")
     for path in unrouted:
-        print(f"  route it yourself in {shown_path(path)}: what that does with it nobody but you knows")
+        print(f"  add a route yourself in {shown_path(path)}: only you know what that table should do with it")
     if after.envelope.max_size > before.envelope.max_size:
         bounded = " that has a bound" if after.schema.unbounded(after.envelope.name) else ""
         print(f"The largest envelope{bounded} grew from {before.envelope.max_size} to {after.envelope.max_size} bytes:")
-        print("flash all boards, because those that decode it have to have room for that.")
-    print("Next: `make setup` builds the ROS message; `router validate --strict` and `router test` prove the table.")
+        print("flash all boards, because those that decode it need a larger buffer.")
+    print("Next: `make setup` builds the ROS message; `router validate --strict` and `router test` check the table.")

@@ -1,4 +1,4 @@
-"""`router record`: what a running router receives, to a file; or what it has kept in memory."""
+"""`router record`: write what a running router receives to a file, or make it save what it has kept in memory."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 FAILED = 1
 
 
-_DESCRIPTION = """Write every datagram that a running router receives to an MCAP file, until Ctrl-C, with sender and
-time; also what no route takes, with the reason. Foxglove opens the file as it is, 'router replay' sends it
-again. To record always, without this command, give the table a 'record'."""
+_DESCRIPTION = """Write every datagram that a running router receives to an MCAP file until Ctrl-C, with sender and
+time. Rejected datagrams are included, with the reason. Foxglove opens the file; 'router replay' sends it again. To
+record always, without this command, add 'record' to the table."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -34,14 +34,14 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "record", _DESCRIPTION, *examples)
     add_router_options(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: TABLE_TIME.mcap in this folder")
-    parser.add_argument("--last", action="store_true", help="have the router save what it has kept in memory instead")
+    parser.add_argument("--last", action="store_true", help="make the router save what it has kept in memory instead")
     add_for(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     if args.last and (args.output or args.seconds):
         where = "the directory of the table's 'record', on the router's computer"
-        raise UsageError(f"--last writes to {where}", "leave -o and --for")
+        raise UsageError(f"--last writes to {where}", "leave out -o and --for")
     return _save_last(args) if args.last else _record(args)
 
 
@@ -66,16 +66,16 @@ def _record(args: argparse.Namespace) -> int:
     table = read_table(table_path(args))
     url = running_url(args)
     time = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    # The router goes before whatever runs on its computer to watch it.
+    # The router has priority over observers on its computer.
     with background_threads(), tap(url) as batches:
         recording = TapRecording(
             args.output or Path(f"{table.path.stem}_{time}.mcap"), wire_of_table(table).envelope, table
         )
-        print(f"recording the router at {url} to {recording.path}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        print(f"recording the router at {url} to {recording.path}; press Ctrl-C to stop", file=sys.stderr, flush=True)
         try:
             with until_interrupted(), progress(_columns) as update:
                 until = monotonic() + (args.seconds or math.inf)
-                for batch in batches:  # there is one each second, at least
+                for batch in batches:  # at least one each second
                     recording.take(batch)
                     update(description=_summary(recording))
                     if monotonic() >= until:

@@ -1,4 +1,4 @@
-"""`router reload`: a running router reads its table again, and changes to it unless it has errors."""
+"""`router reload`: make a running router reload its table, unless the table has errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError
 
 PATIENCE = 60.0
-"""Seconds; a large table takes one to compile where there is much traffic."""
+"""Seconds; compiling a large table takes about one second under heavy traffic."""
 
 _DESCRIPTION = f"""\
 Make a running router read its table again, with all files that the table names. It changes to the new table between two

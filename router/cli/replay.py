@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 DIFFERENT = 1
 
 _DESCRIPTION = """\
-Send the datagrams of a recording again, with the times between them, to the listeners of the table, from the addresses
-that it has for their senders. With --against, send nothing, but run them through the table and another one, and print
-what would be delivered differently; exit code 1 where anything would.
+Send the datagrams of a recording again, at the recorded intervals, to the listeners of the table and from the addresses
+that the table has for their senders. With --against, send nothing: run them through the table and another one, and
+print what they would deliver differently; exit code 1 if there is a difference.
 """
 
 _EXAMPLES = (
@@ -37,15 +37,15 @@ _EXAMPLES = (
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "replay", _DESCRIPTION, *_EXAMPLES)
-    parser.add_argument("file", type=Path, metavar="FILE", help="what 'record' has written")
-    about = "2x is twice as fast, max without waiting (default: 1x)"
+    parser.add_argument("file", type=Path, metavar="FILE", help="recording that 'record' has written")
+    about = "2x is twice as fast, max does not wait (default: 1x)"
     parser.add_argument("--speed", type=speed, metavar="SPEED", help=about)
     completes(
-        parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name of the table (default: its listeners)"),
+        parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name in the table (default: its listeners)"),
         places,
     )
     completes(
-        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table"),
+        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint in the table"),
         endpoints,
     )
     add_table(parser)
@@ -56,11 +56,11 @@ def run(args: argparse.Namespace) -> int:
     from router.recording.reader import Recording
 
     if args.against is not None and (args.speed or args.to or args.origin):
-        raise UsageError("--against sends nothing: --speed, --to and --from have no part in it")
+        raise UsageError("--against sends nothing", "leave out --speed, --to and --from")
     with closing(Recording(args.file)) as recording:
         code = _compare(args, recording) if args.against is not None else _send(args, recording)
         if recording.ends_early:
-            print(f"{args.file} was not finished: what is missing is behind its last whole chunk", file=sys.stderr)
+            print(f"{args.file} was not finished: everything after its last complete chunk is missing", file=sys.stderr)
     return code
 
 
@@ -83,15 +83,15 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
 
 
 def _advise(resent: Resent) -> int:
-    """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    """Print on stderr why the datagrams may have had no effect. Return 1 if the port was closed, else 0."""
     if resent.elsewhere:
         listed = ", ".join(f"{name} ({host})" for name, host in sorted(resent.elsewhere.items())[:5])
         more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
-        what = f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
-        hint = "-t TABLE has other addresses for them, or --from PLACE"
-        print(with_help(f"{what}takes for strangers", hint), file=sys.stderr)
+        what = f"router replay: this computer does not have the addresses of {listed}{more}, and sent from its own"
+        hint = "name a table that has local addresses for them (-t TABLE), or one address for all (--from PLACE)"
+        print(with_help(f"{what}: the router sees strangers", hint), file=sys.stderr)
     if resent.refused:
-        print("router replay: nobody listened for some of them", file=sys.stderr)
+        print("router replay: nobody listened for some of the datagrams", file=sys.stderr)
     return 1 if resent.refused else OK
 
 
@@ -113,7 +113,7 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
 
 
 def _progress(recording: Recording, doing: str) -> AbstractContextManager[Callable[..., None]]:
-    """A chunk, which is half a second, is one step of it."""
+    """Show the progress, in steps of a chunk, which is half a second."""
 
     def columns() -> Iterable[ProgressColumn]:
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn

@@ -1,6 +1,6 @@
-"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal.
+"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal arrives.
 
-The ROS parameter `routes_path` may name the table as well.
+The ROS parameter `routes_path` can also name the table.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from router.kept.head_start import Beginning, HeadStart
     from router.table.model import Gateway
 
-_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router
-reload'). SIGUSR1: save the last datagrams, where the table keeps them ('record').
+_DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
+saves the last datagrams, if the table keeps them ('record').
 
 Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
-_PARAMETERS = """The ROS parameter routes_path chooses the table as well. Any other is a variable of the table in lower
-case, and wins over the environment."""
+_PARAMETERS = """The ROS parameter routes_path also chooses the table. Any other parameter sets the table's variable of
+that name in upper case, and overrides the environment."""
 _ENDING = frozenset({signal.SIGINT, signal.SIGTERM})
 _EXAMPLES = (
     "router run",
@@ -46,15 +46,15 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "run", _DESCRIPTION, *_EXAMPLES, more=_PARAMETERS)
     add_table(parser, is_subject=True)
     parser.add_argument(
-        "--log-level", choices=LOG_LEVELS, default="info", help="least that is logged (default: %(default)s)"
+        "--log-level", choices=LOG_LEVELS, default="info", help="lowest level that is logged (default: %(default)s)"
     )
     parser.add_argument(
         NO_CACHE,
         action="store_true",
-        help="compile the table before anything runs; keep nothing for the next start",
+        help="compile the table before routing starts; keep no program for the next start",
     )
     parser.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARG", help="everything from here on is for ROS"
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARG", help="all further arguments are for ROS"
     )
 
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 def _compile_and_route(
     args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
 ) -> None:
-    """`ending` closes the head start, until `route` does."""
+    """Compile the table and run it. `ending` closes the head start until `route` does."""
     from router.app.keeping import Keeper
     from router.carrier.library import library
     from router.compiler.check import uncollected
@@ -91,7 +91,7 @@ def _compile_and_route(
         _warn_of(without_effect(args.ros_args, program, environ.asked))
         start = "kept" if head_start is not None else "refused" if begun is not None and begun.why else "compiled"
         if head_start is not None and not _is_of(head_start, program, read):
-            logger.warning("an input has changed since the start: the kept program ends, and the compiled one starts")
+            logger.warning("an input has changed since the start: the compiled program replaces the kept one")
             ending.close()
             head_start, start = None, "replaced"
         if signal.sigpending() & _ENDING:  # held back since the head start began, which `ending` closes
@@ -103,12 +103,12 @@ def _compile_and_route(
 
 
 def _begun(begun: Beginning | None) -> HeadStart | None:
-    """The head start, if there is one. Log whether there is, and if a kept program is not used, why."""
+    """Return the head start, if there is one, and log it. Log why a kept program is not used."""
     from router.kept.store import CHANGED
 
     head_start = begun.take() if begun is not None else None
     if head_start is not None:
-        logger.info("forwarding by the kept program, while the table is compiled", listening=[*head_start.listening])
+        logger.info("forwarding by the kept program while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
         log = logger.info if begun.why.endswith(CHANGED) else logger.warning
         log("the kept program is not used: the table is compiled first", why=begun.why)
@@ -116,7 +116,7 @@ def _begun(begun: Beginning | None) -> HeadStart | None:
 
 
 def _is_of(head_start: HeadStart, program: Program, read: inputs.Inputs) -> bool:
-    """Whether a head start runs a program that was just compiled."""
+    """Whether a head start runs the program that was just compiled."""
     from router.carrier.image import image_of
     from router.carrier.library import library
 
@@ -124,7 +124,10 @@ def _is_of(head_start: HeadStart, program: Program, read: inputs.Inputs) -> bool
 
 
 def _table(args: argparse.Namespace, name: str, parameter: str | None) -> Path:
-    """Raises UsageError. The parameter of this name is relative to the working directory, as TABLE."""
+    """Return the path of the table. `parameter`, the ROS parameter `name`, may name it. Raises UsageError.
+
+    The parameter is relative to the working directory, like TABLE.
+    """
     if not parameter:
         return table_path(args)
     typed: Path | None = args.subject or args.table
@@ -165,7 +168,7 @@ def route(
 
 
 def _show_places(router: Router) -> None:
-    """Say where to look: a place a line on a terminal, elsewhere a record of the log."""
+    """Log the addresses of pages and gateways: on a terminal one per line, elsewhere as one record."""
     found = dict(_places(router))
     if found and not sys.stderr.isatty():
         logger.info("where to look", **found)
@@ -192,15 +195,15 @@ def _place(gateway: Gateway) -> str:
 
     if gateway.zenoh is not None:
         return f"zenoh://{gateway.zenoh.key.value}"
-    assert gateway.address is not None  # noqa: S101 - all but Zenoh have one
+    assert gateway.address is not None  # noqa: S101 - only Zenoh has none
     scheme = {Transport.WEBSOCKET: "http", Transport.TCP: "tcp"}.get(gateway.transport.value, "udp")
     return f"{scheme}://{reachable(gateway.address.value)}{'/' if scheme == 'http' else ''}"
 
 
 def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
-    """Handle signals one after the other until one of `ending` comes."""
+    """Handle signals one after the other until one of `ending` arrives."""
     while True:
-        last = signal.sigpending() & set(ending)  # sigwait alone would prefer SIGHUP, however often it comes
+        last = signal.sigpending() & set(ending)  # sigwait alone would return SIGHUP first each time
         match signal.sigwait(last or {*ending, signal.SIGHUP, signal.SIGUSR1}):
             case signal.SIGHUP:
                 router.reload()

@@ -1,6 +1,6 @@
 """`router schema lock`: record the field numbers of the `.proto` files, so that none is ever reused.
 
-Adds what is new and refuses every other change that is not accepted by name. `router validate` compares as well.
+It adds new numbers and rejects every other change that is not accepted by name. `router validate` compares them, too.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from router.types.lock import Conflict
     from router.types.lock_file import Lock
 
-_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there. A number that is
-reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written. `--accept` takes such a
-change when all boards get new firmware; `router validate` prints the command."""
+_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add their new numbers to it. A number that is
+reused, or a field that is renumbered, retyped or renamed, is rejected: exit code {BAD_TABLE}, nothing written. If all
+boards get new firmware, accept such a change by `--accept`; `router validate` prints the command."""
 _PROTOS = "folder of .proto files, instead of a table"
 _EXAMPLES = (
     "router schema lock",
     "router schema lock --protos protos",
     "router schema lock --accept Motor.rpm --accept PBEnvelope.imu_info",
 )
-_LOCK = "the lock file (default: as the table says, else envelope.lock.json in the folder)"
-_ACCEPT = "a change that is meant, called as the finding calls it: Message.field, Enum.VALUE, or a whole Message"
+_LOCK = "lock file (default: the table's, else envelope.lock.json in the folder)"
+_ACCEPT = "an intended change, named as in the finding: Message.field, Enum.VALUE, or a whole Message"
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -44,8 +44,8 @@ def add_parser(subparsers: Subparsers) -> None:
     add_table(lock)
     lock.add_argument("--protos", type=Path, metavar="DIR", help=_PROTOS)
     lock.add_argument("--lock", type=Path, metavar="FILE", help=_LOCK)
-    lock.add_argument("--message", metavar="NAME", help=f"the envelope (default: of table or lock, else {ENVELOPE})")
-    lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: of table or lock, else {ONEOF})")
+    lock.add_argument("--message", metavar="NAME", help=f"envelope (default: that of table or lock, else {ENVELOPE})")
+    lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: that of table or lock, else {ONEOF})")
     lock.add_argument("--accept", action="append", default=[], metavar="NAME", help=_ACCEPT)
 
 
@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
     settings = _settings(args)
     path = lock_path(settings.protos, settings.lock)
     if is_installed(path):
-        what = f"{path} belongs to the installed router, and is lost when that is upgraded"
-        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name yours: --protos protos")
+        what = f"{path} belongs to the installed router: the next upgrade overwrites it"
+        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name the copy: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
     envelope = find_envelope(schema, settings.oneof)
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
         if len(found) > 1:
             names = " ".join(f"--accept {each.name}" for each in found)
-            print(f"nothing was written; if all of it is intended, say so in one command: {names}")
+            print(f"nothing was written; if all of these changes are intended, accept them together: {names}")
         return BAD_TABLE
     new = lock.extended(accepted)
     if new != lock.lock:
@@ -82,9 +82,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> EnvelopeSettings:
-    """Where the protos and the lock are. Raises TableError for a broken table."""
+    """Return the places of protos and lock. Raises TableError for a broken table."""
     if args.protos and args.table:
-        raise UsageError("--protos and --table both say where the messages are", "give one")
+        raise UsageError("--protos and --table both say where the messages are", "give only one")
     settings = _of_folder(args.protos) if args.protos else _of_table(table_path(args))
     return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
 
@@ -108,7 +108,7 @@ def _of_table(path: Path) -> EnvelopeSettings:
 
 
 def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock | None) -> EnvelopeSettings:
-    """The envelope's names: as typed, else as the table says, else as the lock says in whatever package."""
+    """Set the names of envelope and oneof: as typed, else as in the table, else as in the lock, without package."""
     locked = (short_name(lock.message), lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
     message = args.message or settings.message.value or locked[0]
     oneof = args.oneof or settings.oneof.value or locked[1]
@@ -117,15 +117,15 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
 
 
 def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]:
-    """The conflicts that `names` mean, of those `found`. Raises UsageError for a name that means none, or several."""
+    """The conflicts in `found` that `names` refer to. Raises UsageError for a name of none, or of several."""
     accepted = [each for name in names for each in _meant(name, found)]
     return [each for each in found if each in accepted]
 
 
 def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
-    """The conflict of that name, or those of a message; its package and the messages around it may be left out.
+    """The conflict of that name, or all of a message. Package and enclosing messages may be left out.
 
-    A field may be called as the lock has it.
+    A field may also have its name in the lock.
     """
     if exact := [each for each in found if name in (each.name, each.owner)]:
         return exact
@@ -138,22 +138,22 @@ def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
     if full:
         raise UsageError(f"'{name}' may be {' or '.join(full)}; nothing was written", "write its full name")
     hint = did_you_mean(name, known) or "nothing conflicts with the lock"
-    raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
+    raise UsageError(f"'{name}' has no change to accept; nothing was written", hint)
 
 
 def _summary(old: Lock | None, new: Lock, unbounded: str) -> str:
-    """`unbounded` is why there is no largest envelope, "" where there is one."""
+    """`unbounded` is the reason why there is no largest envelope, "" if there is one."""
     added = _numbers(new) - (_numbers(old) if old is not None else set())
     size = f"an envelope takes up to {new.max_size} bytes"
     if unbounded:
-        size = f"an envelope has no largest size, as {unbounded}"
-        size += f"; all else takes up to {new.max_size} bytes" if new.max_size else ""
+        size = f"an envelope has no largest size, because {unbounded}"
+        size += f"; others take up to {new.max_size} bytes" if new.max_size else ""
     if old is not None and old.max_size != new.max_size:
         size += f" (it was {old.max_size}: flash the boards)"
     return f"{plural(len(new.messages), 'message')}, {plural(len(added), 'new number')}; {size}"
 
 
 def _numbers(lock: Lock) -> set[tuple[str, int, str]]:
-    """The numbers given out, whatever the package is."""
+    """The numbers in use, regardless of the package."""
     declared = (*lock.messages.items(), *lock.enums.items())
     return {(short_name(owner), each.number, each.name) for owner, members in declared for each in members.entries}

@@ -32,16 +32,16 @@ def add_parser(subparsers: Subparsers) -> None:
         fields,
     )
     completes(
-        parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name of the table"), places
+        parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name in the table"), places
     )
     completes(
-        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table"),
+        parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint in the table"),
         endpoints,
     )
-    parser.add_argument("--rate", type=hertz, metavar="RATE", help="as 20Hz (default: as fast as possible)")
+    parser.add_argument("--rate", type=hertz, metavar="RATE", help="for example 20Hz (default: as fast as possible)")
     add_count(parser, "how many (default: 1, with --rate until Ctrl-C)")
     parser.add_argument("--trim", action="store_true", help="remove trailing zero bytes, as the old boards do")
-    parser.add_argument("--pad", type=whole, default=0, metavar="N", help="fill up with zeros to N bytes, as they do")
+    parser.add_argument("--pad", type=whole, default=0, metavar="N", help="pad with zeros to N bytes, as old boards do")
     add_wire_options(parser)
 
 
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
-    # Without --count it ends with Ctrl-C, and then reports what was sent.
+    # Without --count, Ctrl-C stops it, and what was sent is reported.
     with udp.open_udp(origin, "--from") as sender, until_interrupted():
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))
@@ -74,7 +74,7 @@ def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:
 
 
 def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sent: Sent) -> int:
-    """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    """Print on stderr why the payload may have had no effect. Return 1 if the port was closed, else 0."""
     from router.net.udp import nobody_listens
 
     if sent.refused:
@@ -84,6 +84,6 @@ def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sen
         return 0
     sources = [name.value for route in table.routes if route.case.value == args.case for name in route.sources]
     if named := [name for name in sources if name in table.endpoints]:
-        what = f"router send: the table takes {args.case} from {' or '.join(named)} only"
+        what = f"router send: the table accepts {args.case} only from {' or '.join(named)}"
         print(with_help(what, f"add --from {named[0]} unless this machine has its address"), file=sys.stderr)
     return 0

@@ -1,4 +1,4 @@
-"""`router sim`: play all boards and the basestation of a table on this machine."""
+"""`router sim`: simulate all boards and the basestation of a table on this computer."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ CHANGES_SHOWN = 3
 
 
 _DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards
-obey commands, halt for a deadman, and stop after a second without commands. The endpoints' addresses must be this
-machine's, as they are in routes/sim.yaml."""
+obey commands, halt when a deadman stops them, and stop after a second without commands. The endpoints' addresses must
+belong to this computer, as in routes/sim.yaml."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",
@@ -47,12 +47,12 @@ def add_parser(subparsers: Subparsers) -> None:
             action="append",
             default=[],
             metavar="NAME:FROM-TO",
-            help="nothing is sent by this endpoint, or of this payload case, from second FROM to second TO; without "
-            "TO for ever. Several are possible",
+            help="send nothing from this endpoint, or of this payload case, from second FROM to second TO; without TO, "
+            "to the end. May be repeated",
         ),
         silences,
     )
-    parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
+    parser.add_argument("--json", action="store_true", help="print statistics as JSON lines; the last one is final")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,7 +83,7 @@ def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) ->
 
 
 def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
-    """A line every LINE_REFRESH seconds, and one for each change of a board."""
+    """Print a line every LINE_REFRESH seconds, and one for each change of a board."""
     shown, due = 0.0, LINE_REFRESH
 
     def write(seconds: float) -> None:
@@ -96,14 +96,14 @@ def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -
             view.update(seconds)
             print(view.line(), flush=True)
 
-    print(f"{simulator.summary}; Ctrl-C ends it", flush=True)
+    print(f"{simulator.summary}; press Ctrl-C to stop", flush=True)
     seconds = simulator.run(args.seconds, CHANGE_REFRESH, write)
     due = seconds
     write(seconds)
 
 
 def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
-    """In place on the whole screen; the summary stays at the end."""
+    """Draw on the whole screen, and leave the summary at the end."""
     from rich.console import Console, Group
     from rich.live import Live
     from rich.text import Text
@@ -113,7 +113,7 @@ def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace
 
         def draw(seconds: float) -> None:
             view.update(seconds)
-            title = Text(f"{simulator.summary}; Ctrl-C ends it", style="bold", no_wrap=True, overflow="ellipsis")
+            title = Text(f"{simulator.summary}; press Ctrl-C to stop", style="bold", no_wrap=True, overflow="ellipsis")
             statuses = view.statuses()
             changes = [Text(str(change), style="dim") for change in view.changes(since=0)[-CHANGES_SHOWN:]]
             room = console.height - 2 - statuses.row_count - len(changes)

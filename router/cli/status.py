@@ -1,4 +1,4 @@
-"""`router status`: whether the router runs and is healthy, in one line and an exit code, for scripts."""
+"""`router status`: whether the router is running and healthy, as one line and an exit code, for scripts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from router.errors import TransportError, plural
 
 DEGRADED = 3
 
-_DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it now or was within the
-last seconds, as the status page and /diagnostics do.
+_DESCRIPTION = f"""Print in one line whether the router of a table is running, and what is wrong with it or was in the
+last few seconds, as on the status page and in /diagnostics. For remedies, run 'router doctor'.
 
-Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
-{BAD_USAGE} wrong usage, {BAD_TABLE} a wrong table. 'router doctor' says what to do about it."""
+Exit code: {OK} running and healthy, {NETWORK_FAULT} not running, {DEGRADED} running with problems, {BAD_USAGE} wrong
+usage, {BAD_TABLE} a wrong table."""
 
 
 _UNTIL_IT_RUNS = f"until router status || [ $? -ne {NETWORK_FAULT} ]; do sleep 1; done    # until it runs"

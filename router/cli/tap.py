@@ -1,4 +1,4 @@
-"""`router tap [CASE...]`: what a running router receives, one line for each datagram."""
+"""`router tap [CASE...]`: print what a running router receives, one line per datagram."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from router.cli.tool_options import (
     until_interrupted,
 )
 
-_DESCRIPTION = """Print what a running router receives: the fields that are not default, and why it rejected what no
-route took. The router is asked where the table's 'http.address' says, on this computer; it does not wait for this
-terminal, and says how many datagrams were too many for it. To listen at a port or a ROS topic without a router: 'router
-listen'."""
+_DESCRIPTION = """Print what a running router receives: the fields that are not at their default, and the reason for
+each rejected datagram. The router is reached at the table's 'http.address', on this computer. It never waits for this
+terminal; datagrams that the terminal missed are counted. To listen at a port or a ROS topic without a router, use
+'router listen'."""
 _EXAMPLES = (
     "router tap imu_info gps_info -t routes/sim.yaml",
     "router tap --from arm_board --for 10s",
@@ -37,19 +37,19 @@ def add_parser(subparsers: Subparsers) -> None:
         parser.add_argument("cases", nargs="*", metavar="CASE", help="only these payload cases (default: everything)"),
         cases,
     )
-    about = "only from this endpoint or IP address; several are possible"
+    about = "only from this endpoint or IP address; may be repeated"
     completes(
         parser.add_argument("--from", dest="sources", action="append", default=[], metavar="ENDPOINT", help=about),
         endpoints,
     )
-    about = "only what a route took, or only what none took"
+    about = "only datagrams that a route took, or only those that none took"
     parser.add_argument("--only", choices=("accepted", "rejected"), help=about)
-    about = "only what this expression of the table's language holds for: 'satellites < 4'"
+    about = "only payloads for which this expression is true: 'satellites < 4'"
     parser.add_argument("--where", metavar="EXPR", help=about)
     add_count(parser)
     add_for(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
-    parser.add_argument("--hex", action="store_true", help="with the bytes of each")
+    parser.add_argument("--hex", action="store_true", help="also print the bytes")
     add_url_option(parser)
     add_wire_options(parser)
 
@@ -66,15 +66,15 @@ def run(args: argparse.Namespace) -> int:
     condition = Condition(args.where, wire.envelope, cases) if args.where else None
     taken = RunningTap(wire, args.cases, condition)
     wanted = args.cases or (sorted(condition.cases) if condition else [])
-    # The router goes before whatever runs on its computer to watch it.
+    # The router has priority over observers on its computer.
     with background_threads(), tap(url, wanted, args.sources, args.only) as batches:
-        say(f"tapping the router at {url}; Ctrl-C ends it")
+        say(f"tapping the router at {url}; press Ctrl-C to stop")
         try:
             with until_interrupted():
                 print_batches(taken.take(batches), args)
         finally:
             if taken.missed:
-                say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")
+                say(f"{taken.missed} datagrams are not shown, as this terminal was too slow; the router routed them")
             if condition is not None and condition.failure:
-                say(f"where --where fails nothing is shown: {condition.failure}")
+                say(f"payloads for which --where has no value are not shown: {condition.failure}")
     return 0

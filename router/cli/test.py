@@ -1,4 +1,4 @@
-"""`router test PATH...`: proves what tables do with messages, without network or ROS."""
+"""`router test PATH...`: check what tables do with messages, without network or ROS."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from router.rehearsal.running import FailedStep, Result
 
 FAILED = 1
-_DESCRIPTION = f"""Run the tests of route tables: given this message, the table sends and publishes exactly that. A
-table stands for the tests beside it, of rover.yaml those in rover.test.yaml; a folder for the *.test.yaml and
-*.test.yml in it (not in folders below it). docs/guides/test-tables.md has the language.
+_DESCRIPTION = f"""Run the tests of route tables: given a message, the table must send and publish exactly what the
+test expects. A table stands for the test file beside it (rover.test.yaml for rover.yaml), a folder for the *.test.yaml
+and *.test.yml in it (not in its subfolders). docs/guides/test-tables.md describes the language.
 
 Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap, {BAD_TABLE} a test file or its table is
 wrong, {BAD_USAGE} wrong usage."""
@@ -45,8 +45,8 @@ def add_parser(subparsers: Subparsers) -> None:
     examples = ("router test", "router test routes/ --coverage", "router test --only 'the operator'")
     parser = add_verb(subparsers, "test", _DESCRIPTION, *examples)
     add_tables(parser, "a table, a test file, or a folder with test files")
-    parser.add_argument("--coverage", action="store_true", help="list what of the tables no test has touched")
-    parser.add_argument("--only", metavar="TEXT", help="run the tests whose name contains this")
+    parser.add_argument("--coverage", action="store_true", help="list the parts of the tables that no test covers")
+    parser.add_argument("--only", metavar="TEXT", help="run only tests with this text in their name")
     add_styles(parser)
 
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from router.rehearsal.reading import find_test_files
 
     if args.coverage and args.only:
-        print("router test: --coverage is about all tests; leave out --only", file=sys.stderr)
+        print("router test: --coverage needs all tests; leave out --only", file=sys.stderr)
         return BAD_USAGE
     paths = [_tests_of(path) for path in table_paths(args)]
     files = find_test_files(paths)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     coverages: dict[Path, Coverage] = {}
     results, findings = _results(files, args.only or "", coverages if args.coverage else None)
     if args.only and not results and not findings:
-        print(f"router test: the name of no test contains {args.only!r}", file=sys.stderr)
+        print(f"router test: no test has {args.only!r} in its name", file=sys.stderr)
         return BAD_USAGE
     if findings and args.style != "json":
         print_findings(findings, sys.stderr, args.style)
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tests_of(path: Path) -> Path:
-    """The test file beside a table; any other path as it is. Raises UsageError for a good table without one."""
+    """The test file beside a table; any other path unchanged. Raises UsageError for a good table without one."""
     from router.rehearsal.reading import ENDINGS
 
     if not path.is_file() or path.name.endswith(ENDINGS):
@@ -96,7 +96,7 @@ def _tests_of(path: Path) -> Path:
 def _results(
     files: Sequence[Path], only: str, coverages: dict[Path, Coverage] | None
 ) -> tuple[list[Result], list[Diagnostic]]:
-    """All results, and what is wrong with the test files and their tables. `coverages`, by table, are filled."""
+    """Run the tests. Return all results, and the findings in test files and tables. Fill `coverages`, by table."""
     from router.compiler.lookup import Definitions
     from router.rehearsal.coverage import Coverage
     from router.rehearsal.reading import read_test_file
@@ -125,7 +125,7 @@ def _results(
 def _print_results(
     results: Sequence[Result], findings: Sequence[Diagnostic], coverages: Collection[Coverage], out: TextIO, style: str
 ) -> None:
-    """Print in one of FORMATS. Only JSON has the `findings`, which are what is wrong with test files and tables."""
+    """Print in one of FORMATS. Only JSON contains `findings`, those in test files and tables."""
     if style == "json":
         wrong = {"findings": [as_data(finding, strict=False) for finding in findings]}
         print(json.dumps(_as_data(results, coverages) | wrong, indent=2), file=out)

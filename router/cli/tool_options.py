@@ -1,4 +1,4 @@
-"""Shared by verbs: which table, envelope and running router; durations, rates and speeds; a progress display."""
+"""Shared by verbs: options for table, envelope and running router; durations, rates and speeds; a progress display."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ TABLE_VARIABLE = "ROUTER_TABLE"
 
 
 def add_table(parser: argparse.ArgumentParser, *, is_subject: bool = False) -> None:
-    """Which table a verb is about: `-t TABLE`. Where the table is the subject, it may be the only argument as well."""
+    """Add `-t TABLE`, a verb's table. If the table is the subject, it may also be a positional argument."""
     if is_subject:
         parser.add_argument("subject", nargs="?", type=Path, metavar="TABLE", help="short for -t TABLE")
-    about = f"route table (default: {TABLE_VARIABLE} of the environment, or {DEFAULT_TABLE})"
+    about = f"route table (default: ${TABLE_VARIABLE}, or {DEFAULT_TABLE})"
     parser.add_argument("-t", "--table", type=Path, metavar="TABLE", help=about)
 
 
 def table_path(args: argparse.Namespace) -> Path:
-    """The table that a verb is about. Raises UsageError where none is named and the default one is not there."""
+    """The path of a verb's table. Raises UsageError if none is named and the default table does not exist."""
     if (named := named_table(args)) is not None:
         return named
     if not inputs.exists(DEFAULT_TABLE):
-        how = f"name a table by -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
+        how = f"name a table with -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
         raise UsageError(f"there is no {DEFAULT_TABLE} here", how)
     return DEFAULT_TABLE
 
@@ -55,20 +55,20 @@ def named_table(args: argparse.Namespace) -> Path | None:
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and inputs.real_path(subject) != inputs.real_path(option):
-        raise UsageError(f"the table is {subject} or, by --table, {option}", "name one")
+        raise UsageError(f"two tables are named: {subject} and, with --table, {option}", "name only one")
     of_environment = inputs.ENVIRONMENT.get(TABLE_VARIABLE)
     return subject or option or (Path(of_environment) if of_environment else None)
 
 
 def table_if_any(args: argparse.Namespace) -> Path | None:
-    """The table that is named, or the default one if it is there."""
+    """The table that is named, or the default table if it exists."""
     return named_table(args) or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
 
 
 def good_table(
     path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
 ) -> tuple[Checked, Program]:
-    """Check a table and print its warnings. Raises TableError where it has errors."""
+    """Check a table and print its warnings. Raises TableError if it has errors."""
     from router.cli.findings import print_findings
     from router.compiler import check_table
 
@@ -80,24 +80,24 @@ def good_table(
 
 
 def add_tables(parser: argparse.ArgumentParser, about: str) -> None:
-    """As `add_table`, where several tables, or folders of them, may be the subject."""
+    """Like `add_table`, for verbs that take several tables, or folders of tables."""
     parser.add_argument("paths", nargs="*", type=Path, metavar="PATH", help=about)
     add_table(parser)
 
 
 def table_paths(args: argparse.Namespace) -> list[Path]:
-    """What a verb with `add_tables` is about. Raises UsageError."""
+    """The paths of a verb with `add_tables`. Raises UsageError."""
     paths: list[Path] = args.paths
     if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
-        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}", "name one")
+        raise UsageError(f"two tables are named: {paths[0]} and, with --table, {args.table}", "name only one")
     return paths or [table_path(args)]
 
 
 def add_styles(parser: argparse.ArgumentParser) -> None:
-    """How findings are written, as `args.style`: one of router.cli.findings.FORMATS."""
+    """Add the options for the format of findings, as `args.style`: one of router.cli.findings.FORMATS."""
     styles = parser.add_mutually_exclusive_group()
     styles.set_defaults(style="text")
-    for style, about in (("json", "for programs"), ("github", "annotations beside the lines of a pull request")):
+    for style, about in (("json", "JSON, for programs"), ("github", "annotations beside the lines of a pull request")):
         styles.add_argument(f"--{style}", dest="style", action="store_const", const=style, help=about)
 
 
@@ -107,7 +107,7 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
 
 
 def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
-    """The messages, and the table if one is used, which `place` requires if it is a name.
+    """The messages, and the table if one is used. A `place` that is a name requires a table.
 
     Raises TableError and UsageError.
     """
@@ -115,7 +115,7 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
     from router.table import read_table
 
     if args.protos is not None and args.table is not None:
-        raise UsageError("--protos and --table both say where the messages are", "give one")
+        raise UsageError("--protos and --table both say where the messages are", "give only one")
     find = table_path if place.isidentifier() and place != "localhost" else table_if_any
     if args.protos is None and (path := find(args)) is not None:
         table = read_table(path)
@@ -123,17 +123,19 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
     try:
         return wire_of_protos(args.protos or asset("protos")), None
     except FileNotFoundError:
-        raise UsageError("this router has no protos of its own", "name a table, by -t TABLE, or --protos DIR") from None
+        raise UsageError(
+            "this router has no protos of its own", "name a table (-t TABLE) or a folder (--protos DIR)"
+        ) from None
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
-    """Which running router: that of a table, or at a URL."""
+    """Add the options that select a running router: that of a table, or the one at a URL."""
     add_table(parser)
     add_url_option(parser)
 
 
 def add_url_option(parser: argparse.ArgumentParser) -> None:
-    about = "where the running router answers, instead of where its table says: http://127.0.0.1:9108"
+    about = "URL of the running router, such as http://127.0.0.1:9108 (default: the table's 'http.address')"
     parser.add_argument("--url", metavar="URL", help=about)
 
 
@@ -154,12 +156,12 @@ def running_url(args: argparse.Namespace) -> str:
     return url_of(table)
 
 
-def add_for(parser: argparse.ArgumentParser, about: str = "end after this time, as 10s (default: at Ctrl-C)") -> None:
+def add_for(parser: argparse.ArgumentParser, about: str = "stop after this time, as 10s (default: at Ctrl-C)") -> None:
     """`--for 10s`, as `args.seconds`."""
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
 
 
-def add_count(parser: argparse.ArgumentParser, about: str = "end after N messages (default: at Ctrl-C)") -> None:
+def add_count(parser: argparse.ArgumentParser, about: str = "stop after N messages (default: at Ctrl-C)") -> None:
     parser.add_argument("--count", type=whole, metavar="N", help=about)
 
 
@@ -178,9 +180,9 @@ def until_interrupted() -> Iterator[None]:
 def print_batches(
     batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace, waited: float = 0.0
 ) -> None:
-    """Print until --count or --for is reached, of which `waited` seconds are over; empty batches come meanwhile.
+    """Print until --count or --for is reached; `waited` seconds of --for are already over.
 
-    A batch is written at once: a system call for each line would cost more than the line.
+    Batches may be empty. Each is written with one system call: one per line would cost more than the line.
     """
     left, until = args.count, time.monotonic() + (args.seconds or math.inf) - waited
     for batch in batches:
@@ -261,7 +263,7 @@ def whole(text: str) -> int:
 def progress(
     columns: Callable[[], Iterable[ProgressColumn]], total: int | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Show `columns` of rich on stderr if it is a terminal; the value updates them: `tell(completed=7)`."""
+    """Show `columns` of rich on stderr if it is a terminal. Yields what updates them: `tell(completed=7)`."""
     if not sys.stderr.isatty():
         yield lambda **_: None
         return

@@ -1,4 +1,4 @@
-"""`router top`: a running router at a glance, from its metrics."""
+"""`router top`: show a running router at a glance, from its metrics."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
-the time since the last one, and how long routes took in the middle (p50) and at worst, but for one of 100 (p99). It
-begins with what is wrong and when each endpoint was last heard. `!` marks what is wrong now, `+2` targets that have no
-room. On a terminal it is shown again and again; keys sort and scroll it."""
+the time since the last one, and the latency, median (p50) and 99th percentile (p99). Problems, and when each endpoint
+was last heard, come first. `!` marks what is wrong now, `+2` two targets that do not fit. On a terminal the display is
+live; keys sort and scroll it."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -28,12 +28,12 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "top", _DESCRIPTION, *examples)
     add_router_options(parser)
     parser.add_argument(
-        "--sort", choices=ORDERS, default=ORDERS[0], help="the largest first (default: as in the table)"
+        "--sort", choices=ORDERS, default=ORDERS[0], help="sort by this, largest first (default: order of the table)"
     )
-    about = "between two looks, as 500ms (default: 1s)"
+    about = "time between two updates, for example 500ms (default: 1s)"
     parser.add_argument("--interval", type=seconds, default=1.0, metavar="DURATION", help=about)
-    parser.add_argument("--once", action="store_true", help="print once and end (the default without a terminal)")
-    parser.add_argument("--json", action="store_true", help="once, as a JSON object")
+    parser.add_argument("--once", action="store_true", help="print once and exit (default without a terminal)")
+    parser.add_argument("--json", action="store_true", help="print once, as a JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_json(url: str, order: Order, interval: float) -> None:
-    """The fields of `View`, with all rows, times in seconds; where no router answers, those of `router status`."""
+    """Print the fields of `View` with all rows, times in seconds; if no router answers, those of `router status`."""
     from router.tools.running_router import down
     from router.tools.top import ordered
 
@@ -68,7 +68,7 @@ def _show_once(url: str, order: Order, interval: float) -> None:
     from router.tools.top_view import Page
 
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    with console.capture() as shown:  # rich ends the process where a pipe is closed, and `main` has a code for that
+    with console.capture() as shown:  # rich exits if a pipe is closed; `main` has an exit code for that
         console.print(Page(_look(url, interval), order))
     print(shown.get(), end="")
 
@@ -87,7 +87,7 @@ _PLAIN_WIDTH = 160
 
 
 def _show(url: str, order: Order, interval: float) -> None:
-    """Until `q` or Ctrl-C. Tries again if the router does not answer: it may be starting."""
+    """Show the router until `q` or Ctrl-C. Retry if it does not answer: it may be starting."""
     from rich.console import Console
     from rich.live import Live
 

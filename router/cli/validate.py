@@ -1,4 +1,4 @@
-"""`router validate PATH...`: every finding of route tables. Needs neither ROS nor a network."""
+"""`router validate PATH...`: print every finding in route tables. Needs neither ROS nor a network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.errors import Diagnostic, Severity, UsageError, shown_path
 
 _DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint. A folder stands for the
-*.yaml and *.yml in it (not in folders below it, and not *.test.yaml).
+*.yaml and *.yml in it (not in its subfolders, and not *.test.yaml).
 
 Exit code: {OK} clean, {BAD_TABLE} errors, {BAD_USAGE} wrong usage."""
 
@@ -24,7 +24,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "validate", _DESCRIPTION, *examples)
     add_tables(parser, "a table, or a folder with tables")
     add_styles(parser)
-    parser.add_argument("--strict", action="store_true", help="take warnings for errors")
+    parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def find_tables(paths: Sequence[Path]) -> list[Path]:
-    """The files that the paths stand for, each once. Raises UsageError; a file need not exist."""
+    """The files that the paths stand for, each once; they need not exist. Raises UsageError."""
     tables: dict[Path, None] = {}
     for path in paths:
-        if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises where a folder above is not ours to read)
+        if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
             tables[path] = None
             continue
         try:

@@ -1,1 +1,1 @@
-"""A program without network, on a clock that is told to go: table tests, and replay against another table."""
+"""Programs run without network on a simulated clock: table tests, and replay against another table."""

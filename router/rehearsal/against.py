@@ -1,4 +1,4 @@
-"""A recording through two tables on one clock: which deliveries are the same, and a report of those that are not."""
+"""Run a recording through two tables on one clock, compare the deliveries, and report those that differ."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ Loss = tuple[str, str, str, str]
 
 @dataclass(slots=True)
 class Row:
-    """What one target got of one route. `moved` came from both tables with the same bytes at different times.
+    """What one target got from one route. `moved`: delivered by both tables with the same bytes at different times.
 
-    `examples`, one of a kind, have the nanoseconds since the beginning, and the delivery of either table, if there is.
+    `examples`, one of each kind, have the nanoseconds since the beginning and each table's delivery, if there is one.
     """
 
     old: int = 0
@@ -54,8 +54,8 @@ class Row:
 class Against:
     """The comparison. `take` the datagrams in order; `rows` are by route and target, `losses` by table.
 
-    `span` is the time from the first datagram to the last, ns. `senders` are what the recording calls them, the
-    listener that they came by, and their addresses.
+    `span` is the time from the first datagram to the last, ns. `senders` are names in the recording, listeners, and
+    addresses.
     """
 
     def __init__(self, old: Program, new: Program) -> None:
@@ -99,7 +99,7 @@ class Against:
         return bool(places) and not any(table.sender(*place) for table in tables for place in places)
 
     def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
-        """Those since the last call, by target. Losses are counted."""
+        """Deliveries since the last call, by target. Losses are counted."""
         found: dict[str, list[Delivery]] = {}
         for event in self._runs[side].events:
             if isinstance(event, (Sent, Published)):
@@ -110,7 +110,7 @@ class Against:
         return found
 
     def _compare(self, old: Sequence[Delivery], new: Sequence[Delivery]) -> None:
-        """Count what one target got from one datagram and the time before it."""
+        """Count what one target got from one datagram and in the time before it."""
         for each in old:
             self._row(each).old += 1
         for each in new:
@@ -141,7 +141,7 @@ class Against:
         return left
 
     def _without_moved(self, found: Sequence[Delivery], unmatched: Counter[tuple[str, bytes]]) -> Iterator[Delivery]:
-        """Without those that the other table made earlier."""
+        """Deliveries without those that the other table made earlier."""
         for each in found:
             if unmatched[key := _key(each)]:
                 unmatched[key] -= 1
@@ -154,7 +154,7 @@ class Against:
 
     def _example(self, old: Delivery | None, new: Delivery | None) -> None:
         event = new or old
-        assert event is not None  # noqa: S101 - there is one of them
+        assert event is not None  # noqa: S101 - at least one of them exists
         examples = self._row(event).examples
         kind = (old is None, new is None)
         if kind not in ((one is None, other is None) for _, one, other in examples):
@@ -185,7 +185,7 @@ _COLUMNS = ("old", "new", "same", "changed", "moved", "lost", "added")
 
 
 class _Content(NamedTuple):
-    """What a delivery is, and its fields by path."""
+    """The kind of a delivery, and its fields by path."""
 
     name: str
     fields: dict[str, str]
@@ -200,7 +200,7 @@ class Report:
         self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
 
     def lines(self, found: Against) -> Iterator[str]:
-        """All of it. Little where both tables deliver the same."""
+        """The whole report; a short one if both tables deliver the same."""
         old, new = (checked.path for checked in self._tables)
         yield f"{found.datagrams} datagrams of {found.span / 1e9:.1f} s, through {old} and {new}"
         if not found.differs:
@@ -233,7 +233,7 @@ class Report:
         if len(differing) > _MOST_FIELDS:
             yield f"  and {len(differing) - _MOST_FIELDS} more fields"
         if not differing and old.name == new.name:
-            yield "  the same fields, in other bytes"
+            yield "  the same fields, encoded differently"
 
     def _content(self, side: int, event: Delivery | None) -> _Content:
         assert event is not None  # noqa: S101 - an example has one of the two
@@ -277,7 +277,7 @@ def _losses(found: Against) -> Iterator[str]:
 
 
 def _same_losses(found: Against) -> Iterator[str]:
-    """What both tables lost: of a recording from another network, that is everything."""
+    """What both tables lost: everything if the recording is from another network."""
     counts: Counter[str] = Counter()
     for (done, _, _, reason), count in found.losses[0].items():
         counts[f"{done} ({reason})"] += count
@@ -286,18 +286,18 @@ def _same_losses(found: Against) -> Iterator[str]:
 
 
 def _strangers(found: Against) -> Iterator[str]:
-    """Why next to nothing was delivered, where the tables are for another network than the recording."""
+    """Why almost nothing was delivered, if the tables are for a different network from the recording."""
     if not found.is_among_strangers:
         return
     named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in found.senders})
     more = f" and {len(named) - _MOST_SENDERS} more" if len(named) > _MOST_SENDERS else ""
     yield ""
-    yield f"neither table has an endpoint where the datagrams came from: {', '.join(named[:_MOST_SENDERS])}{more};"
+    yield f"neither table has an endpoint for any sender of the recording: {', '.join(named[:_MOST_SENDERS])}{more};"
     yield "compare tables with the addresses of the recording"
 
 
 def _is_reported(row: Row, before: Delivery | None, after: Delivery | None) -> bool:
-    """Whether an example is one: what only came at another time is none of what did not come."""
+    """Whether an example is reported: deliveries that only changed their time are not."""
     if before is None:
         return row.added > 0
     return after is not None or row.lost > 0

@@ -1,7 +1,7 @@
-"""ROS messages as CDR bytes and back, one scalar after the other: slow, plain, and apart from what the carrier does.
+"""ROS messages to CDR bytes and back, one scalar after the other: slow, plain, and independent of the carrier.
 
-Plain CDR, little-endian, as rmw_fastrtps writes it. What the carrier writes is thus checked by other code, in
-table tests and in the tests of the router, where this module is the oracle.
+Plain CDR, little-endian, as rmw_fastrtps writes it. This code checks what the carrier writes, in table tests and as the
+oracle of the router's own tests.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def serialize(message: MessageType, values: Mapping[str, Any], padding: int = 0)
 def deserialize(message: MessageType, data: bytes) -> SimpleNamespace:
     """The message in bytes with their header, as objects with its fields; lists of bytes are lists of numbers.
 
-    Bytes behind the message are ignored. Raises MappingError or ValueError when it is no such message.
+    Bytes after the message are ignored. Raises MappingError or ValueError if it is not such a message.
     """
     if data[:2] != b"\x00\x01":
         raise MappingError(f"not plain CDR: {data[:2].hex()}")
@@ -39,7 +39,7 @@ class _Writer:
         self.data = bytearray()
 
     def scalar(self, format_: str, value: object) -> None:
-        """Aligned to its own size, counted from behind the header."""
+        """A scalar, aligned to its own size, counted from the end of the header."""
         packed = struct.pack("<" + format_, value)
         while len(self.data) % len(packed):
             self.data.append(self.padding)
@@ -84,7 +84,7 @@ class _Reader:
 
     def bytes(self, count: int) -> bytes:
         if self.at + count > len(self.data):
-            raise MappingError(f"{len(self.data)} bytes, and {count} wanted from {self.at} on")
+            raise MappingError(f"{len(self.data)} bytes, but {count} are needed from {self.at} on")
         self.at += count
         return self.data[self.at - count : self.at]
 

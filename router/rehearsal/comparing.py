@@ -1,4 +1,4 @@
-"""Compare what happened in a step with what a test expects: each difference with its places in test and table."""
+"""Compare what happened in a step with what a test expects, and name the places of differences in test and table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from router.types.framing import restored, trimmed
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing that a table does not do as a test expects; `is_of_field` where only the content is another one."""
+    """One difference from what a test expects; `is_of_field` if only the content of a message differs."""
 
     span: SourceSpan
     message: str
@@ -30,7 +30,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What happened in a step: events `early`, before its time, and in it. `given` are the times and bytes given."""
+    """What happened in a step: events before its time (`early`) and in it. `given` are the times and bytes given."""
 
     step: Step
     early: Sequence[Event]
@@ -38,12 +38,12 @@ class Outcome:
     given: Sequence[tuple[int, bytes]]
 
     def given_at(self, at: int) -> int:
-        """When the last message came in that a delivery at this time can be made of, ns."""
+        """When the last message arrived that a delivery at this time can contain, ns."""
         return max((time for time, _ in self.given if time <= at), default=at)
 
 
 class Comparison:
-    """Compares the steps of the tests of one table; `teller` has the words."""
+    """Compares the steps of the tests of one table; `teller` describes events."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
         self._wire = Wire(program.envelope)
@@ -52,7 +52,7 @@ class Comparison:
         self._table = program.table
 
     def failures(self, outcome: Outcome) -> Iterator[Failure]:
-        """In the order in which a person would look for them."""
+        """Failures in the order in which a person would look for them."""
         expected, events = outcome.step.expected, outcome.events
         yield from self._early(outcome)
         if expected.anything:
@@ -72,7 +72,7 @@ class Comparison:
         yield from _filtered(expected, events)
 
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
-        """What happened since the step before, at no time that a step has."""
+        """What happened since the previous step, at a time that belongs to no step."""
         related: dict[Related | None, list[Event]] = {}
         for event in outcome.early:
             if isinstance(event, (Sent, Published, Dropped)):
@@ -86,7 +86,7 @@ class Comparison:
     def _delivered(
         self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
-        """`explained`: a rejection that was reported is why targets got nothing."""
+        """`explained`: a rejection that was already reported is why targets got nothing."""
         for target in dict.fromkeys((*expected, *came)):
             deliveries, events = expected.get(target, ()), came.get(target, [])
             if deliveries and not events:
@@ -103,7 +103,7 @@ class Comparison:
                     yield from self._differences(delivery, event, outcome)
 
     def _missing(self, target: str, span: SourceSpan, outcome: Outcome) -> Failure:
-        """With what became of the message instead, where there is an event of it."""
+        """A failure that says what happened to the message instead, if there is an event for it."""
         for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}{in_brackets(event.detail)}"
@@ -137,7 +137,11 @@ class Comparison:
         try:
             decoded = self._wire.decode(event.data)
         except DecodeError as error:
-            yield Failure(expected.span, f"{event.target} gets no envelope: {error}", self.teller.related(event))
+            yield Failure(
+                expected.span,
+                f"{event.target} gets bytes that are not an envelope: {error}",
+                self.teller.related(event),
+            )
             return
         if decoded.case.name != case:
             yield Failure(expected.span, f"{self.teller.described(event)}, not {case}", self.teller.related(event))
@@ -177,7 +181,7 @@ class Comparison:
     # places and words
 
     def _of_name(self, target: str, outcome: Outcome) -> Related | None:
-        """Where the table should have delivered what was given to a target that got nothing of it."""
+        """The place where the table should have delivered to a target that got nothing."""
         return self._index.of_name(target, (each.route for each in outcome.events if isinstance(each, Received)))
 
 

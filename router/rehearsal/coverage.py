@@ -1,6 +1,6 @@
-"""What of a table its tests have touched, by what the router counted: routes, targets, and rejections.
+"""The routes, targets and rejections of a table that its tests have touched, from the router's counters.
 
-Only steps count that expect something (not `any`), and of targets only messages that were compared with something.
+A step counts only if it expects something (not `any`), and a target only if its message was compared with something.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from router.table.model import ANY
 KINDS = ("route", "target", "rejection")
 
 Key = tuple[str, ...]
-"""What is touched: `route` or a reason of the metrics, then the names of listener, route, target."""
+"""What is touched: a kind, such as `route` or a reason of the metrics, then names of listener, route and target."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +52,12 @@ class Coverage:
             self._touched.update(key for event in outcome.events for key in _keys(event, expected))
 
     def add(self, other: Coverage) -> None:
-        """Add what another file of tests has touched of the same table, whatever its variables are."""
+        """Add what another test file has touched in the same table, whatever its variables."""
         self._items = other._items | self._items
         self._touched |= other._touched
 
     def inherit(self, other: Coverage) -> None:
-        """Add what the tests of another table have touched that both tables have from the same place of a file."""
+        """Add what the tests of another table have touched in parts that both tables take from the same file."""
         places = {key: _real(item.span) for key, item in other._items.items() if key in other._touched}
         self._touched |= {key for key, item in self._items.items() if places.get(key) == _real(item.span)}
 
@@ -70,14 +70,14 @@ class Coverage:
         return not self.gaps()
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """Of each kind, how many were touched, and how many there are."""
+        """By kind, how many items were touched, and how many there are."""
         there = [item.kind for item in self._items.values()]
         missing = [item.kind for item in self.gaps()]
         return {kind: (there.count(kind) - missing.count(kind), there.count(kind)) for kind in KINDS}
 
 
 def _real(span: SourceSpan) -> SourceSpan:
-    """The same for each path that a table may be extended by."""
+    """The span with the real path of its file: tables may extend it by different paths."""
     return replace(span, file=os.path.realpath(span.file))
 
 
@@ -115,7 +115,7 @@ def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
 
 
 def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
-    """What the table says that keeps messages of a route from its targets."""
+    """The settings of a table that keep messages of a route from its targets."""
     name = route.route.name
     if ttl := route.route.ttl:
         yield ("stale", name), Item("rejection", ttl.span, f"no test has a message of {name} that is older than this")
@@ -132,14 +132,14 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
 
 
 def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Node | None]]:
-    """Every target of a route, with its `when` or that of the topic that topics it."""
+    """Every target of a route, with its `when` or that of the topic that feeds it."""
     yield from ((target, target.when) for target in route.targets)
     for subscription in route.subscriptions:
         yield from ((target, target.when or subscription.when) for target in subscription.targets)
 
 
 def _keys(event: Event, expected: Expected) -> Iterator[Key]:
-    """What an event touches in a step that expects this."""
+    """The keys that an event touches in a step that expects this."""
     match event:
         case Received():
             yield "route", event.route

@@ -1,4 +1,4 @@
-"""What a table test says of a message field by field, given or expected, and where a message differs from it.
+"""A message as a table test writes it, given or expected, and where an actual message differs from it.
 
 A message here is anything with its fields as attributes: a protobuf message, or what `cdr.deserialize` returns.
 """
@@ -32,7 +32,7 @@ Path = tuple[Union[str, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One field that is not what was expected; `span` is the place that expects it."""
+    """One field that differs from what was expected; `span` is the place that expects it."""
 
     path: Path
     expected: str
@@ -43,7 +43,7 @@ class Difference:
         return f"{path_text(self.path)} is {self.actual}, not {self.expected}"
 
 
-# What a test says. `differences` compares it with an actual value; `now` is when the step's message came in, ns.
+# What a test says. `differences` compares it with an actual value; `now` is when the step's message arrived, ns.
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class AnyValue:
 
 @dataclass(frozen=True, slots=True)
 class Scalar:
-    """A scalar, of a float32 the nearest one; or a number that may be `tolerance` off, written as `text`."""
+    """A scalar (for a float32, the nearest one), or a number with a `tolerance`, written as `text`."""
 
     value: Any
     span: SourceSpan
@@ -76,7 +76,7 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """A message of STAMP_TYPES: `offset` ns after the test's start, or None for when the message came in."""
+    """A message of STAMP_TYPES: `offset` ns after the test's start, or None for the arrival of the message."""
 
     type: MessageType
     offset: int | None
@@ -93,7 +93,7 @@ class Time:
 
 @dataclass(frozen=True, slots=True)
 class Fields:
-    """A message of this type whose other fields are all at their default."""
+    """A message of this type; all other fields are at their default."""
 
     type: MessageType
     members: Mapping[str, FieldValue]
@@ -142,10 +142,10 @@ _WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
 
 
 class FieldReader:
-    """Reads the fields of messages. With `exact`, as for what is given, there is no `any` and no tolerance.
+    """Reads the fields of messages. With `exact`, as for given messages, `any` and tolerances are not allowed.
 
-    `constants` are the numbers of enum values by name; several where enums share a name. `any` is that word without
-    quotes; with them it is text. What does not fit a type raises InvalidValueError at its place.
+    `constants` are the numbers of enum values by name; several if enums share a name. `any` is that word without
+    quotes; in quotes it is text. A value that does not fit its type raises InvalidValueError at its place.
     """
 
     def __init__(self, constants: Mapping[str, set[int]], *, exact: bool) -> None:
@@ -223,12 +223,12 @@ class FieldReader:
         numbers = self._constants.get(text, set())
         if len(numbers) > 1:
             message = f"several enums have a value '{text}', with different numbers"
-            raise invalid(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
+            raise invalid(span, Code.BAD_VALUE, message, f"name the enum, as in State.{text}")
         return next(iter(numbers), None)
 
 
 def _near(text: str, span: SourceSpan) -> Scalar | None:
-    """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
+    """`~1.571` is any number that rounds to it, `1.57 +- 0.01` any number within that tolerance."""
     if found := _ROUGHLY.fullmatch(text):
         value = _finite(found[1], "number to be near", span)
         digits = len(found[2] or "") - int(found[3] or 0)
@@ -237,7 +237,7 @@ def _near(text: str, span: SourceSpan) -> Scalar | None:
         value = _finite(found[1], "number to be near", span)
         tolerance = _finite(found[2], "tolerance", span)
         if tolerance < 0:
-            raise invalid(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
+            raise invalid(span, Code.BAD_VALUE, f"the tolerance '{found[2]}' is negative")
         return Scalar(value, span, tolerance, text)
     return None
 
@@ -248,7 +248,7 @@ def _finite(text: str, what: str, span: SourceSpan) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise invalid(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
+        raise invalid(span, Code.BAD_VALUE, f"'{text}' is not a {what}", "write a number, as in 1.57 +- 0.01")
     return value
 
 
@@ -260,28 +260,28 @@ def _offset(node: ScalarNode) -> int | None:
     try:
         return parse_duration(node.text)
     except ValueError as error:
-        hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
+        hint = f"write '{RECEIVED_AT}', or the time after the beginning of the test, for example 300ms"
         raise invalid(node.span, Code.BAD_VALUE, str(error), hint) from error
 
 
-# Messages made of what a test gives
+# Messages from what a test gives
 
 
 def protobuf_message(message_class: type[Message], given: Fields, now: int) -> Message:
-    """A protobuf message with these fields set; `now` is when it comes in, ns."""
+    """A protobuf message with these fields set; `now` is when it arrives, ns."""
     return message_class(**_plain(given, now, complete=False))
 
 
 def ros_values(given: Fields, now: int) -> Mapping[str, Any]:
-    """All values of a ROS message by name, those that were not given at their default."""
+    """All values of a ROS message by name; values that were not given are at their default."""
     values: Mapping[str, Any] = _plain(given, now, complete=True)
     return values
 
 
 def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
-    """A given value as the constructors of protobuf take it, with messages and maps as dicts.
+    """A given value as protobuf's constructors accept it, with messages and maps as dicts.
 
-    `complete`: with the defaults of what is not given.
+    `complete`: including the defaults of fields that are not given.
     """
     match value:
         case Fields():
@@ -303,7 +303,7 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
 
 
 def _default_of(kind: Type, default: object = None) -> Any:
-    """The value of a field that nothing fills; of a message its values by name. `default` is the declared one."""
+    """The value of a field that nothing fills; for a message, its values by name. `default` is the declared one."""
     if default is not None:
         return default
     match kind:
@@ -348,7 +348,7 @@ class _Entry(NamedTuple):
 
 
 def _elements(kind: List, value: Any) -> Sequence[Any]:
-    """Of a list; of a protobuf map its entries, by key."""
+    """The elements of a list; for a protobuf map, its entries sorted by key."""
     element = kind.element
     if isinstance(element, MessageType) and element.is_map_entry:
         return [_Entry(key, value[key]) for key in sorted(value)]  # its own order differs from run to run
@@ -366,7 +366,7 @@ def _time_of(kind: MessageType, value: Any) -> int:
 
 
 def shown(kind: Type, value: Any) -> str:
-    """A value as a test would write it, on one line; of messages the fields that are not at their default."""
+    """A value as a test would write it, on one line; messages without the fields at their default."""
     match kind:
         case MessageType() if kind.name in STAMP_TYPES:
             return offset(_time_of(kind, value) - START)
@@ -385,7 +385,7 @@ def shown(kind: Type, value: Any) -> str:
 def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]:
     """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text.
 
-    Of a submessage that is not set there is none: it may be of the type of the message, and that without end.
+    A submessage that is not set has none: it may be of the type of its message, and so on without end.
     """
     if isinstance(kind, MessageType):
         for field in kind.fields:

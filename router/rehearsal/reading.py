@@ -1,4 +1,4 @@
-"""Test files: found, checked against their schema and read, with the table under test compiled beside them."""
+"""Find test files, check them against their schema and read them, and compile the table under test."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TableTest:
 
 @dataclass(frozen=True, slots=True)
 class TestFile:
-    """The tests of a file, and its table with the program that they run."""
+    """The tests of a file, and their table with its program."""
 
     __test__ = False  # for pytest, which takes the name for a class of tests
 
@@ -47,10 +47,10 @@ class TestFile:
 
 
 def find_test_files(paths: Sequence[Path]) -> list[Path]:
-    """The files that the paths stand for, each once: a folder for those in it that are named as tests."""
+    """The files that the paths stand for, each once: a folder stands for the test files in it."""
     files: dict[Path, None] = {}
     for path in paths:
-        if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises where a folder above is not ours to read)
+        if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
             found = sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS) and file.name[0] != ".")
             files.update(dict.fromkeys(found))
         else:
@@ -59,7 +59,7 @@ def find_test_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_test_file(path: Path, definitions: Definitions) -> TestFile:
-    """Raises TableError with every finding in the file, or in its table."""
+    """Read a test file. Raises TableError with every finding in the file, or in its table."""
     root = _checked_nodes(path)
     variables = _Variables(_variables(root))
     checked = check_table(_table_of(root, path), variables, definitions)
@@ -94,7 +94,7 @@ def _table_of(root: MappingNode, path: Path) -> Path:
             table = path.with_name(path.name.removesuffix(ending) + ending.removeprefix(".test"))
             if table.is_file():
                 return table
-    message, hint = "this file is not named after a table beside it", "say which it tests, such as 'table: rover.yaml'"
+    message, hint = "this file is not named after a table beside it", "name its table, for example 'table: rover.yaml'"
     raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
 
 
@@ -105,7 +105,7 @@ def _variables(root: MappingNode) -> Mapping[str, str]:
 
 
 class _Variables(dict[str, str]):
-    """Values by name that remember which names were `asked` for."""
+    """Values by name; `asked` are the names that were looked up."""
 
     def __init__(self, values: Mapping[str, str]) -> None:
         super().__init__(values)
@@ -117,7 +117,7 @@ class _Variables(dict[str, str]):
 
 
 class _Reader:
-    """Reads tests. What is wrong is added to `findings`, and the rest of the file is still read."""
+    """Reads tests. Errors are added to `findings`, and the rest of the file is still read."""
 
     def __init__(self, names: Names) -> None:
         self.findings: list[Diagnostic] = []
@@ -131,7 +131,7 @@ class _Reader:
             return TableTest(name, span, tuple(self._steps(span, [node])))
         others = [key for key in node.entries if key != "steps"]
         if others:
-            message = f"'{others[0]}' stands beside 'steps'"
+            message = f"'{others[0]}' is beside 'steps'"
             self._find(node.entries[others[0]].key.span, Code.UNKNOWN_KEY, message, "move it into a step")
         listed = steps.items if isinstance(steps, SequenceNode) else ()
         return TableTest(name, span, tuple(self._steps(span, listed)))
@@ -141,7 +141,7 @@ class _Reader:
         for node in nodes:
             step = self._step(span, node)
             if is_stopped:
-                message, hint = "the router is stopped in the step above", "what comes then is another test"
+                message, hint = "the step above stops the router", "write a separate test for this step"
                 self._find(step.span, Code.BAD_VALUE, message, hint)
             latest = self._in_order("at", step.at, latest, node)
             if step.given is not None:
@@ -151,10 +151,10 @@ class _Reader:
             yield step
 
     def _in_order(self, key: str, time: int | None, latest: int, node: Node) -> int:
-        """The time of a key of a step, ns, which is not before the `latest` of what stands above."""
+        """Return the time of a step's key, ns, or `latest` if that is later. A time before `latest` is a finding."""
         if time is not None and time < latest and isinstance(node, MappingNode):
-            message = f"this is {offset(time)}, before the {offset(latest)} of what stands above"
-            self._find(node.entries[key].value.span, Code.BAD_VALUE, message, "steps are in the order of time")
+            message = f"this is {offset(time)}, earlier than the {offset(latest)} above"
+            self._find(node.entries[key].value.span, Code.BAD_VALUE, message, "write steps in the order of time")
         return max(latest, time or 0)
 
     def _step(self, test: SourceSpan, node: Node) -> Step:
@@ -162,8 +162,8 @@ class _Reader:
         span = next(iter(node.entries.values())).key.span if node.entries else test
         expect = node.entries.get("expect")
         if expect is None:
-            message = "this says nothing of what is expected"
-            self._find(span, Code.MISSING_KEY, message, "say 'expect: nothing', or what")
+            message = "this step has no 'expect'"
+            self._find(span, Code.MISSING_KEY, message, "write what it expects, or 'expect: nothing'")
             return Step(span, Expected(span))
         given = node.get("given")
         expected = self._read(lambda found: self._expected.expected(expect.key.span, found, given), expect.value)
@@ -177,7 +177,7 @@ class _Reader:
         )
 
     def _read(self, read: Callable[[Node], R], node: Node | None) -> R | None:
-        """None for a key that is not there, and for what has a finding."""
+        """The value that `read` returns; None for a missing key, and for a value with a finding."""
         if node is None:
             return None
         try:
@@ -191,7 +191,7 @@ class _Reader:
 
 
 def _duration(node: Node) -> int:
-    """Of `at` and `until`, which may be zero as other durations may not."""
+    """The value of `at` or `until`, which may be zero, unlike other durations."""
     assert isinstance(node, ScalarNode)  # noqa: S101 - the schema saw to it
     is_zero = not node.text.strip("0. nsumih")
     return 0 if is_zero else parsed(parse_duration, Located(node.text, node.span))
@@ -226,13 +226,13 @@ def _schema_findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnosti
             owner = subject(error.path) if error.path else "a test file"
             yield from unknown_keys(root, error.path, list(error.schema["properties"]), owner, empty)
         elif not error.path and error.path not in misspelt:
-            yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
+            yield Diagnostic(whole, Code.MISSING_KEY, "the test file has no key 'tests'")
         elif error.keyword == "required" and error.path in misspelt:
-            continue  # the key that is missing may be the one that is misspelt
+            continue  # the missing key may be the misspelt one
         elif error.keyword == "required":
             key = key_at(root, error.path)
             missing = error.message.split("'")[1]
-            message = f"a step says what it expects: '{missing}' is missing"
+            message = f"this step has no '{missing}'"
             yield Diagnostic(key.span if key else node_at(root, error.path).span, Code.MISSING_KEY, message)
         else:
             yield finding(error, root)

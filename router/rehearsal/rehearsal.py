@@ -1,7 +1,7 @@
-"""A program on a clock that stands still until it is told to go: messages go in, a list of events comes out.
+"""A program on a simulated clock: messages go in, a list of events comes out.
 
 The library that drives the rover executes it (`carrier.rehearsal`). Every topic has a subscriber,
-and the network takes everything. Gateways have no part in it, nor has what deadmen send when the router starts.
+and the network takes everything. Gateways do not take part, and deadmen do not send at the start.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from router.compiler.program import Program
 from router.datagrams import Peer
 
 START = 1_767_225_600_000_000_000
-"""Where the clock stands at first unless another time is given: the beginning of 2026, in ns of the wall clock."""
+"""The time at the start, unless another one is given: the beginning of 2026, in ns of the wall clock."""
 
 
 # Events
@@ -25,7 +25,7 @@ START = 1_767_225_600_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What became of a message at `at`, ns of the rehearsal's clock."""
+    """What happened to a message at `at`, ns of the rehearsal's clock."""
 
     at: int
 
@@ -40,7 +40,7 @@ class Received(Event):
 
 @dataclass(frozen=True, slots=True)
 class Sent(Event):
-    """A datagram for an endpoint; `by_deadman` where the route's deadman sent it in place of a command."""
+    """A datagram for an endpoint; `by_deadman` if the route's deadman sent it in place of a command."""
 
     route: str
     target: str
@@ -59,7 +59,7 @@ class Published(Event):
 
 @dataclass(frozen=True, slots=True)
 class Dropped(Event):
-    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` says more where there is more."""
+    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` has more about it, if there is more."""
 
     route: str
     target: str
@@ -69,7 +69,7 @@ class Dropped(Event):
 
 @dataclass(frozen=True, slots=True)
 class Filtered(Event):
-    """`when` held a message back from a target, or a frame had the datagram already."""
+    """`when` withheld a message from a target, or a frame already had the datagram."""
 
     route: str
     target: str
@@ -110,7 +110,7 @@ EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
     "messages_collected": lambda at, labels, _: Collected(at, *labels),
     "datagrams_rejected": lambda at, labels, _: Rejected(at, *labels),
 }
-"""The event for each metric that is one when it is counted: from time, label values, and the bytes handed over last."""
+"""For each metric whose count is an event: a function from time, label values, and the last bytes to that event."""
 
 
 # The run
@@ -119,9 +119,8 @@ EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
 class Rehearsal:
     """One run of a program, from the state of a router that has just started.
 
-    `now` is the boot clock, in ns, and the wall clock as well, until that is set. `events` has what happened, in order;
-    the caller may clear it.
-    The same calls give the same events.
+    `now` is the boot clock, in ns, and also the wall clock until that is set. `events` has what happened, in order; the
+    caller may clear it. The same calls give the same events.
     """
 
     def __init__(self, program: Program, start_ns: int = START) -> None:
@@ -143,7 +142,7 @@ class Rehearsal:
         return self.now + self.ahead
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
-        """Receive a datagram now, which waited in the socket since `arrived_ns`. Raises KeyError for no listener."""
+        """Receive a datagram that waited in the socket since `arrived_ns`. Raises KeyError for an unknown listener."""
         self._stage.datagram(listener, peer, data, self._wall if arrived_ns is None else arrived_ns)
         self._read()
 
@@ -158,18 +157,18 @@ class Rehearsal:
         self._read()
 
     def set_clock(self, ahead_ns: int) -> None:
-        """Set the wall clock, to so many ns ahead of the boot clock."""
+        """Set the wall clock to this many ns ahead of the boot clock."""
         self.ahead = ahead_ns
         self._stage.set_clock(ahead_ns)
 
     def reload(self, program: Program) -> None:
-        """Go on with another program, whose counters continue those of the present one."""
+        """Continue with another program, whose counters continue those of the current one."""
         self._stage.adopt(program)
         self._series |= _series(program)
         self._read()
 
     def restart(self) -> None:
-        """Begin again with the present program, as a router that has just started."""
+        """Start again with the current program, as a router that has just started."""
         self._stage.restart(self._start)
         self._at, self.ahead, self._data = self._start, 0, b""
         self.events.clear()
@@ -194,12 +193,12 @@ class Rehearsal:
                     self._report(report.detail or str(report.error or ""))
 
     def _count(self, counter: int) -> None:
-        """Make an event of what is counted: only the counters have both the route and the target."""
+        """Make an event from a counter: only counters have both the route and the target."""
         if (series := self._series.get(counter)) is not None:
             self.events.append(EVENTS[series.metric](self._at, series.labels, self._data))
 
     def _report(self, detail: str) -> None:
-        """Add to the event of the last count what is reported about it."""
+        """Add what is reported about the last count to its event."""
         event = self.events[-1]
         if isinstance(event, (Dropped, Rejected)):
             self.events[-1] = replace(event, detail=detail)

@@ -19,7 +19,7 @@ from router.table.reading import InvalidValueError
 
 @dataclass(frozen=True, slots=True)
 class FailedStep:
-    """`told` is what happened in it, in order; nothing where only contents are other ones."""
+    """`told` is what happened in it, in order; empty if only contents differ."""
 
     failures: list[Failure]
     told: list[str]
@@ -27,7 +27,7 @@ class FailedStep:
 
 @dataclass(slots=True)
 class Result:
-    """What came of one test. `findings` are mistakes in the test that only show when it runs."""
+    """The result of one test. `findings` are mistakes in the test that only show when it runs."""
 
     test: TableTest
     failed: list[FailedStep] = field(default_factory=list)
@@ -43,7 +43,7 @@ class Result:
 
 
 def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) -> list[Result]:
-    """Run the tests of a file whose name contains `only`, and record in `coverage` what of the table they touch."""
+    """Run the tests of a file whose name contains `only`, and record what they touch in `coverage`."""
     comparison, rehearsal = Comparison(file.checked, file.program), Rehearsal(file.program)
     return [_run(test, file.program, rehearsal, comparison, coverage) for test in file.tests if only in test.name]
 
@@ -82,7 +82,7 @@ def _run_step(step: Step, rehearsal: Rehearsal, program: Program) -> Outcome:
 
 
 def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, bytes]]:
-    """The times and bytes of what was given."""
+    """Give a step's message to the rehearsal. Return the times and bytes of what was given."""
     found: list[tuple[int, bytes]] = []
     begin = rehearsal.now
     for number in range(given.times):
@@ -99,7 +99,7 @@ def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, byt
 
 
 def _datagram(given: Given, wire: Wire, now: int) -> bytes:
-    """The bytes that arrive. Raises InvalidValueError where they are longer than they are to be padded to."""
+    """The bytes that arrive. Raises InvalidValueError if they are longer than `pad`."""
     data = given.data or b""
     if given.case is not None and given.fields is not None:
         data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))

@@ -1,6 +1,6 @@
-"""The steps of a table test: what is given and what is expected, as data with its places, and how that is read.
+"""The steps of a table test: what is given and expected, as data with its places, and the readers of both.
 
-Every name has to be one of the table under test. What is not raises InvalidValueError, with the nearest name there is.
+Every name must be in the table under test; otherwise InvalidValueError is raised, with the nearest name in the table.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from router.types.protobuf import PayloadCase
 UNCHANGED = "unchanged"
 
 Counts = Mapping[str, int]
-"""How many of each reason, or of each target."""
+"""How many of each reason, or for each target."""
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A message that comes in, `times` often, `every` ns, each sent `age` ns ago.
+    """A message that arrives `times` times, `every` ns, each sent `age` ns before.
 
-    With a `topic` a ROS message, else a datagram from `peer` at `listener`. Its content is `fields`, of a datagram
-    those of the payload `case`, or the bytes `data`. `pad` in bytes, 0 for none.
+    With a `topic` it is a ROS message, else a datagram from `peer` at `listener`. Its content is `fields` (for a
+    datagram, those of the payload `case`) or the bytes `data`. `pad` in bytes, 0 for none.
     """
 
     span: SourceSpan
@@ -53,9 +53,9 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """One delivery that is expected: the datagram as it was given, these bytes, or a message with these fields.
+    """One expected delivery: the datagram as it was given, these bytes, or a message with these fields.
 
-    `case` is the payload of a datagram. Where nothing of all that is said, any content will do.
+    `case` is the payload of a datagram. If none of these is given, any content is accepted.
     """
 
     span: SourceSpan
@@ -66,7 +66,7 @@ class Delivery:
 
     @property
     def is_compared(self) -> bool:
-        """Whether the test looks at the content, and not only at which payload it is."""
+        """Whether the test compares the content, and not only the payload case."""
         return self.is_unchanged or self.data is not None or self.fields is not None
 
 
@@ -93,7 +93,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """`at` and `until` in ns after the beginning of the test, None where the step before ends."""
+    """`at` and `until` in ns after the beginning of the test; None for the end of the previous step."""
 
     span: SourceSpan
     expected: Expected
@@ -107,11 +107,11 @@ class Step:
 
 
 _PORT = 40_000
-"""A sender's port where the test says none."""
+"""A sender's port if the test gives none."""
 
 
 class Names:
-    """The names of a table. A method takes a name and its place, and raises InvalidValueError if there is none such."""
+    """The names of a table. Methods take a name and its place, and raise InvalidValueError for an unknown name."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
         self._checked = checked
@@ -137,7 +137,7 @@ class Names:
         return envelope.cases[name]
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
-        """The address that an endpoint sends from, or any other that is written HOST:PORT."""
+        """The address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
             address = endpoint.address.value
             return address.host, endpoint.source_port.value if endpoint.source_port else address.port
@@ -149,7 +149,7 @@ class Names:
             raise invalid(span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)) from error
 
     def listener(self, named: Located[str] | None, sender: str, span: SourceSpan) -> str:
-        """The one that is named, else the one by which the sender is believed, else the only one."""
+        """The listener that is named, else the one at which the sender is accepted, else the only one."""
         listeners = self._table.listeners
         if named is not None:
             return self._known(named.value, listeners, named.span, "listener")
@@ -157,11 +157,11 @@ class Names:
         if endpoint is not None and endpoint.listener is not None:
             return endpoint.listener.value
         if len(listeners) > 1:
-            raise invalid(span, Code.MISSING_KEY, f"say which listener: {', '.join(listeners)}")
+            raise invalid(span, Code.MISSING_KEY, f"name the listener: {', '.join(listeners)}")
         return next(iter(listeners))
 
     def endpoint(self, name: str, span: SourceSpan) -> str:
-        """One that something is sent to."""
+        """An endpoint that something is sent to."""
         self._known(name, self._table.endpoints, span, "endpoint", Code.UNKNOWN_ENDPOINT)
         return self._known(name, self._destinations, span, "route to the endpoint", Code.UNKNOWN_ENDPOINT)
 
@@ -222,13 +222,13 @@ class GivenReader:
         _refuse(node, ("message",), "a datagram", _KEYS_OF_DATAGRAMS)
         sender = optional_text(node, "from")
         if sender is None:
-            raise invalid(span, Code.MISSING_KEY, "it is not said who sends this", "add 'from: ENDPOINT'")
+            raise invalid(span, Code.MISSING_KEY, "this datagram has no sender", "add 'from: ENDPOINT'")
         named, data = optional_text(node, "case"), _hex(node)
         if (named is None) == (data is None):
-            message = "a datagram is given as 'case' with 'fields', or as 'hex'; a ROS message has a 'topic'"
+            message = "write a datagram as 'case' with 'fields' or as 'hex', a ROS message with 'topic'"
             raise invalid(span, Code.BAD_VALUE, message)
         if named is None and (fields := node.entries.get("fields")):
-            raise invalid(fields.key.span, Code.UNKNOWN_KEY, "'fields' belongs to 'case'")
+            raise invalid(fields.key.span, Code.UNKNOWN_KEY, "'fields' needs 'case'")
         case = self._names.case(named.value, named.span) if named else None
         pad = integer(node, "pad")
         times, every, age = _repetition(node)
@@ -251,7 +251,7 @@ class GivenReader:
         kind = self._names.subscribed(topic.value, topic.span)
         data, message = _hex(node), node.get("message")
         if data is not None and message is not None:
-            raise invalid(span, Code.BAD_VALUE, "a ROS message is given as 'message' or as 'hex', not both")
+            raise invalid(span, Code.BAD_VALUE, "a ROS message has 'message' or 'hex', not both")
         fields = self._content(kind, message, topic.span) if data is None else None
         times, every, age = _repetition(node)
         return Given(span, topic.value, fields=fields, data=data, times=times, every=every, age=age)
@@ -263,7 +263,7 @@ class GivenReader:
 def _refuse(node: MappingNode, names: tuple[str, ...], what: str, known: tuple[str, ...]) -> None:
     for name in names:
         if entry := node.entries.get(name):
-            hint = f"it has {', '.join((*known, 'hex'))}"
+            hint = f"its keys are {', '.join((*known, 'hex'))}"
             raise invalid(entry.key.span, Code.UNKNOWN_KEY, f"{what} has no key '{name}'", hint)
 
 
@@ -271,7 +271,7 @@ def _repetition(node: MappingNode) -> tuple[int, int, int]:
     """`times`, `every` and `age`, the latter two in ns."""
     times, every, age = integer(node, "times"), optional_text(node, "every"), optional_text(node, "age")
     if every is not None and times is None:
-        raise invalid(every.span, Code.MISSING_KEY, "'every' without 'times'", "say how often it is given")
+        raise invalid(every.span, Code.MISSING_KEY, "'every' without 'times'", "add 'times', the number of messages")
     return (
         times.value if times else 1,
         parsed(parse_duration, every) if every else 0,
@@ -297,7 +297,7 @@ class ExpectedReader:
         self._given = FieldReader(names.constants, exact=True)
 
     def expected(self, span: SourceSpan, node: Node, given: Node | None) -> Expected:
-        """`given` is what the step is given, which 'unchanged' refers to. Raises InvalidValueError."""
+        """`given` is what 'unchanged' refers to: the step's given message. Raises InvalidValueError."""
         if isinstance(node, ScalarNode):
             return Expected(span, anything=node.text == ANY)
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
@@ -328,7 +328,7 @@ class ExpectedReader:
         if isinstance(node, ScalarNode):
             return [_of_word(node, given)]
         if not isinstance(node, MappingNode):
-            raise invalid(node.span, Code.WRONG_TYPE, "a list within a list is no datagram")
+            raise invalid(node.span, Code.WRONG_TYPE, "a list within a list is not a datagram")
         times = _times(node)
         content = [(name, entry) for name, entry in node.entries.items() if name != "times"]
         if not content:
@@ -361,11 +361,11 @@ class ExpectedReader:
         return [Delivery(span, fields=fields)] * times
 
     def _content(self, kind: MessageType, node: Node, given: Node | None) -> Fields:
-        """Fields as they are written here, or as they were given."""
+        """Fields as written here, or as given."""
         if not _is(node, UNCHANGED):
             return self._fields.message(kind, node)
         if not isinstance(given, MappingNode) or "hex" in given.entries:
-            raise invalid(node.span, Code.BAD_VALUE, "no fields were given in this step that could be unchanged")
+            raise invalid(node.span, Code.BAD_VALUE, "'unchanged' needs fields that are given in this step")
         fields = given.get("fields") or given.get("message")
         return self._given.message(kind, fields) if fields else Fields(kind, {}, node.span)
 
@@ -403,12 +403,12 @@ def _of_word(node: ScalarNode, given: Node | None) -> Delivery:
     if node.text == ANY:
         return Delivery(node.span)
     hint = f"write {UNCHANGED}, {ANY}, or {{CASE: {{FIELD: value}}}}"
-    raise invalid(node.span, Code.BAD_VALUE, f"'{node.text}' is no datagram", hint)
+    raise invalid(node.span, Code.BAD_VALUE, f"'{node.text}' is not a datagram", hint)
 
 
 def _unchanged(span: SourceSpan, given: Node | None) -> Delivery:
     if not isinstance(given, MappingNode) or "topic" in given.entries:
-        message = "no datagram was given in this step that could be unchanged"
+        message = "'unchanged' needs a datagram that is given in this step"
         raise invalid(span, Code.BAD_VALUE, message, "write {ENDPOINT: {CASE: {FIELD: value}}}")
     return Delivery(span, is_unchanged=True)
 
@@ -428,7 +428,7 @@ def _times(node: MappingNode) -> int:
 def _count(node: Node) -> int:
     value = node.value if isinstance(node, ScalarNode) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST:
-        raise invalid(node.span, Code.BAD_VALUE, f"how often is a whole number from 1 to {_MOST}")
+        raise invalid(node.span, Code.BAD_VALUE, f"this must be a whole number from 1 to {_MOST}")
     return value
 
 
@@ -436,7 +436,7 @@ def _refuse_repeated(named: Sequence[tuple[str, SourceSpan]]) -> None:
     names = [name for name, _ in named]
     for index, (name, span) in enumerate(named):
         if name in names[:index]:
-            hint = f"where it gets the datagram twice, write {{{name}: {{times: 2}}}}"
+            hint = f"if it gets the datagram twice, write {{{name}: {{times: 2}}}}"
             raise invalid(span, Code.BAD_VALUE, f"'{name}' is named twice", hint)
 
 
@@ -447,7 +447,7 @@ def _name(node: Node) -> tuple[str, SourceSpan]:
 
 
 def _listed(node: Node | None) -> Sequence[Node]:
-    """One, or a list of them; of nothing, none."""
+    """One node, or the items of a list; none for None."""
     if node is None:
         return ()
     return node.items if isinstance(node, SequenceNode) else (node,)

@@ -1,4 +1,4 @@
-"""What happened in a rehearsal in words, and where the table says so."""
+"""Describe what happened in a rehearsal, with the places in the table."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MOST_LINES = 12
 
 @dataclass(frozen=True, slots=True)
 class Related:
-    """A stretch of the table, and what it has to do with a failure."""
+    """A place in the table, and how it is related to a failure."""
 
     span: SourceSpan
     note: str
@@ -57,7 +57,7 @@ class TableIndex:
         return Related(found[0].span, note) if found else None
 
     def type(self, route: str, topic: str) -> MessageType | None:
-        """Of a topic that a route publishes on."""
+        """The type of a topic that a route publishes on."""
         return next((found.type for found in self._targets.get((route, topic), ())), None)
 
     def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
@@ -84,7 +84,7 @@ class TableIndex:
             if found.plan is None:
                 return Related(found.span, "forwarded here")
             if (span := _filled(found.plan, path)) is not None:
-                return Related(span, f"what fills {path_text(path)}")
+                return Related(span, f"{path_text(path)} is filled here")
         return self.target(route, target, "nothing here fills it")
 
 
@@ -105,7 +105,7 @@ def _filled(plan: Plan, path: Path) -> SourceSpan | None:
 
 
 class Teller:
-    """Tells what happened to messages of one table. `index` finds its places."""
+    """Describes what happened to messages of one table. `index` finds its places."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
         self.index = TableIndex(checked)
@@ -117,10 +117,10 @@ class Teller:
         for _, same in groupby(events, _what):
             alike = [*same]
             line, place = self.first_of(alike), self.related(alike[0])
-            if place is not None and place.span.file not in line:  # as it is where an expression has no value
+            if place is not None and place.span.file not in line:  # it is if an expression has no value
                 line += f" ({place.span})"
             lines.append(line)
-        more = [f"and {len(lines) - _MOST_LINES} lines more"] if len(lines) > _MOST_LINES else []
+        more = [f"and {len(lines) - _MOST_LINES} more lines"] if len(lines) > _MOST_LINES else []
         return lines[:_MOST_LINES] + more
 
     def related(self, event: Event) -> Related | None:
@@ -134,7 +134,7 @@ class Teller:
         return None
 
     def first_of(self, events: Sequence[Event]) -> str:
-        more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
+        more = f", and so on, {len(events)} in total" if len(events) > 1 else ""
         return self.described(events[0]) + more
 
     def described(self, event: Event) -> str:
@@ -149,9 +149,9 @@ class Teller:
                 inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
                 return f"{at}{inside} is published on {event.target}"
             case Dropped():
-                return f"{at}{event.target} misses one as {event.reason}{in_brackets(event.detail)}"
+                return f"{at}a message for {event.target} is dropped as {event.reason}{in_brackets(event.detail)}"
             case Filtered():
-                return f"{at}{event.route} withholds one from {event.target}"
+                return f"{at}{event.route} withholds a message from {event.target}"
             case Collected():
                 return f"{at}{event.target} waits for the rest of its frame"
             case Received():
@@ -171,7 +171,7 @@ class Teller:
 
 
 def _what(event: Event) -> tuple[object, ...]:
-    """The same of events that only time and content tell apart."""
+    """A key that is equal for events that differ only in time and content."""
     names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
     return type(event), *names
 
@@ -181,5 +181,5 @@ def in_brackets(detail: str) -> str:
 
 
 def when(event: Event) -> str:
-    """`at 500 ms `, nothing at the beginning of the test."""
+    """`at 500 ms `; empty at the beginning of the test."""
     return f"at {offset(event.at - START)} " if event.at != START else ""

@@ -1,4 +1,4 @@
-"""What simulated endpoints do with the datagrams that they receive. Times are seconds since the start."""
+"""How simulated endpoints react to the datagrams that they receive. Times are seconds since the start."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMEOUT = 1.0
 """Seconds without a command after which a board stops on its own."""
 
 MISSED_REPEATS = 3
-"""A deadman has ended when this many of its repeats are missing."""
+"""A deadman counts as ended when this many of its repeats are missing."""
 
 
 class State(enum.Enum):
@@ -32,7 +32,7 @@ class State(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """What a deadman sends in place of commands. It holds for `hold` seconds."""
+    """A payload that a deadman sends in place of commands. It counts for `hold` seconds."""
 
     case: str
     message: Message
@@ -74,7 +74,7 @@ def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[St
 
 
 class Board:
-    """Obeys `commands`, halts for `stops`, and stops when neither came for TIMEOUT seconds.
+    """Obeys `commands`, halts on `stops`, and stops after TIMEOUT seconds without either.
 
     A halt ends with the first command after the deadman has ended, since commands of other routes may continue.
     `changed` is called with every new state.
@@ -149,13 +149,13 @@ def boards(
 
 
 PART = ("frame_id", "total_count", "index")
-"""Fields of a payload that is a part of a frame: number of the frame, number of its parts, index of this one."""
+"""Fields of a payload that is part of a frame: frame number, number of parts, index of this part."""
 
 FRAME_TIMEOUT = 1_000_000_000
-"""Nanoseconds after the first part of a frame when the frame is given up."""
+"""Nanoseconds from the first part of a frame until an incomplete frame is discarded."""
 
 MOST_FRAMES, MOST_PARTS = 64, 8192
-"""Frames that are assembled at a time, and parts of one."""
+"""Most frames that are assembled at a time, and most parts of a frame."""
 
 
 def is_part(kind: MessageType) -> bool:
@@ -163,14 +163,14 @@ def is_part(kind: MessageType) -> bool:
 
 
 class Frames:
-    """Counts the frames that a simulated basestation assembles of one payload case. `astray` are parts of no frame."""
+    """Counts the frames that a simulated basestation assembles of one payload case. `astray`: parts of no frame."""
 
     def __init__(self) -> None:
         self.complete = 0
         self.incomplete = 0
         self.astray = 0
         self._missing: dict[tuple[int, int], tuple[float, set[int]]] = {}
-        """Deadline and missing parts by number of the frame and number of its parts, the oldest first.
+        """Deadline and missing parts by frame number and number of parts, the oldest first.
 
         A complete frame is kept until its deadline, so that copies of its parts are recognised.
         """
@@ -190,7 +190,7 @@ class Frames:
             self._forget_oldest()
 
     def advance(self, now: int) -> None:
-        """Give up frames that are overdue."""
+        """Discard overdue frames."""
         while self._missing and next(iter(self._missing.values()))[0] <= now:
             self._forget_oldest()
 

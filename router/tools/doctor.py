@@ -1,4 +1,4 @@
-"""What keeps a router from working on this computer, and what to do about it.
+"""Find what keeps a router from working on this computer, with remedies.
 
 `examine` checks the table first, then this computer, then the running router if there is one.
 """
@@ -36,7 +36,7 @@ from router.tools.running_router import Health, health, url_of
 
 
 def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Each result as soon as it is known; pings take up to a second."""
+    """Yield each result as soon as it is known; pings take up to a second."""
     checked = check_table(path, variables)
     yield from _table(checked)
     program = checked.program
@@ -58,9 +58,9 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
 
 
 def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Only what would make the start fail, and warnings of networks that the table needs and that are not there.
+    """Yield only what would make the start fail, and warnings of missing networks that the table needs.
 
-    Without the ports of listeners: systemd may hold them for the router.
+    Ports of listeners are not checked: systemd may hold them for the router.
     """
     checked = check_table(path, variables)
     needed = [_table(checked)]
@@ -93,20 +93,20 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
     if program.table.http is None:
         yield warning(
             "router",
-            "the table has no `http.address`: a running router cannot be asked",
+            "the table has no `http.address`: a running router cannot be checked",
             "add `http: {address: 127.0.0.1:9108}`",
         )
     elif running is None:
-        what = f"none answers at {program.table.http.value}: its health was not looked at"
+        what = f"no router answers at {program.table.http.value}: its health was not checked"
         yield fine("router", what)
     else:
         yield from _told(program, running)
 
 
 def _told(program: Program, running: Health) -> Iterator[CheckResult]:
-    """What a running router says, which may run another version of the table by now."""
+    """What a running router reports; it may be running another version of the table."""
     if running.table_sha256 != program.table.sha256:
-        yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
+        yield warning("router", "its table differs from this file", "router reload, or systemctl restart")
     for each in running.problems:
         if each.kind.level is Level.CALM:
             yield fine("router", each.text)
@@ -118,13 +118,13 @@ def _told(program: Program, running: Health) -> Iterator[CheckResult]:
 
 
 def _in_place_of(running: Health | None) -> Mapping[str, str]:
-    """By endpoint the host that sends what it should, as the running router says."""
+    """By endpoint, the other host that sends its payloads, as the running router reports."""
     labels = [each.labels for each in running.problems] if running is not None else []
     return {each["endpoint"]: each["sender"] for each in labels if "sender" in each}
 
 
 def _health(program: Program) -> Health | None:
-    """None if no router answers, or the table has no `http.address`."""
+    """The health of the running router; None if no router answers, or the table has no `http.address`."""
     try:
         return None if program.table.http is None else health(url_of(program.table))
     except TransportError:  # no answer, or another program's

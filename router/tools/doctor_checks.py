@@ -35,7 +35,7 @@ class Grade(enum.Enum):
 
 
 class CheckResult(NamedTuple):
-    """`about` is a word such as `ports`; `remedy` is empty where nothing has to be done."""
+    """`about` is a word such as `ports`; `remedy` is empty if nothing has to be done."""
 
     grade: Grade
     about: str
@@ -48,7 +48,7 @@ def fine(about: str, text: str) -> CheckResult:
 
 
 def warning(about: str, text: str, remedy: str) -> CheckResult:
-    """Something works worse than it could, or not for everybody."""
+    """Something works less well than it could, or not for everybody."""
     return CheckResult(Grade.WARNING, about, text, remedy)
 
 
@@ -76,17 +76,17 @@ def receive_buffers(program: Program) -> Iterator[CheckResult]:
     try:
         allowed = int(RMEM_MAX.read_text())
     except FileNotFoundError:  # in a container
-        what = "the kernel does not say here how large receive buffers may be"
-        yield warning("buffers", what, "run this on the host as well; the router's log says when it got less")
+        what = "the kernel does not show here how large receive buffers may be"
+        yield warning("buffers", what, "also run this on the host; the router logs when a buffer is smaller")
         return
     if wanted <= allowed or os.geteuid() == 0:
-        yield fine("buffers", f"a listener may have the {wanted} bytes that the table asks for")
+        yield fine("buffers", f"a listener can have the {wanted} bytes that the table asks for")
         return
     yield warning(
         "buffers",
         f"the table asks for receive buffers of {wanted} bytes, the kernel allows {allowed}: bursts may be dropped",
-        f"sysctl -w net.core.rmem_max={wanted}, and for good in /etc/sysctl.d/60-rover-router.conf; the service of "
-        "`make install-service` need not be told",
+        f"sysctl -w net.core.rmem_max={wanted}, and permanently in /etc/sysctl.d/60-rover-router.conf; the service of "
+        "`make install-service` does not need it",
     )
 
 
@@ -100,13 +100,13 @@ def recordings(program: Program) -> Iterator[CheckResult]:
     there = next(folder for folder in (directory, *directory.parents) if os.path.exists(folder))  # noqa: PTH110
     if not there.is_dir():
         remedy = "move that file away, or give `record` another directory"
-        yield problem("recordings", f"{there} is a file, and no folder", remedy)
+        yield problem("recordings", f"{there} is a file, not a folder", remedy)
         return
     if not os.access(there, os.R_OK | os.W_OK | os.X_OK):
         yield problem(
             "recordings",
             f"{_user(os.geteuid())} may not write to {there}",
-            "chown it, or give `record` another directory; for a service, run deploy/install-service.sh again then",
+            "chown it, or give `record` another directory; for a service, then run deploy/install-service.sh again",
         )
         return
     kept = sum(recording_sizes(directory, program.table.path.stem).values())
@@ -115,26 +115,26 @@ def recordings(program: Program) -> Iterator[CheckResult]:
         yield warning(
             "recordings",
             f"the disk with {directory} has room for {(kept + free) >> 20} MiB, "
-            f"`retention` says {settings.retention >> 20}",
-            "a smaller `retention`: the oldest files go before the disk is full",
+            f"`retention` is {settings.retention >> 20} MiB",
+            "reduce `retention`: then the oldest files are deleted before the disk is full",
         )
     else:
         yield fine("recordings", f"{directory}, with {free >> 20} MiB free")
 
 
 def clock(now: datetime | None = None, status: int | None = None) -> Iterator[CheckResult]:
-    """Check that the clock is synchronised, as `ttl` needs. Tests give the arguments."""
+    """Check that the clock is synchronised, as `ttl` requires. Tests pass the arguments."""
     now = now or datetime.now(timezone.utc)
     status = _clock_status() if status is None else status
     if now < _BUILT:
         yield problem("clock", f"it says {now:%Y-%m-%d %H:%M}", "set it: `timedatectl set-ntp true`, or `date -s`")
     elif status is None:
-        yield warning("clock", "the kernel does not say whether it is synchronised", "look at `timedatectl`")
+        yield warning("clock", "the kernel does not say whether it is synchronised", "run `timedatectl`")
     elif status & _UNSYNCHRONISED:
         yield warning(
             "clock",
-            "nothing synchronises it: messages of other computers may seem stale, and `ttl` then drops them",
-            "install chrony on all computers of the rover, with one of them as the others' server; `timedatectl`",
+            "it is not synchronised: messages of other computers may seem stale, and `ttl` then drops them",
+            "install chrony on all computers of the rover, with one as the others' server; check with `timedatectl`",
         )
     else:
         yield fine("clock", "synchronised")
@@ -149,15 +149,15 @@ def _clock_status() -> int | None:
 
 
 def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[CheckResult]:
-    """Warn of nodes of several users: between these, Fast DDS's shared memory loses messages silently."""
+    """Warn if several users run nodes: Fast DDS's shared memory silently loses messages between them."""
     owners = {each.stat().st_uid for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")}
     if len(owners) > 1 or (owners - {os.geteuid()} and variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4"):
         yield warning(
             "ROS",
-            f"nodes of {' and '.join(sorted(map(_user, owners)))} share memory here: Fast DDS loses what goes from one "
-            "user's node to another's, without a word",
+            f"nodes of {' and '.join(sorted(map(_user, owners)))} share memory here: Fast DDS silently loses "
+            "messages between nodes of different users",
             "run all nodes as one user, or with FASTDDS_BUILTIN_TRANSPORTS=UDPv4 in their environment, as the service "
-            "of the router has it; `fastdds shm clean` removes what ended nodes have left",
+            "of the router does; `fastdds shm clean` removes the files of nodes that have exited",
         )
 
 
@@ -200,12 +200,12 @@ def listeners(program: Program) -> Iterator[CheckResult]:
         about = f"listener '{listener.name}'"
         if (found := _absence(listener)) is not None:
             why, remedy = found
-            remedy += "; the router waits for what comes up later, such as a tunnel"
+            remedy += "; the router waits for it, for example for a tunnel to come up"
             yield warning("listeners", f"{about} cannot use {listener.bound_to}: {why}", remedy)
         elif listener.interface is not None and interface_is_up(listener.interface):
             yield fine("listeners", f"{about}: network interface {listener.interface} is up")
         elif listener.interface is not None:
-            what = f"{about}: network interface {listener.interface} is down: nothing comes in"
+            what = f"{about}: network interface {listener.interface} is down: the listener receives nothing"
             yield warning("listeners", what, f"ip link set {listener.interface} up")
 
 
@@ -218,7 +218,7 @@ def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
 
 
 def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
-    """What gateways bind: (protocol, address, owner). Of Zenoh's locators only those of tcp with an IPv4 address."""
+    """What gateways bind: (protocol, address, owner). Of Zenoh's locators, only those of TCP with an IPv4 address."""
     for gateway in program.table.gateways.values():
         what = f"gateway '{gateway.name}'"
         if gateway.receive is not None:
@@ -246,7 +246,7 @@ def _port(protocol: str, address: Address, interface: str | None, what: str, wai
 
 def _refused(protocol: str, address: Address, what: str, error: OSError, waits: bool) -> Iterator[CheckResult]:
     if error.errno == errno.EADDRNOTAVAIL:
-        remedy = "give the interface that address (`ip address`), or have the table say 0.0.0.0"
+        remedy = "give an interface that address (`ip address`), or write 0.0.0.0 in the table"
         grade = warning if waits else problem
         yield grade("ports", f"{what}: no interface of this computer has {address.host}", remedy)
         return
@@ -255,19 +255,17 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
         return
     holder = port_holder(protocol, address.port)
     if holder.startswith(_KEEPS):
-        yield fine(
-            "ports", f"{what}: {holder} keeps {address} for the service; start that: systemctl start rover-router"
-        )
+        yield fine("ports", f"{what}: {holder} keeps {address} for the service; start it: systemctl start rover-router")
         return
     yield problem(
         "ports",
         f"{what}: {holder} has {protocol} port {address.port}",
-        "stop it, or choose another port; root is told who it is, and `systemctl status` tells of which service",
+        "stop it, or choose another port; run as root to see which process, and `systemctl status PID` for its service",
     )
 
 
 def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Iterator[CheckResult]:
-    """Check that a route leads to each endpoint. `grade` makes the result where none does."""
+    """Check that an IP route leads to each endpoint. `grade` makes the result if none does."""
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
         try:
@@ -281,9 +279,9 @@ def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Ite
 
 
 def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Check that a route leads to each endpoint, and that it answers a ping.
+    """Check that an IP route leads to each endpoint, and that it answers a ping.
 
-    `in_place_of`: by endpoint, another host that sends what it should.
+    `in_place_of`: by endpoint, another host that sends its payloads.
     """
     yield from ways(program, problem)
     reachable = {each.name: each.address.value.host for each in program.table.endpoints.values() if _has_way(each)}
@@ -291,16 +289,16 @@ def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[Chec
         answered = answering(set(reachable.values()))
     except PermissionError:
         remedy = "run this as root, or: sysctl -w net.ipv4.ping_group_range='0 2147483647'"
-        yield warning("endpoints", "this user may not ping, so nobody knows whether they are there", remedy)
+        yield warning("endpoints", "this user may not ping, so it is unknown whether endpoints are up", remedy)
         return
     for name, host in reachable.items():
         if host in answered:
             yield fine("endpoints", f"{name}: {host} answers a ping")
         elif name in in_place_of:
-            what = f"{name}: {host} does not answer a ping, and {in_place_of[name]} sends what it should"
-            yield warning("endpoints", what, "has it another address than the table says? See `router` below")
+            what = f"{name}: {host} does not answer a ping, but {in_place_of[name]} sends its payloads"
+            yield warning("endpoints", what, "check its address in the table; see `router` below")
         else:
-            remedy = "is it on, and is its cable in? Some boards never answer a ping"
+            remedy = "check that it is on and connected; some boards never answer a ping"
             yield warning("endpoints", f"{name}: {host} does not answer a ping", remedy)
 
 
@@ -312,7 +310,7 @@ def _has_way(endpoint: Endpoint) -> bool:
 
 
 def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
-    """Those of `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
+    """The `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
     answered: set[str] = set()
     with _open_ping() as pinging:
         request = _request(os.getpid() & 0xFFFF)
@@ -359,7 +357,7 @@ def ros(program: Program) -> Iterator[CheckResult]:
         from router.ros.node import middleware
         from router.ros.types import usable_class
     except ImportError as error:
-        yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
+        yield problem("ROS", f"the table has topics, but ROS 2 cannot be loaded: {error}", ros_remedy())
         return
     wrong: dict[str, dict[str, str]] = {}
     for plan in plans:
@@ -390,16 +388,16 @@ def carrier() -> Iterator[CheckResult]:
 
 
 def _priority() -> Iterator[CheckResult]:
-    """Check that the carrier's threads may run at the least real-time priority."""
+    """Check that the carrier's threads may run at the lowest real-time priority."""
     policy = os.sched_getscheduler(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except PermissionError:
         yield warning(
             "carrier",
-            "it may not run at a real-time priority: other programs can delay commands and brakes by some 0.5 ms",
-            f"'{_user(os.geteuid())} - rtprio 1' in /etc/security/limits.d/60-rover-router.conf, and log in again; a "
-            "container needs deploy/container/realtime.yaml; the service of `make install-service` need not be told",
+            "it may not run at a real-time priority: other programs can delay commands and brakes by about 0.5 ms",
+            f"write '{_user(os.geteuid())} - rtprio 1' in /etc/security/limits.d/60-rover-router.conf, and log in "
+            "again (a container needs deploy/container/realtime.yaml; the service of `make install-service` does not)",
         )
     else:
         os.sched_setscheduler(0, policy, os.sched_param(0))
@@ -417,8 +415,8 @@ def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Chec
     if networks:
         yield warning(
             "ROS",
-            "every computer in a network of this one is in the ROS domain, and can publish commands: it is domain 0, "
-            f"and nodes are looked for by {', '.join(networks)}",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST where all nodes are on this computer, as the service has it by "
-            "itself; else a domain of your own, and docs/guides/security.md",
+            "every computer in this computer's networks can join the ROS domain and publish commands: it is domain 0, "
+            f"with discovery on {', '.join(networks)}",
+            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST if all nodes are on this computer, as the service does; else "
+            "use a domain of your own, and read docs/guides/security.md",
         )

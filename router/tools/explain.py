@@ -1,4 +1,4 @@
-"""What `router explain` says: routes and gateways as the router understands them, and two tables compared."""
+"""The output of `router explain`: routes and gateways as the router understands them, and two tables compared."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
         datagram = framed_size(case.number, case.max_size)
         yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
     elif everything.program is not None:
-        yield f"  largest encoding: none, as {everything.program.protos.unbounded(case.type.name)}"
+        yield f"  largest encoding: none, because {everything.program.protos.unbounded(case.type.name)}"
     if route.ignore is not None:
         yield f"  ignored: {route.ignore}"
         return
@@ -85,7 +85,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
 
 
 def tried_route(checked: CheckedRoute, everything: Checked, program: Program, words: Sequence[str]) -> Iterator[str]:
-    """What becomes of one payload with these `field=value` words from the first source, on a router that just started.
+    """What happens to one payload with these `field=value` words, sent by the first source to a newly started router.
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
     """
@@ -179,7 +179,7 @@ def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
 
 
 def _waiting(served: CheckedTarget) -> Iterator[str]:
-    """What decides when a message leaves that is ready."""
+    """What decides when a message that is ready is sent."""
     words = phrases(served.declared)
     if "max_rate" in words and served.declared.on_limit is OnLimit.LATEST:
         yield f"    {words['max_rate']}, {words['on_limit']}"
@@ -188,7 +188,7 @@ def _waiting(served: CheckedTarget) -> Iterator[str]:
 
 
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
-    """What a board's firmware can take."""
+    """The limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
     payload = board.fields.get(case.number)
     fields = list(_bounded(payload.message)) if payload is not None and payload.message is not None else []
@@ -219,14 +219,14 @@ def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
 
 
 def _mapping(served: CheckedTarget) -> Iterator[str]:
-    """One line for each field, in columns, and what nothing fills."""
+    """One line for each mapped field, in columns, and the fields that nothing fills."""
     yield from _rows(served.rows)
     if served.plan is not None and (unset := list(_unset(served.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"
 
 
 def _rows(rows: Sequence[Row]) -> Iterator[str]:
-    """A long expression shifts only what follows it."""
+    """Lines in columns; a long expression shifts only the rest of its line."""
     cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
     widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
     for target, type_, expression, kind, automatic in (
@@ -403,13 +403,13 @@ def _publishers(types: Iterable[str]) -> str:
 def diff(old: Checked, new: Checked) -> Iterator[str]:
     """A unified diff of the explanations of two tables without errors, a hunk for each part that differs.
 
-    Places and the width of columns are not compared, addresses only of endpoints.
+    Places and the width of columns are not compared; addresses are compared only for endpoints.
     """
     before, after = _parts(old), _parts(new)
     for name in dict.fromkeys((*after, *before)):
         hunks = difflib.unified_diff(before.get(name, ()), after.get(name, ()), lineterm="", n=1)
         for number, line in enumerate(hunks):
-            if number >= 2:  # behind the names of the files
+            if number >= 2:  # after the names of the files
                 yield f"{line} {name}" if line.startswith("@@") else line
 
 
@@ -454,7 +454,7 @@ def _comparable(lines: Iterable[str]) -> list[str]:
 
 
 def _zenoh_config(gateway: Gateway) -> Iterator[str]:
-    """A checksum that differs for different configurations: what is in them may be secret."""
+    """A checksum of the configuration, as its contents may be secret."""
     if gateway.zenoh is not None and gateway.zenoh.config is not None:
         config = gateway.zenoh.config
         yield f"  zenoh.config: {config.path or 'here'} ({hash(config.text) & 0xFFFFFF:06x})"

@@ -14,7 +14,7 @@ from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schem
 from router.tools.gateway_sources import Arrival, Source
 
 PATIENCE = 0.2
-"""Seconds that a source waits at most, so that Ctrl-C and `seconds` are noticed."""
+"""Longest wait of a source in seconds, so that Ctrl-C and the end of `seconds` are noticed."""
 
 ASK_AGAIN = 1.0
 """Seconds between two requests for schemas."""
@@ -39,7 +39,7 @@ class Tally:
 
 
 class GatewayClient:
-    """Decodes arrivals. `wants` selects topics; of "" it says whether all are wanted.
+    """Decodes arrivals. `wants` selects topics; `wants("")` is whether all topics are wanted.
 
     A schema without a topic is shown before the first wanted message of its type.
     """
@@ -55,7 +55,7 @@ class GatewayClient:
         return self._tally
 
     def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
-        """Yield what is heard, for `seconds`."""
+        """Yield what is received within `seconds`."""
         ends, asks = time.monotonic() + seconds, 0.0
         while (now := time.monotonic()) < ends:
             if not self._tally.schemas and now >= asks:
@@ -80,7 +80,7 @@ class GatewayClient:
                 yield from self._counted(heard, arrival.sender)
 
     def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Iterator[Heard]:
-        """Count it, and yield what is wanted."""
+        """Count a message or schema, and yield what is wanted."""
         if isinstance(heard, Remark):
             yield heard
         elif isinstance(heard, Schema):
@@ -112,7 +112,7 @@ _COMMAND_LINE = SourceSpan("command line", 1, 1)
 
 
 def topic_filter(globs: Sequence[str]) -> Callable[[str], bool]:
-    """A predicate: whether any glob matches a topic. Without globs each topic matches. Raises UsageError."""
+    """Return a predicate: whether any glob matches a topic. Without globs, every topic matches. Raises UsageError."""
     patterns = [TopicPattern(glob, is_regex=False, span=_COMMAND_LINE) for glob in globs]
     for problem in filter(None, map(pattern_problem, patterns)):
         raise UsageError(f"--topic: {problem.what}", problem.hint)

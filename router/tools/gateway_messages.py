@@ -1,4 +1,4 @@
-"""Packets and documents of a gateway taken apart, and printed: as a line with the values, or as JSON."""
+"""Decode packets and documents of a gateway, and print them as a line of values or as JSON."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MOST_TEXT = 256 << 20
 """Bytes of the longest message that a gateway can be configured to send."""
 
 _MOST_DEEP = 64
-"""Nesting of lists and objects that is accepted."""
+"""Deepest nesting of lists and objects that is accepted."""
 
 
 class Shape(NamedTuple):
-    """What a schema says of a field; `members` of a message, by name."""
+    """A field as a schema describes it; `members` of a message, by name."""
 
     type_name: str
     is_array: bool
@@ -26,9 +26,9 @@ class Shape(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A topic's message as received. In packets every single value is a list of one: `is_wrapped`.
+    """A topic's message as received. `is_wrapped`: every single value is a list of one, as in packets.
 
-    `time` is the sender's wall clock, seconds since 1970. `shape` is None before the schema came.
+    `time` is the sender's wall clock, seconds since 1970. `shape` is None until the schema has arrived.
     """
 
     time: float
@@ -40,7 +40,7 @@ class Message(NamedTuple):
 
 
 class Schema(NamedTuple):
-    """The schema of a type, as received and taken apart. `topic` is empty in documents."""
+    """The schema of a type, as received and as decoded. `topic` is empty in documents."""
 
     time: float
     topic: str
@@ -67,7 +67,7 @@ Heard = Union[Message, Schema, Remark, Problem]
 
 def read(data: bytes) -> Message | Schema | Remark:
     """Decode a packet or a document. Raises PacketError."""
-    # At a packet's ninth byte is 0 or 1, which no text has.
+    # The ninth byte of a packet is 0 or 1, which no text contains.
     if data[:1] == b"{" and (len(data) < HEAD.size or data[HEAD.size - 1] > 1):
         return _document(_object(data))
     return _packet(unpack(data))
@@ -89,7 +89,7 @@ def _is_schema(content: Mapping[str, Any]) -> bool:
 def _document(document: Mapping[str, Any]) -> Message | Schema | Remark:
     op = document.get("op")
     if not isinstance(op, str):
-        raise PacketError("a document that does not say what it is")
+        raise PacketError("a document of unknown kind")
     if op not in {"data", "schema"}:
         return Remark(document)
     time, type_name = document.get("time"), document.get("type")
@@ -107,9 +107,9 @@ def _object(text: bytes) -> dict[str, Any]:
     try:
         value = json.loads(text.decode())
     except (ValueError, RecursionError) as error:
-        raise PacketError(f"no JSON: {error}") from error
+        raise PacketError(f"not JSON: {error}") from error
     if not isinstance(value, dict):
-        raise PacketError("JSON that is no object")
+        raise PacketError("JSON that is not an object")
     _check_depth(value)
     return value
 
@@ -129,7 +129,7 @@ def shape(schema: object) -> Mapping[str, Shape]:
     try:
         return {field["name"]: _field(field) for field in schema["fields"]}  # type: ignore[index]
     except (KeyError, TypeError) as error:
-        raise PacketError(f"no schema: {error!r}") from error
+        raise PacketError(f"not a schema: {error!r}") from error
 
 
 def _field(field: Mapping[str, Any]) -> Shape:
@@ -182,7 +182,7 @@ def pieces(heard: Heard) -> list[Piece]:
 
 
 def _remark(document: Mapping[str, Any]) -> Iterable[str]:
-    """A document as words; of a list of topics only their names."""
+    """A document as words; a list of topics as their names only."""
     if not isinstance(rows := document.get("topics"), list):
         return words(_tree(document, _NO_SHAPE, is_wrapped=False))
     names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
@@ -190,7 +190,7 @@ def _remark(document: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _clock(seconds: float) -> str:
-    """Local time of day; beyond the calendar's range the number."""
+    """Local time of day; the number if it is outside the calendar's range."""
     try:
         return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
     except (OverflowError, OSError, ValueError):
@@ -215,7 +215,7 @@ def _type_text(shape: Shape) -> str:
 
 
 def _tree(values: Mapping[str, Any], shapes: Mapping[str, Shape], is_wrapped: bool) -> Mapping[str, Tree]:
-    """The members as text. `is_wrapped`: a single value stands in a list of one."""
+    """The members as text. `is_wrapped`: a single value is in a list of one."""
     tree: dict[str, Tree] = {}
     for name, value in values.items():
         shape = shapes.get(name)

@@ -55,7 +55,7 @@ class Source(Protocol):
 _LENGTH = struct.Struct("<I")
 
 LONGEST = MOST_TEXT + (1 << 20)
-"""Bytes of a packet or document. Any text that begins with `{` would be a longer packet."""
+"""Most bytes of a packet or document. Text that begins with `{`, read as a packet, would be longer."""
 
 
 class Splitter:
@@ -116,7 +116,7 @@ CONNECT_TIMEOUT = 2.0
 
 
 class ConnectedSource(ABC):
-    """A source that connects, and reconnects for ever. Each connection is another `sender`."""
+    """A source that reconnects after each failure. Each connection is another `sender`."""
 
     lost = 0
     """TCP loses nothing."""
@@ -131,7 +131,7 @@ class ConnectedSource(ABC):
         self._is_reported = False
         self._next_attempt = 0.0
 
-    def ask(self) -> None:  # noqa: B027 - there is nothing to ask
+    def ask(self) -> None:  # noqa: B027 - there is nothing to request
         """A new client gets all schemas unasked."""
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
@@ -144,11 +144,11 @@ class ConnectedSource(ABC):
 
     @abstractmethod
     def _open(self, opened: socket.socket, connected: ExitStack) -> None:
-        """Begin to receive; `connected` closes what is entered into it. Raises OSError."""
+        """Start to receive; `connected` closes what is entered into it. Raises OSError."""
 
     @abstractmethod
     def _receive(self, timeout: float) -> Sequence[bytes]:
-        """Return what has arrived; call `_lose` when the connection has ended."""
+        """Return what has arrived; call `_lose` if the connection has ended."""
 
     def _connect(self, timeout: float) -> bool:
         if (rest := self._next_attempt - time.monotonic()) > 0:
@@ -168,7 +168,7 @@ class ConnectedSource(ABC):
         return True
 
     def _lose(self, why: str) -> None:
-        """Close, and report it once until there is a connection again."""
+        """Close the connection. Report that once, until there is a connection again."""
         self._connected.close()
         if not self._is_reported:
             self._say(f"{self.place} {why}; trying again")
@@ -196,15 +196,15 @@ class TcpSource(ConnectedSource):
         try:
             data = self._socket.recv(_READ_SIZE)
             for one in self._splitter.feed(data):
-                received.append(one)  # noqa: PERF402 - what is whole counts, though the next be none
+                received.append(one)  # noqa: PERF402 - keeps complete packets if the next one is invalid
         except TimeoutError:
             return ()
         except (OSError, PacketError) as error:
-            self._lose(f"is left ({error})")
+            self._lose(f"was disconnected ({error})")
         else:
             if not data:
                 unfinished = self._splitter.unfinished
-                self._lose(f"has gone, after {unfinished} bytes of a message" if unfinished else "has gone")
+                self._lose(f"has closed, after {unfinished} bytes of a message" if unfinished else "has closed")
         return received
 
 
@@ -230,7 +230,7 @@ class WebsocketSource(ConnectedSource):
                 )
             )
         except InvalidHandshake as error:
-            raise OSError(f"it is no websocket: {error}") from error
+            raise OSError(f"it is not a websocket: {error}") from error
 
     def _receive(self, timeout: float) -> Sequence[bytes]:
         try:
@@ -238,7 +238,7 @@ class WebsocketSource(ConnectedSource):
         except TimeoutError:
             return ()
         except ConnectionClosed as error:
-            self._lose(f"has gone ({error})")
+            self._lose(f"has closed ({error})")
             return ()
         return message.encode().split(b"\n") if isinstance(message, str) else (bytes(message),)
 
@@ -277,7 +277,7 @@ class UdpSource:
             self._say(f"cannot ask {self._gateway}: {error.strerror}")
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
-        """Everything that is there at once, to empty the receive buffer quickly."""
+        """Return everything that has arrived, to empty the receive buffer quickly."""
         found: list[Arrival] = []
         if self._readable.poll(timeout * 1000):
             with suppress(BlockingIOError):
@@ -322,7 +322,7 @@ def _zenoh(text: str) -> ZenohSettings:
         raise UsageError(f"zenoh has no option '{unknown[0]}'", did_you_mean(unknown[0], known))
     file = options.get("config", [None])[-1]
     if file is not None and len(options) > 1:
-        raise UsageError("zenoh has 'config' alone", "write mode, connect and listen into that file")
+        raise UsageError("zenoh takes 'config' alone", "write mode, connect and listen in that file")
     return ZenohSettings(
         key=Located(key, _SPAN),
         mode=options.get("mode", ["peer"])[-1],

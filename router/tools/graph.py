@@ -1,4 +1,4 @@
-"""A table's route map as text for Mermaid and Graphviz, and as the picture (SVG) that Graphviz draws of it."""
+"""A table's route map as text for Mermaid and Graphviz, and as a picture (SVG) drawn by Graphviz."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEGEND: Mapping[NodeKind, str] = {
     NodeKind.GATEWAY: "gateway",
     NodeKind.CLIENTS: "clients of a gateway",
 }
-"""What the shapes mean."""
+"""The meaning of the shapes."""
 _GUARDED = "route with a ttl or a deadman"
 
 _MERMAID_SHAPES = {
@@ -53,7 +53,7 @@ _SVG_STYLE = """<style>
 }
 </style>
 """
-"""Graphviz draws for a light ground."""
+"""Colours for a dark theme; Graphviz draws for a light background."""
 
 
 def mermaid(table: RouteTable, title: str) -> str:
@@ -67,13 +67,13 @@ def dot(table: RouteTable, title: str) -> str:
 
 
 def svg(table: RouteTable, title: str) -> str:
-    """The picture, light or dark as its viewer prefers. Raises UsageError where Graphviz is not installed."""
+    """The picture, light or dark as its viewer prefers. Raises UsageError if Graphviz is not installed."""
     program = shutil.which("dot")
     if program is None:
-        raise UsageError("an .svg is drawn by Graphviz, which is not installed", "apt install graphviz")
+        raise UsageError("an .svg needs Graphviz, which is not installed", "apt install graphviz")
     command = [program, "-Tsvg"]
     drawn = subprocess.run(command, input=dot(table, title), capture_output=True, encoding="utf-8", check=True)
-    without_doctype = drawn.stdout[drawn.stdout.index("<svg") :]  # which names another host
+    without_doctype = drawn.stdout[drawn.stdout.index("<svg") :]  # it names another host
     head, body = without_doctype.split(">", 1)
     return f"{head}>\n{_SVG_STYLE}{body.lstrip()}"
 

@@ -1,6 +1,6 @@
-"""What `router explain --code` lists: what the carrier reads of a message, and its operations with their places.
+"""The output of `router explain --code`: what the carrier reads from a message, and its operations with their places.
 
-Operations have the names of `native/operations.h`, which says what they do.
+Operations have the names of `native/operations.h`, which describes them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _MOST_SHOWN = 16
 
 
 def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
-    """All routine of a route."""
+    """All routines of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name
     for kind, routes in (("destination", lowered.to_destinations), ("topic", lowered.to_topics)):
@@ -66,7 +66,7 @@ def _layout(layout: Layout) -> Iterator[str]:
 
 
 def _fields(fields: list[WantedField], layout: Layout) -> Iterator[str]:
-    """The fields of a protobuf message of which something is read, and the slots that say which member a oneof has."""
+    """The fields of a protobuf message that are read, and the slots that say which member of a oneof is set."""
     for field in fields:
         places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
         places += [f"section {field.section}"] if field.section != NONE else []
@@ -133,7 +133,7 @@ def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> 
 
 
 def _listed(routine: Routine, places: list[str], layout: Layout) -> Iterator[str]:
-    """One operation a line, by number; a line for each place where that changes. Loops are indented."""
+    """One numbered operation per line, below its place where that changes. Loops are indented."""
     depth = 0
     before = ""
     for number, (operation, place) in enumerate(zip(routine, places, strict=True)):
@@ -260,7 +260,7 @@ _OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
     Op.WRITE_DOUBLE: _write,
     Op.WRITE_BYTES: _write,
 }
-"""How the operands of an operation are shown. Of other operations, unsigned integers are named."""
+"""Functions that show the operands of an operation. For other operations, unsigned integers are named."""
 
 
 def _slot(slot: int, layout: Layout) -> str:

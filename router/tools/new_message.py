@@ -1,4 +1,4 @@
-"""What `router new` adds: a message with its number and fields, checked against what there is."""
+"""The message that `router new` adds, with its number and fields, checked against the existing ones."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class NewMessage:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What a message is added to: a table without errors, its schema, and the folder of the ROS messages."""
+    """The place for a new message: a table without errors, its schema, and the folder of the ROS messages."""
 
     table: RouteTable
     settings: EnvelopeSettings
@@ -83,7 +83,7 @@ class Site:
 
 
 def site_of(checked: Checked, messages: Path) -> Site:
-    """`checked` is a table without errors. Raises UsageError where it has no envelope."""
+    """`checked` is a table without errors. Raises UsageError if it has no envelope."""
     if checked.table is None or checked.envelope is None:
         raise ValueError(f"{checked.path} has errors")
     settings = checked.table.envelope
@@ -108,18 +108,18 @@ _OF_C = frozenset(
     typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
     """.split()  # noqa: SIM905 - ninety words are read more easily without quotes
 )
-"""Refused as names, since boards and ROS nodes are compiled from the same declarations."""
+"""Rejected as names, since boards and ROS nodes are compiled from the same declarations."""
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
 _WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 _LARGEST_NUMBER = (1 << 29) - 1
 _OF_PROTOBUF = range(19_000, 20_000)
-"""Field numbers that protobuf keeps for itself."""
+"""Field numbers that protobuf reserves for itself."""
 
 
 def new_message(name: str, number: int, board: str, fields: Sequence[str], site: Site) -> NewMessage:
-    """The message that the command line describes. Raises UsageError if it is not possible."""
+    """The message that the command line describes. Raises UsageError if it is invalid."""
     endpoint = _endpoint(board, site.table)
     case = _case(name, endpoint.name)
     _check_names(name, case, site)
@@ -128,7 +128,7 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     message = NewMessage(name, number, endpoint.name, case, asked)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
         if path.exists():
-            raise UsageError(f"there is a file {shown_path(path)} already", "take another name")
+            raise UsageError(f"the file {shown_path(path)} already exists", "choose another name")
     return message
 
 
@@ -150,7 +150,7 @@ def _parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
 
 
 def _usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
-    """The fields of a message without `--fields`: a number, and the enums and messages most siblings have."""
+    """The fields of a message without `--fields`: a number, and the enums and messages that most siblings have."""
     siblings = [case.type for case in site.envelope.cases.values() if case.type.short_name.startswith(prefix)]
     shared = Counter(
         NewField(field.name, field.type.name)
@@ -164,32 +164,34 @@ def _usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
 def _field(text: str, comment: str, site: Site) -> NewField:
     name, colon, type_ = text.partition(":")
     if not colon:
-        raise UsageError(f"'{text}' is no field", "write name:type, as in dose_rate:float")
+        raise UsageError(f"'{text}' is not a field", "write name:type, as in dose_rate:float")
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise UsageError(f"'{name}' is no name of a field", "write it as dose_rate")
-    _check_word(name, "take another name for the field")
+        raise UsageError(f"'{name}' is not a valid field name", "write it in the style of dose_rate")
+    _check_word(name, "choose another name for the field")
     if surprise(name) or resolve(name) != name:  # in tables and tests names stand without quotation marks
-        raise UsageError(f"'{name}' is no text to readers of YAML", f"take another name, such as is_{name}")
+        raise UsageError(f"YAML does not read '{name}' as text", f"choose another name, for example is_{name}")
     if type_ in SCALARS:
         return NewField(name, type_, comment)
     named = (*site.schema.messages, *site.schema.enums)
     own = [full for full in named if type_ in (full, full.rpartition(".")[2])]
     if not own:
         close = nearest(type_, sorted((*SCALARS, *named)))
-        there = f"there are {', '.join(SCALARS)}, and the enums and messages of the protos"
+        there = f"the types are {', '.join(SCALARS)}, and the enums and messages of the protos"
         hint = f"did you mean '{close}'?" if close else there
         if site.schema.warnings:  # perhaps the file that declares it
             hint += f" ({site.schema.warnings[0]})"
         raise UsageError(f"there is no type '{type_}' for '{name}'", hint)
     if len(own) > 1:
-        raise UsageError(f"several types are called '{type_}'", f"write which for '{name}': {', '.join(sorted(own))}")
+        raise UsageError(
+            f"several types are called '{type_}'", f"write the full name for '{name}': {', '.join(sorted(own))}"
+        )
     return NewField(name, own[0], comment)
 
 
 def _check_word(name: str, remedy: str) -> None:
-    """Refuse words of C and C++."""
+    """Reject keywords of C and C++. Raises UsageError."""
     if name in _OF_C:
-        raise UsageError(f"'{name}' is a word of C or C++, and no name there", remedy)
+        raise UsageError(f"'{name}' is a keyword of C or C++", remedy)
 
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
@@ -198,7 +200,7 @@ def _endpoint(board: str, table: RouteTable) -> Endpoint:
     found = senders.get(board) or senders.get(f"{board}_board")
     if found is None:
         names = [name.removesuffix("_board") for name in senders]
-        hint = did_you_mean(board, names) or f"there are {', '.join(names)}"
+        hint = did_you_mean(board, names) or f"the boards are {', '.join(names)}"
         raise UsageError(f"{table.path.name} has no board '{board}'", hint)
     return found
 
@@ -210,29 +212,29 @@ def _case(name: str, board: str) -> str:
     if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):
         better = rest[:1].upper() + rest[1:]
         example = better if _MESSAGE_NAME.fullmatch(better) else "RadiationInfo"
-        raise UsageError(f"'{name}' is no name for a message of {board}", f"write it as {prefix}{example}")
+        raise UsageError(f"'{name}' is not a valid name for a message of {board}", f"write it as {prefix}{example}")
     return _WORD_BORDER.sub("_", rest).lower()
 
 
 def _check_names(name: str, case: str, site: Site) -> None:
     taken = {known.rpartition(".")[2] for known in (*site.schema.messages, *site.schema.enums)}
     if name in taken:
-        raise UsageError(f"there is a message '{name}' already")
-    _check_word(case, "take another name for the message")
+        raise UsageError(f"there is already a message '{name}'")
+    _check_word(case, "choose another name for the message")
     if surprise(case) or resolve(case) != case:
-        raise UsageError(f"'{case}' is no text to readers of YAML", "take another name for the message")
+        raise UsageError(f"YAML does not read '{case}' as text", "choose another name for the message")
     if case in site.envelope.cases:
         number = site.envelope.cases[case].number
         raise UsageError(
-            f"{site.envelope.name} has a payload case '{case}' already, number {number}; take another name"
+            f"{site.envelope.name} already has a payload case '{case}', number {number}; choose another name"
         )
     topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.all_topics}
     if case in topics:
-        raise UsageError(f"the route {topics[case]} has a topic '{case}' already", "take another name")
+        raise UsageError(f"the route {topics[case]} already has a topic '{case}'", "choose another name")
 
 
 def _check_number(number: int, case: str, site: Site) -> None:
-    """Raises UsageError, with the next free number, for one that was ever given out, reserved or promised."""
+    """Raises UsageError, with the next free number, for a number that was ever used, reserved or promised."""
     lock, envelope = read_lock(site.schema.lock), site.envelope.name
     entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
     holders = {entry.number: entry.name for entry in entries}
@@ -240,16 +242,18 @@ def _check_number(number: int, case: str, site: Site) -> None:
     above = range(max(holders, default=0) + 1, _LARGEST_NUMBER)
     free = next(candidate for candidate in above if _is_free(candidate, site))
     if not 1 <= number <= _LARGEST_NUMBER or number in _OF_PROTOBUF:
-        raise UsageError(f"{number} is no field number of protobuf", f"{free} is free")
+        raise UsageError(f"{number} is not a field number of protobuf", f"{free} is free")
     if number in holders:
-        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever", f"{free} is free")
+        raise UsageError(f"number {number} belongs permanently to '{holders[number]}'", f"{free} is free")
     if any(number in span for span in site.schema.reserved_numbers(envelope)):
         raise UsageError(f"{envelope} reserves number {number}", f"{free} is free")
     if promised := _promise(number, site):
         raise UsageError(f"{site.file(envelope)} says: {promised} {free} is free")
     if case in holders.values():
         was = next(old for old, name in holders.items() if name == case)
-        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another", "take another name")
+        raise UsageError(
+            f"'{case}' once had number {was}, and cannot be added again with another", "choose another name"
+        )
 
 
 def _is_free(number: int, site: Site) -> bool:

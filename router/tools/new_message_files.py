@@ -20,21 +20,21 @@ from router.types.protobuf import find_envelope, load_protos
 
 _WIDEST = 120
 _LONGEST_FIELD = 60
-"""Characters that are kept free for the last field on a line."""
+"""Characters reserved for the last field on a line."""
 _SECTION_WIDTH = 115
 _COMMENT_GAP = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """`texts` are the whole contents of each file. `unrouted` are tables beside that need a route by hand."""
+    """`texts` are the whole contents of each file. `unrouted` are the other tables that need a route by hand."""
 
     texts: Mapping[Path, str]
     unrouted: tuple[Path, ...]
 
 
 def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Changes:
-    """Everything but the lock. `others` are the tables beside the site's. Raises UsageError."""
+    """All changes except to the lock. `others` are the tables beside the site's. Raises UsageError."""
     root, table = site.schema.root, site.table
     envelope = root / site.file(site.envelope.name)
     texts = {
@@ -59,9 +59,9 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
 
 
 class Written:
-    """Files as they are written, line ends kept, so that all of it can be undone.
+    """Files that are written with their line ends preserved, and can all be undone.
 
-    Raises UsageError when one cannot be written, and then none is.
+    Raises UsageError if one cannot be written, and then undoes the others.
     """
 
     def __init__(self, texts: Mapping[Path, str]) -> None:
@@ -103,7 +103,7 @@ class Written:
 
 
 def locked(site: Site) -> str:
-    """The lock with what the `.proto` files declare now. Raises UsageError and TableError."""
+    """The lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
     schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
     errors = [each for each in lock.findings() if each.severity is Severity.ERROR]
@@ -209,7 +209,7 @@ def _short(name: str) -> str:
 
 
 def _aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
-    """Declarations with their comments below each other."""
+    """Declarations with their comments aligned."""
     rows = list(rows)
     width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
     for code, comment in rows:
@@ -220,7 +220,7 @@ def _aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
 
 
 class _Entry(NamedTuple):
-    """One entry of a YAML section: index of its first line, and of the line behind its last."""
+    """One entry of a YAML section: index of its first line, and of the line after its last."""
 
     first: int
     end: int
@@ -244,7 +244,7 @@ def _entries(text: str, section: str) -> list[_Entry]:
 
 
 def _last_line(node: yaml.Node) -> int:
-    """The index of a node's last line, or of a blank one behind it. The end mark of a block lies behind comments."""
+    """The index of a node's last line, or of a blank one after it. The end mark of a block is after comments."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _last_line(last[1] if isinstance(last, tuple) else last)
@@ -253,7 +253,7 @@ def _last_line(node: yaml.Node) -> int:
 
 
 def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str = "") -> str:
-    """The text with another entry below one, under a heading of its own where `section` says so."""
+    """The text with a stanza after an entry, under a heading if there is a `section`."""
     lines = text.split("\n")
     indent = " " * after.indent
     stanza = list(stanza)
@@ -268,7 +268,7 @@ def _in_table(text: str, message: NewMessage, site: Site) -> str:
     if not own and len(site.table.files) > 1:
         extended = shown_path(site.table.files[1])
         raise UsageError(
-            f"{shown_path(site.table.path)} has no routes of its own", f"take what it extends: -t {extended}"
+            f"{shown_path(site.table.path)} has no routes of its own", f"use the table that it extends: -t {extended}"
         )
     of_board = [route for route in own if message.board in (source.value for source in route.sources)]
     last = _last_route(text, of_board or own)
@@ -320,7 +320,7 @@ def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
     line = max((route.case.span.line for route in routes), default=0)
     found = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
     if found is None:
-        raise UsageError("the table has no routes of its own that one could be added to", "write it by hand")
+        raise UsageError("the table has no routes of its own to add one to", "write the route by hand")
     return found
 
 
@@ -336,9 +336,9 @@ def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
     try:
         entries = _entries(text, "tests")
     except yaml.YAMLError as error:
-        raise UsageError(f"{shown_path(path)} is no YAML: {error}") from error
+        raise UsageError(f"{shown_path(path)} is not valid YAML: {error}") from error
     if not entries:
-        raise UsageError(f"{shown_path(path)} has no 'tests'", "write one, or remove the file")
+        raise UsageError(f"{shown_path(path)} has no 'tests'", "write a test, or remove the file")
     of_board = [entry for entry in entries if message.board in _senders(entry.value)]
     return _with_stanza(text, (of_board or entries)[-1], _test(message, site), "" if of_board else message.board_words)
 
@@ -378,7 +378,7 @@ def _flow(key: str, values: object) -> list[str]:
 
 
 def _sample(type_name: str, place: int, site: Site) -> object:
-    """A value that no field has by default, and mostly another one for each."""
+    """A value that is no field's default, and mostly differs from field to field."""
     if type_name in SCALARS:
         return _scalar(type_name == "bool", type_name in ("float", "double"), place)
     return _value(site.schema.enums.get(type_name) or site.schema.messages[type_name], place)

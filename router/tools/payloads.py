@@ -16,7 +16,7 @@ METRES_PER_DEGREE = 111_320.0
 """Of latitude, and of longitude at the equator."""
 
 START = (51.0993, 17.0184)
-"""Latitude and longitude of the middle of the walk, degrees."""
+"""Latitude and longitude of the centre of the walk, degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def pose(t: float, epoch: float) -> Pose:
 
 
 Noise = Callable[[float], float]
-"""A standard deviation to one sample of Gaussian noise."""
+"""A function from a standard deviation to one sample of Gaussian noise."""
 
 Values = Mapping[str, object]
 
@@ -143,7 +143,7 @@ MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "BasestationManualDrive": _manual_drive,
     "BasestationManualBrake": _manual_brake,
 }
-"""By protobuf message; other fields move as their types allow."""
+"""By protobuf message; all other fields vary as their types allow."""
 
 
 RATES: Mapping[str, float] = {
@@ -167,7 +167,7 @@ RATES: Mapping[str, float] = {
 """Usual rate of a payload case on the rover, Hz."""
 
 USUAL_RATE = 2.0
-"""Of a payload case that RATES lacks."""
+"""Rate of a payload case that is not in RATES, Hz."""
 
 NESTING = 3
 """Depth to which recursive messages are filled."""

@@ -1,4 +1,4 @@
-"""Recordings that tools make of a running router's tap, and recordings that they send again."""
+"""Recordings made from a running router's tap, and recordings that are sent again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_SOCKETS = 256
 
 
 class TapRecording:
-    """One file, complete once it is closed; `datagrams` and `missed` count. Raises UsageError where it cannot write."""
+    """A file, complete once it is closed; `datagrams` and `missed` are counts. Raises UsageError if it cannot write."""
 
     def __init__(self, path: Path, envelope: Envelope, table: RouteTable) -> None:
         self.path = path
@@ -38,9 +38,11 @@ class TapRecording:
         try:
             self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
         except FileExistsError:
-            raise UsageError(f"{path} exists", "choose another name") from None
+            raise UsageError(f"{path} already exists", "choose another name") from None
         except OSError as error:
-            remedy = f"make the folder {path.parent}" if isinstance(error, FileNotFoundError) else "see to its folder"
+            remedy = (
+                f"make the folder {path.parent}" if isinstance(error, FileNotFoundError) else "make its folder writable"
+            )
             raise UsageError(f"cannot write {path}: {error.strerror}", f"{remedy}, or choose another by -o") from error
 
     @property
@@ -49,7 +51,7 @@ class TapRecording:
         return self._file.size
 
     def take(self, batch: Iterable[MirroredDatagram | Lost]) -> None:
-        """Add a batch. Call it every second, also with an empty batch, so that earlier ones are written."""
+        """Add a batch. Call this every second, also with an empty batch, so that earlier ones are written."""
         datagrams: list[MirroredDatagram] = []
         for each in batch:
             if isinstance(each, Lost):
@@ -62,7 +64,7 @@ class TapRecording:
             self._write()
 
     def close(self) -> None:
-        """Write what is left, and what readers seek by."""
+        """Write the remaining data, and the index for readers."""
         self._write()
         try:
             self._file.close()
@@ -78,18 +80,18 @@ class TapRecording:
             self._file.write(chunk)
             self._file.sync()
         except OSError as error:
-            raise UsageError(f"cannot go on writing {self.path}: {error.strerror}") from error
+            raise UsageError(f"cannot continue writing {self.path}: {error.strerror}") from error
 
 
 def on_time(recording: Recording, speed: float) -> Iterator[Recorded]:
-    """Yield each datagram when it is due; without waiting at an infinite speed.
+    """Yield each datagram when it is due; at an infinite speed, without waiting.
 
-    A clock that was set during the recording changes nothing.
+    Changes of the wall clock during the recording have no effect.
     """
     start, first = 0.0, None
     for found in recording.datagrams():
         if first is None:
-            start, first = time.monotonic(), found.steady  # not before: opening a large recording takes its time
+            start, first = time.monotonic(), found.steady  # not before: opening a large recording takes time
         wait = start + (found.steady - first) / 1e9 / speed - time.monotonic()
         if wait > 0:
             time.sleep(wait)
@@ -111,8 +113,8 @@ class Resent:
 class Replayer:
     """Sends to `to`, or to the listener's address in `table`; from `origin`, or from the sender's address.
 
-    The sender's address is that of the endpoint in `table`, else the recorded one. Where this computer does not have
-    it, any address is used, and `resent` says so.
+    The sender's address is that of the endpoint in `table`, else the recorded one. If this computer does not have it,
+    any address is used, and `resent` names the sender.
     """
 
     def __init__(self, table: RouteTable | None, to: Address | None, origin: Address | None) -> None:
@@ -123,7 +125,7 @@ class Replayer:
         self._sockets: dict[tuple[str, tuple[str, int], str], socket.socket] = {}
 
     def send(self, found: Recorded) -> None:
-        """Raises UsageError for a listener that has no address, TransportError for what the network does not take."""
+        """Raises UsageError for a listener that has no address, TransportError if the network cannot send."""
         key = (found.listener, found.peer, found.endpoint)
         if key not in self._sockets:
             if len(self._sockets) >= MOST_SOCKETS:
@@ -158,7 +160,7 @@ class Replayer:
         listeners = self._table.listeners if self._table is not None else {}
         if listener not in listeners:
             hint = did_you_mean(listener, listeners)
-            raise UsageError(f"the table has no listener '{listener}' as the recording has", hint or "give --to")
+            raise UsageError(f"the table does not have the listener '{listener}' of the recording", hint or "give --to")
         return udp.listener_address(listeners[listener])
 
     def _bound(self, found: Recorded) -> socket.socket:

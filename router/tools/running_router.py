@@ -1,4 +1,4 @@
-"""The HTTP client of a running router: its health and metrics, orders to it, and its tap."""
+"""The HTTP client of a running router: its health and metrics, commands to it, and its tap."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from router.table.model import RouteTable
 
 PATIENCE = 5.0
-"""Seconds; a router answers at once, and says once a second in a tap that it is there."""
+"""Seconds; a router answers immediately, and sends at least once per second in a tap."""
 
 PIECE = 1 << 18
 
 
 class Answer(NamedTuple):
-    """The JSON object of an answer; `ok`: the order was carried out."""
+    """The JSON object of an answer; `ok`: the command was executed."""
 
     ok: bool
     body: dict[str, Any]
@@ -48,21 +48,21 @@ class Health(NamedTuple):
 
 
 def url_of(table: RouteTable) -> str:
-    """Return where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
+    """Return the URL of the router that runs a table. Raises UsageError if the table has no `http.address`."""
     if table.http is None:
-        raise UsageError(f"{table.path} has no 'http.address', without which a running router cannot be asked")
+        raise UsageError(f"{table.path} has no 'http.address', so a running router cannot be reached")
     return url_at(table.http.value)
 
 
 def url_at(address: Address) -> str:
-    """The URL of a router whose `http.address` this is."""
+    """The URL of a router with this `http.address`."""
     from router.tools.udp import reachable
 
     return f"http://{reachable(address)}"
 
 
 def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
-    """Order a running router to do something. Raises TransportError where no router answers."""
+    """Send a command to a running router. Raises TransportError if no router answers."""
     with closing(_connection(url, patience)) as connection:
         response = _asked(connection, url, "POST", path)
         text = _read(response, url)
@@ -74,9 +74,9 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
 
 
 def metrics(url: str) -> Snapshot:
-    """Return the numbers of a running router, and when they were read (`at`: s, wall clock).
+    """Return the metrics of a running router, and when they were read (`at`: s, wall clock).
 
-    Raises TransportError where nobody answers, or something else than a router.
+    Raises TransportError if nothing answers, or something other than a router.
     """
     from router.observe.snapshot import COLLECTED_AT, parse_metrics
 
@@ -115,9 +115,9 @@ def tap(
     """Yield what a running router receives from now on: of these payload cases, from these endpoints; none means all.
     `only` is one of DECISIONS.
 
-    It comes in batches, of which there is an empty one each second while nothing comes. What is of no known payload
-    case comes in any case. Raises UsageError for what the router refuses, TransportError where none answers, and
-    later when it has ended.
+    It arrives in batches, each second an empty one while nothing is received. Datagrams of no known payload case are
+    always included. Raises UsageError if the router rejects the request, TransportError if none answers, and later
+    when the router stops.
     """
     asked = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(asked + ([("only", only)] if only else []))
@@ -136,9 +136,9 @@ def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[Mirro
         try:
             piece = response.read1(PIECE)
         except (OSError, http.client.HTTPException) as error:
-            raise TransportError(f"the router at {url} has fallen silent: {error}") from error
+            raise TransportError(f"the router at {url} does not answer any more: {error}") from error
         if not piece:
-            raise TransportError(f"the router at {url} has ended")
+            raise TransportError(f"the router at {url} has stopped")
         yield list(reader.take(piece))
 
 
@@ -159,7 +159,7 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
         connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
-        remedy = "is it running? -t TABLE or --url names another router"
+        remedy = "start it, or name another router with -t TABLE or --url"
         why = getattr(error, "strerror", None) or error  # without the number that OSError shows
         raise TransportError(f"{Problem(Kind.ROUTER_DOWN, {'instance': url}).words}: {why}", remedy) from error
 
@@ -177,7 +177,7 @@ def _read(response: http.client.HTTPResponse, url: str) -> bytes:
     try:
         return response.read()
     except (OSError, http.client.HTTPException) as error:
-        raise TransportError(f"the router at {url} broke off: {error}") from error
+        raise TransportError(f"the router at {url} broke the connection: {error}") from error
 
 
 def _first_line(text: bytes) -> str:

@@ -24,7 +24,7 @@ Key = tuple[str, str]
 """Endpoint and payload case."""
 
 PATIENCE = 2.0
-"""Seconds without an answer after which the headline asks for the router."""
+"""Seconds without an answer after which the headline asks whether the router runs."""
 
 _STYLES = {State.WAITING: "dim", State.OBEYING: "green", State.HALTED: "bold yellow", State.STOPPED: "bold red"}
 

@@ -1,6 +1,6 @@
 """All boards and the basestation of a route table on one machine, over real UDP.
 
-Each endpoint binds its own address, sends the payload cases of which the table names it as source, and receives.
+Each endpoint binds its own address, sends the payload cases that have it as their source, and receives.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """Nothing is sent by an endpoint, or of a payload case, from `start` to `end`, seconds since the start."""
+    """A time in which an endpoint, or a payload case, is not sent: `start` to `end`, seconds since the start."""
 
     name: str
     start: float
@@ -56,7 +56,7 @@ class Silence:
 
 
 def parse_silence(text: str) -> Silence:
-    """`basestation:5-8`, `manual_drive:5-` (for ever). Raises UsageError."""
+    """`basestation:5-8`, `manual_drive:5-` (without end). Raises UsageError."""
     found = _SILENCE.fullmatch(text)
     if found is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
@@ -67,16 +67,16 @@ def parse_silence(text: str) -> Silence:
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
-    """Raises UsageError for one whose name sends nothing."""
+    """Raises UsageError for a name that is neither a sender nor a payload case that is sent."""
     known = {name for stream in streams for name in (stream.endpoint, stream.case.name)} - {STRANGER}
     for silence in silences:
         if silence.name not in known:
             hint = did_you_mean(silence.name, known)
-            raise UsageError(f"nothing is sent that '{silence.name}' could silence", hint)
+            raise UsageError(f"no endpoint or payload case that is sent is called '{silence.name}'", hint)
 
 
 FEEDS = 5
-"""How often a command is sent at least within the timeout of its deadman."""
+"""Least number of commands within the timeout of their deadman."""
 
 
 def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
@@ -102,7 +102,7 @@ DRAIN = 256
 """Datagrams read from one socket before the next one is served."""
 
 PATIENCE = 0.2
-"""Seconds until `stop` and missing commands are noticed, at most."""
+"""Most seconds until `stop` and missing commands are noticed."""
 
 LATE = 1.0
 """Seconds behind schedule after which messages are skipped rather than sent in a burst."""
@@ -145,7 +145,7 @@ class Simulator:
         silences: Sequence[Silence] = (),
     ) -> None:
         if not table.listeners:
-            raise UsageError(f"{table.path} has no listeners: nobody receives what boards would send")
+            raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
         self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
@@ -198,8 +198,8 @@ class Simulator:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
                 raise UsageError(
                     str(error),
-                    "play a table with addresses of this machine, such as 127.0.0.2; "
-                    "routes/sim.yaml lays them over the rover's",
+                    "simulate a table with addresses of this computer, for example 127.0.0.2; "
+                    "routes/sim.yaml has such addresses for the rover's endpoints",
                 ) from error
             raise
         self._opened.append(opened)

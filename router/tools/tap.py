@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 
 class Condition:
-    """One expression for several payload cases; it may be about fields that not all of them have.
+    """One expression for several payload cases; it may use fields that not all of them have.
 
-    The library evaluates it, as it evaluates `when`. `failure` is the first case with a payload for which it has no
-    value, as in a division by zero: there it does not hold.
+    The library evaluates it like `when`. `failure` names the first case with a payload for which it has no value, for
+    example because of a division by zero: there it counts as false.
     """
 
     def __init__(self, text: str, envelope: Envelope, cases: Sequence[PayloadCase]) -> None:
-        """Raises UsageError where it suits none of the cases, StartError without a library."""
+        """Raises UsageError if it fits none of the cases, StartError without a library."""
         self.failure = ""
         self._conditions: dict[str, NativeCondition] = {}
         findings: dict[str, Diagnostic] = {}
@@ -55,7 +55,7 @@ class Condition:
             except (ExpressionError, TooLargeError) as error:
                 findings[case.name] = error.diagnostic
         if not self._conditions:
-            # The hint that is most like what was written.
+            # The hint closest to what was written.
             likely = max(findings.values(), key=lambda each: SequenceMatcher(a=each.hint, b=text).ratio())
             raise UsageError(f"--where: {likely.message}", likely.hint)
 
@@ -69,7 +69,7 @@ class Condition:
             return False
         holds = condition.holds(payload.SerializeToString(), source, received_at)
         if holds is None:
-            self.failure = self.failure or f"{case}: it has no value for all payloads, as in a division by zero"
+            self.failure = self.failure or f"{case}: for example, because of a division by zero"
         return bool(holds)
 
 
@@ -101,14 +101,14 @@ def _enums(message: MessageType) -> Iterator[Enum]:
 
 
 PATIENCE = 0.2
-"""Seconds after which Ctrl-C, and the end of --for, are noticed at the latest, while no message comes."""
+"""Most seconds until Ctrl-C and the end of --for are noticed while no message arrives."""
 
 
 @dataclass(frozen=True, slots=True)
 class TappedDatagram:
     """One datagram: time of arrival (local time), sender, bytes, and its payload or why it cannot be decoded.
 
-    `rejected` is the reason why no route of the router took it, if none did.
+    `rejected` is the reason if no route took it.
     """
 
     at: dt.datetime
@@ -129,7 +129,7 @@ class TappedDatagram:
         return f"{line} [{self.data.hex()}]" if with_hex else line
 
     def _repair(self, zeros: int) -> str:
-        return f"trimmed: {zeros} zeros put back" if zeros > 0 else f"padded: {-zeros} zeros taken off"
+        return f"trimmed: {zeros} zeros restored" if zeros > 0 else f"padded: {-zeros} zeros removed"
 
     def json(self, with_hex: bool) -> str:
         """One JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
@@ -182,9 +182,9 @@ def _local_time(at: int) -> dt.datetime:
 
 
 class RunningTap:
-    """Decodes what a running router receives. `missed` counts what it could not send, because this is too slow.
+    """Decodes what a running router receives. `missed` counts datagrams that were not sent because this is too slow.
 
-    Only what is of `cases` and fulfils `condition`; without both everything, also what is no payload.
+    Selects payloads of `cases` that fulfil `condition`; without both, everything, including what is no payload.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class RunningTap:
         self._condition = condition
 
     def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[TappedDatagram]]:
-        """Yield for each batch what is to be shown of it, which may be nothing."""
+        """Yield the part of each batch that is to be shown, which may be empty."""
         for batch in batches:
             shown = []
             for each in batch:
@@ -222,7 +222,7 @@ class RunningTap:
 
 
 def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
-    """Wait for messages, for ever; after PATIENCE without one, yield an empty list."""
+    """Yield messages without end; after PATIENCE without one, an empty list."""
     while True:
         yield [
             TappedMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
@@ -233,7 +233,7 @@ def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
 def listen(
     receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]
 ) -> Iterator[list[TappedDatagram]]:
-    """Wait for one datagram after the other, for ever; after PATIENCE without one, yield an empty list."""
+    """Yield datagrams one by one without end; after PATIENCE without one, an empty list."""
     receiver.settimeout(PATIENCE)
     while True:
         try:

@@ -17,7 +17,7 @@ WINDOW = 3.0
 
 
 class Order(enum.Enum):
-    """By what routes are sorted, and the key that chooses it. All but TABLE have the largest first."""
+    """An order of routes, and the key that selects it. All but TABLE have the largest first."""
 
     TABLE = "table"
     RATE = "rate"
@@ -32,8 +32,8 @@ class Order(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class TargetRow:
-    """A destination or topic of a route, or the clients of a gateway: delivered messages in all and per second, those
-    that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone;
+    """A destination or topic of a route, or the clients of a gateway: delivered messages in total and per second,
+    dropped and withheld ones. `lost` are those that were dropped although the table does not ask for it;
     `is_losing`: that is a problem now.
     """
 
@@ -52,7 +52,7 @@ class TargetRow:
 
 @dataclass(frozen=True, slots=True)
 class RouteRow:
-    """A route or a gateway: messages taken in all and per second, and its targets.
+    """A route or a gateway: messages taken in total and per second, and its targets.
 
     `age` is the time since its last message, `median` and `slowest` (of 100 messages) its latency: seconds, None where
     there is none yet. `is_tripped`: its deadman sends now.
@@ -87,10 +87,10 @@ class RouteRow:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """All routes, and what no route took, by reason.
+    """All routes, and by reason the datagrams that no route took.
 
-    `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints of which that is a problem.
-    `problems`: all that is wrong, in words; `calm`: what stands still because nobody drives.
+    `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints for which that is a problem.
+    `problems`: everything that is wrong, in words; `calm`: what is inactive because nobody drives.
     """
 
     routes: tuple[RouteRow, ...]
@@ -122,12 +122,12 @@ class Window:
 
     @property
     def ends(self) -> tuple[Snapshot, Snapshot]:
-        """The first and the last of them, which may be the same one. Raises IndexError before the first `add`."""
+        """The first and the last snapshot, which may be the same. Raises IndexError before the first `add`."""
         return self._snapshots[0], self._snapshots[-1]
 
 
 def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
-    """Counters only fall when the router starts anew."""
+    """Whether the router was restarted: only then do counters decrease."""
     return any(
         after.counts(metric).get(labels, 0.0) < count
         for metric in ("datagrams_received", "messages_received")
@@ -162,7 +162,7 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), no
 
 
 def ordered(rows: Sequence[RouteRow], order: Order) -> tuple[RouteRow, ...]:
-    """The largest first, what has no value last; those that are equal stay in the order of the table."""
+    """The largest first, rows without a value last; equal rows stay in the order of the table."""
     if order is Order.TABLE:
         return tuple(rows)
     return tuple(sorted(rows, key=lambda row: -_weight(row, order)))
@@ -207,7 +207,7 @@ def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence
 
 
 def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, str]]:
-    """With the metric that counts what each got. Of a gateway these are messages, and not the packets they went in."""
+    """Targets, after the metric that counts their messages. For a gateway it counts messages, not packets."""
     is_gateway = bool(after.of("messages_sent", route))
     for metric in DELIVERED:
         if not (is_gateway and metric == "datagrams_sent"):
@@ -235,7 +235,7 @@ def _dropped(route: str, target: str, snapshot: Snapshot) -> dict[str, int]:
 
 
 def _rate(before: Snapshot, after: Snapshot, metric: str, *labels: str) -> float:
-    """Per second; a router that was started anew counts from zero."""
+    """Per second; a restarted router counts from zero."""
     then, now, seconds = before.total(metric, *labels), after.total(metric, *labels), after.at - before.at
     return (now - then if now >= then else now) / seconds if seconds > 0 else 0.0
 
@@ -250,15 +250,15 @@ def _latencies(route: str, snapshot: Snapshot) -> dict[float, float]:
 
 
 def _new_latencies(before: Mapping[float, float], after: Mapping[float, float]) -> Mapping[float, float]:
-    """Those in between; all where there are none in between, and where the router was started anew."""
+    """Latencies between the snapshots; all of `after` if there are none, or if the router was restarted."""
     between = {bound: count - before.get(bound, 0.0) for bound, count in after.items()}
     return between if between.get(math.inf, 0.0) > 0 and min(between.values()) >= 0 else after
 
 
 def quantile(counts: Mapping[float, float], part: float) -> float | None:
-    """The value below which that part of all is, interpolated in its bucket. `counts`: how many are not above a bound.
+    """The quantile `part` of a histogram, interpolated in its bucket. `counts`: values up to each bound.
 
-    `inf` where it is beyond the last bound, None where there is nothing.
+    `inf` if it is beyond the last bound, None if there are no values.
     """
     bounds = sorted(counts)
     if not bounds or counts[bounds[-1]] <= 0:

@@ -21,11 +21,11 @@ from router.values import age_text, rate_text, shortened
 Cell = Callable[[RouteRow], Text]
 
 LATENCIES_FROM = 100
-"""Columns of a terminal from which on latencies are shown."""
+"""Least width of a terminal, in columns, for latencies to be shown."""
 
 _SHORT = 9
 _SHORTEST = 4
-"""Letters that are left of the name of a target at least, of several and of the only one shown."""
+"""Least letters shown of the name of a target: of several, and of the only one."""
 
 
 _LATENCIES: dict[str, Cell] = {
@@ -68,7 +68,7 @@ class RouteTable:
 
     @property
     def shown(self) -> range:
-        """The routes that are shown, by their number in this order. The last page is a full one."""
+        """The numbers, in this order, of the routes that are shown. The last page is a full one."""
         count, room = len(self.view.routes), max(self.height - 1, 0)
         first = max(min(self.first, count - room), 0)
         return range(first, min(first + room, count))
@@ -76,7 +76,7 @@ class RouteTable:
 
 @dataclass(frozen=True, slots=True)
 class _Fitted:
-    """A cell whose text depends on the width that its column gets."""
+    """A cell whose text depends on the width of its column."""
 
     text: Callable[[int], Text]
 
@@ -88,7 +88,7 @@ class _Fitted:
 
 
 def _name(row: RouteRow, width: int) -> Text:
-    """With a `!` while its deadman sends."""
+    """The name, with a `!` while its deadman sends."""
     name = f"!{row.route}" if row.is_tripped else row.route
     return Text(shortened(name, width), style="bold red" if row.is_tripped else "")
 
@@ -131,7 +131,7 @@ def _rate(rate: float) -> Text:
 
 
 def _drops(row: RouteRow) -> Text:
-    """Red and with a `!` while it goes on; yellow where messages were lost before."""
+    """Red and with a `!` while messages are lost; yellow if some were lost before."""
     text, style = reasons_text(row.dropped) or "-", "yellow" if row.lost else "dim"
     if row.is_losing:
         text, style = f"!{text}", "bold red"

@@ -1,4 +1,4 @@
-"""How `router top` looks on a terminal and in a file, and the keys that it takes."""
+"""The display of `router top` on a terminal and in a file, and its keys."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Screen:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """All of it, to be printed once."""
+    """The whole display, to be printed once."""
 
     view: View
     order: Order
@@ -144,7 +144,7 @@ def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:
-    """The endpoints below each other, in as many lines as they need; what has no room is counted."""
+    """The endpoints below each other, in as many lines as they need; those that do not fit are counted."""
     title, gap = "last heard  ", "  "
     items = [_heard(name, age, name in view.silent) for name, age in view.silence.items()]
     longest = max(map(len, items), default=0)
@@ -159,7 +159,7 @@ def _last_heard(view: View, width: int, most: int) -> list[Text]:
 
 
 def _heard(name: str, age: float | None, is_silent: bool) -> Text:
-    """Always as wide, so that nothing moves while ages change."""
+    """Text of constant width, so that nothing moves while ages change."""
     text = Text(f"{shortened(name, _LETTERS)} ")
     if is_silent:
         text = Text(f"!{text.plain}", style="bold red")

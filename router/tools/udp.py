@@ -164,7 +164,7 @@ class Sent:
 def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rate: float | None, sent: Sent) -> None:
     """Send `count` times (None: until interrupted) at `rate` Hz (None: at once), counting in `sent`.
 
-    The caller owns `sent` and has it after an interrupt, too. Raises TransportError.
+    The caller owns `sent`, which is also valid after an interrupt. Raises TransportError.
     """
     connect(sender, to)
     try:
@@ -189,16 +189,16 @@ def connect(sender: socket.socket, to: Address) -> None:
 
 def cannot_send(to: Address, error: OSError) -> TransportError:
     is_away = error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH)
-    remedy = "is it switched on, and this computer in its network?" if is_away else ""
+    remedy = "check that it is switched on, and that this computer is in its network" if is_away else ""
     return TransportError(f"cannot send to {to}: {error.strerror}", remedy)
 
 
 def send_once(sender: socket.socket, data: bytes) -> int:
-    """Send on a connected socket. Return 1 if an earlier datagram was refused, which it reports instead of sending."""
+    """Send on a connected socket. Return 1 if an earlier datagram was refused, which the first attempt reports."""
     try:
         sender.send(data)
     except ConnectionRefusedError:
-        with contextlib.suppress(ConnectionRefusedError):  # of another one, that came in between
+        with contextlib.suppress(ConnectionRefusedError):  # reported for another one in between
             sender.send(data)
         return 1
     return 0

@@ -135,7 +135,7 @@ def test_verbs_reach_a_listener_by_the_address_of_its_interface(site: Rover) -> 
         assert "listener 'lan': network interface lan0 is up" in found
         site.rover.ip("link", "set", "radio0", "down")
         found = site.rover.run(*router, "doctor", "-t", table, check=False)
-        assert "listener 'radio': network interface radio0 is down: nothing comes in" in found
+        assert "listener 'radio': network interface radio0 is down: the listener receives nothing" in found
 
 
 def mac(computer: Computer) -> str:

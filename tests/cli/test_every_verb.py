@@ -117,7 +117,7 @@ def test_a_table_that_the_environment_names_and_is_not_there_is_said(
 )
 def test_without_any_table_it_says_how_to_name_one(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == BAD_USAGE
-    how = "name a table by -t TABLE or ROUTER_TABLE, or write a first one: `router init DIR`"
+    how = "name a table with -t TABLE or ROUTER_TABLE, or write a first one: `router init DIR`"
     assert capsys.readouterr().err == f"router {words[0]}: there is no routes/rover.yaml here\nhelp: {how}\n"
 
 

@@ -97,7 +97,7 @@ def without_times(out: str) -> list[str]:
 
 def test_what_is_kept_of_a_table_is_told_by_command_line_and_folder(table: Path, told: Told) -> None:
     cache = table.parent / "cache/rover-router"
-    nothing = [f"nothing of this table is kept in {cache}: a start compiles it first"]
+    nothing = [f"no program of this table is kept in {cache}: a start compiles the table first"]
     assert told(table) == nothing
     other = table.with_name("other.yaml")
     other.write_text(table.read_text())
@@ -130,7 +130,7 @@ def test_a_kept_program_of_another_python_is_told_and_not_judged(
     with monkeypatch.context() as patch:
         patch.setattr(sys, "executable", "/opt/python")
         keep(table, "router", "run")
-    assert told(table)[-1] == "  of another Python, /opt/python, whose `router explain` says whether a start uses it"
+    assert told(table)[-1] == "  made by another Python, /opt/python: its `router explain` says whether a start uses it"
 
 
 def test_a_file_that_no_start_can_use_is_named(table: Path, told: Told) -> None:
@@ -139,9 +139,9 @@ def test_a_file_that_no_start_can_use_is_named(table: Path, told: Told) -> None:
     swapped = path.with_name("00000000.program")
     path.rename(swapped)
     why = "it is of another command line, folder or Python"
-    assert told(table)[0] == f"{swapped} is no kept program that a start can use: {why}"
+    assert told(table)[0] == f"{swapped} cannot be used as a kept program: {why}"
     swapped.write_bytes(swapped.read_bytes()[:-1])
-    assert told(table)[0] == f"{swapped} is no kept program that a start can use: it is truncated"
+    assert told(table)[0] == f"{swapped} cannot be used as a kept program: it is truncated"
 
 
 def test_of_a_router_that_runs_it_says_what_its_next_start_does(table: Path) -> None:

@@ -47,7 +47,7 @@ def listening(*options: str) -> Iterator[tuple[subprocess.Popen[str], tuple[str,
     command = [*LISTEN, f"udp://127.0.0.1:{port}", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        assert process.stderr.readline() == f"listening: udp 127.0.0.1:{port}; Ctrl-C ends it\n"
+        assert process.stderr.readline() == f"listening: udp 127.0.0.1:{port}; press Ctrl-C to stop\n"
         yield process, ("127.0.0.1", port)
 
 

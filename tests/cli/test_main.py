@@ -122,5 +122,5 @@ def test_without_what_the_headers_declare_a_sentence_says_what_to_do() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (
         BAD_TABLE,
         "",
-        "router validate: router/declared.py was not made of the present headers\nhelp: run 'make setup'\n",
+        "router validate: router/declared.py does not match the headers of the carrier\nhelp: run 'make setup'\n",
     )

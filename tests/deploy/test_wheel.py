@@ -214,7 +214,7 @@ def test_the_examples_are_copied_and_work_where_they_are(routed: Router, package
     shutil.rmtree(copied / "schemas")
     before = contents(copied)
     again = routed("init", "--rover", ".")
-    assert (again.returncode, again.stderr) == (2, "router init: routes is there already; nothing was written\n")
+    assert (again.returncode, again.stderr) == (2, "router init: routes already exists; nothing was written\n")
     assert contents(copied) == before
 
 
@@ -229,8 +229,8 @@ def test_the_lock_of_the_installation_is_not_written(routed: Router, packages: P
     refused = routed("schema", "lock", "--protos", shipped)
     assert refused.returncode == 2
     assert refused.stderr == (
-        f"router schema: {shipped}/envelope.lock.json belongs to the installed router, and is lost when that is "
-        "upgraded\nhelp: copy the protos with `router init --rover DIR`, and name yours: --protos protos\n"
+        f"router schema: {shipped}/envelope.lock.json belongs to the installed router: the next upgrade overwrites "
+        "it\nhelp: copy the protos with `router init --rover DIR`, and name the copy: --protos protos\n"
     )
     assert routed("new", "SensorBoardMore", "--number", "99", "--board", "sensor").returncode == 2
     assert contents(packages) == before

@@ -93,7 +93,7 @@ def test_tables_for_another_network_are_told_as_such(
     assert found.code == (new != FORWARD)
     senders = ", ".join(f"a stranger at 192.168.0.{number}" for number in (10, 30, 99))
     assert found.lines[-2:] == [
-        f"neither table has an endpoint where the datagrams came from: {senders};",
+        f"neither table has an endpoint for any sender of the recording: {senders};",
         "compare tables with the addresses of the recording",
     ]
 

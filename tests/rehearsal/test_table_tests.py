@@ -251,7 +251,7 @@ def test_failure_has_its_place_in_test_and_table(tmp_path: Path) -> None:
     for span, shown in ((failure.span, "2"), (failure.table.span, "radians(gyro_x)")):
         line = Path(span.file).read_text().splitlines()[span.line - 1]
         assert line[span.column - 1 : span.end_column - 1] == shown
-    assert failure.table.note == "what fills angular_velocity.x"
+    assert failure.table.note == "angular_velocity.x is filled here"
 
 
 DIFFERENCES = [
@@ -342,7 +342,7 @@ def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
     for failure in found:
         assert failure.message == (
             "before this step, at 500 ms manual_brake {brake: true} is sent to driving_board by the deadman of "
-            "drive_motor, and so on, 2 in all; no step expects it"
+            "drive_motor, and so on, 2 in total; no step expects it"
         )
         assert failure.table is not None
         assert failure.table.note == "sent by this deadman"
@@ -362,9 +362,12 @@ def test_what_happened_in_a_failed_step_is_told_in_order_with_its_places(tmp_pat
     assert [line.replace(f"{tmp_path}/", "") for line in step.told] == [
         "imu_info takes a message from sensor_board",
         "imu_info {accel_x: 0.5} is sent to basestation (table.yaml:17:20)",
-        "imu_info withholds one from recorder (table.yaml:17:60)",
+        "imu_info withholds a message from recorder (table.yaml:17:60)",
         "{accel_x: 0.5} is published on imu_data (table.yaml:19:10)",
-        "imu/data_raw misses one as mapping_error (table.yaml:24:53: angular_velocity.y: division by zero)",
+        (
+            "a message for imu/data_raw is dropped as mapping_error "
+            "(table.yaml:24:53: angular_velocity.y: division by zero)"
+        ),
     ]
     assert [step.told for step in other.failed] == [[]]
 
@@ -387,7 +390,7 @@ IN_MEANING = [
         "payload case 'imu'",
     ),
     ("{given: {case: imu_info, from: sensor}, expect: nothing}", Code.UNKNOWN_ENDPOINT, "'sensor'"),
-    ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "say which listener"),
+    ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "name the listener"),
     ("{given: {case: imu_info, from: sensor_board, listener: x}, expect: nothing}", Code.BAD_VALUE, "listener 'x'"),
     ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
     (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
@@ -395,29 +398,29 @@ IN_MEANING = [
     (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
     ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
     ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),
-    ("{expect: {sent: basestation}}", Code.BAD_VALUE, "no datagram was given in this step"),
+    ("{expect: {sent: basestation}}", Code.BAD_VALUE, "needs a datagram that is given"),
     ("{expect: {published: {imu: {}}}}", Code.BAD_VALUE, "no route that publishes on 'imu'"),
     ("{expect: {published: {imu_data: {accel: 1}}}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
-    ("{expect: {published: {imu_data: unchanged}}}", Code.BAD_VALUE, "no fields were given"),
+    ("{expect: {published: {imu_data: unchanged}}}", Code.BAD_VALUE, "needs fields that are given"),
     ("{expect: {dropped: {basestation: lost}}}", Code.BAD_VALUE, "no reason 'lost'"),
     ("{expect: {dropped: {nobody: stale}}}", Code.BAD_VALUE, "no route to 'nobody'"),
     ("{expect: {route: imu}}", Code.BAD_VALUE, "no route 'imu'"),
     ("{expect: {filtered: nobody}}", Code.BAD_VALUE, "no route to 'nobody'"),
-    ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
-    ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, before the 2 s"),
-    ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
+    ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "has no 'expect'"),
+    ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, earlier than the 2 s"),
+    ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' is beside 'steps'"),
     (
         f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
         Code.BAD_VALUE,
-        "1.999 s, before the 2 s",
+        "1.999 s, earlier than the 2 s",
     ),
-    ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1 s"),
-    ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
+    ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, earlier than the 1 s"),
+    ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "stops the router"),
     (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
-    ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
-    ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "'-1' is no tolerance"),
-    ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is no number to be near"),
-    ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is no number to be near"),
+    ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is not a tolerance"),
+    ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "the tolerance '-1' is negative"),
+    ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is not a number to be near"),
+    ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is not a number to be near"),
 ]
 
 

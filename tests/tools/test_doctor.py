@@ -180,8 +180,8 @@ def test_an_address_of_a_gateway_that_no_interface_has_is_told(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("variables", "networks", "warned"),
     [
-        ({}, ["lo", "eth0", "wlan0"], "by eth0, wlan0"),
-        ({"ROS_DOMAIN_ID": "0", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, ["lo", "eth0"], "by eth0"),
+        ({}, ["lo", "eth0", "wlan0"], "on eth0, wlan0"),
+        ({"ROS_DOMAIN_ID": "0", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, ["lo", "eth0"], "on eth0"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, ["lo", "eth0"], None),
         ({"ROS_DOMAIN_ID": "42"}, ["lo", "eth0"], None),
         ({}, ["lo"], None),
@@ -196,7 +196,7 @@ def test_an_open_ros_domain_is_a_warning(
     topic = "ph_info: {source: sensor_board, topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]"
     program = rewritten(table, "ph_info: {source: sensor_board, destinations: [basestation]", topic)
     found = open_domain(program, variables)
-    assert [(each.grade, each.text.partition("looked for ")[2]) for each in found] == (
+    assert [(each.grade, each.text.partition("discovery ")[2]) for each in found] == (
         [(Grade.WARNING, warned)] if warned else []
     )
 
@@ -246,7 +246,7 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     assert found.grade is Grade.WARNING
     assert "sysctl -w net.core.rmem_max=65536" in found.remedy
     (tmp_path / "rmem_max").unlink()  # as in a container on many kernels
-    assert gist(receive_buffers(compiled(table)), "the kernel does not say here") == [(Grade.WARNING, True)]
+    assert gist(receive_buffers(compiled(table)), "the kernel does not show here") == [(Grade.WARNING, True)]
 
 
 def recorded(table: Path, folder: Path, keep: str) -> Program:
@@ -258,8 +258,8 @@ def recorded(table: Path, folder: Path, keep: str) -> Program:
     ("folder", "keep", "grade", "text"),
     [
         ("later", "64MiB", Grade.FINE, "later, with 100 MiB free"),
-        (".", "4GiB", Grade.WARNING, "room for 100 MiB, `retention` says 4096"),
-        ("file/below", "4GiB", Grade.PROBLEM, "file is a file, and no folder"),
+        (".", "4GiB", Grade.WARNING, "room for 100 MiB, `retention` is 4096"),
+        ("file/below", "4GiB", Grade.PROBLEM, "file is a file, not a folder"),
     ],
 )
 def test_recordings_need_a_folder_with_room(
@@ -413,13 +413,13 @@ def test_who_sends_in_place_of_an_endpoint_that_answers_no_ping_is_named(
     labels = {"endpoint": "sensor_board", "sender": "127.0.0.20"}
     with serving(compiled(table), Problem(Kind.ENDPOINT_NEVER_HEARD, labels)):
         found = [each.text for each in examine(table, {}) if each.about == "endpoints" and each.grade is Grade.WARNING]
-    assert found == ["sensor_board: 127.0.0.30 does not answer a ping, and 127.0.0.20 sends what it should"]
+    assert found == ["sensor_board: 127.0.0.30 does not answer a ping, but 127.0.0.20 sends its payloads"]
 
 
 def test_a_router_that_runs_another_table_is_told(table: Path) -> None:
     with serving(compiled(table)):
         rewritten(table, "version: 1", "version: 1  # changed")
-        assert texts(told(table), Grade.WARNING) == ["it runs another table than this file"]
+        assert texts(told(table), Grade.WARNING) == ["its table differs from this file"]
 
 
 def test_the_ports_of_a_running_router_are_not_a_problem(table: Path) -> None:

@@ -60,21 +60,21 @@ def test_a_packet_whose_time_begins_like_a_document_is_a_packet() -> None:
     ("data", "complaint"),
     [
         (b"", "no packet"),
-        (packet(b""), "no JSON"),
-        (packet(b"[]"), "JSON that is no object"),
-        (packet(b'{"x":\xff}'), "no JSON: .*decode"),
+        (packet(b""), "not JSON"),
+        (packet(b"[]"), "JSON that is not an object"),
+        (packet(b'{"x":\xff}'), "not JSON: .*decode"),
         (packet(b"{}", is_compressed=True), "no zstd frame"),
         (packet(b'{"x":' + b"[" * 100 + b"]" * 100 + b"}"), "more than 64 levels"),
-        (packet(b'{"x":' + b"[" * 100_000 + b"]" * 100_000 + b"}"), "no JSON"),
-        (packet(b'{"name":"T","namespace":"p","fields":[{"name":"x"}]}'), "no schema: KeyError"),
-        (packet(b'{"name":"T","namespace":"p","fields":3}'), "no schema: TypeError"),
-        (packet(b'{"name":"T","namespace":"p","fields":[{"name":[],"type":"bool","is_array":0}]}'), "no schema"),
-        (b'{"op":"schema","type":"t","time":1}', "no schema"),
+        (packet(b'{"x":' + b"[" * 100_000 + b"]" * 100_000 + b"}"), "not JSON"),
+        (packet(b'{"name":"T","namespace":"p","fields":[{"name":"x"}]}'), "not a schema: KeyError"),
+        (packet(b'{"name":"T","namespace":"p","fields":3}'), "not a schema: TypeError"),
+        (packet(b'{"name":"T","namespace":"p","fields":[{"name":[],"type":"bool","is_array":0}]}'), "not a schema"),
+        (b'{"op":"schema","type":"t","time":1}', "not a schema"),
         (b'{"op":"data","topic":"/t","type":"t","data":{}}', "without time or type"),
         (b'{"op":"data","topic":"/t","type":"t","time":1,"data":[]}', "without topic or data"),
-        (b'{"op":"data"', "no JSON"),
-        (b"{", "no JSON"),
-        (b'{"x":1,  "y":2}', "does not say what it is"),
+        (b'{"op":"data"', "not JSON"),
+        (b"{", "not JSON"),
+        (b'{"x":1,  "y":2}', "of unknown kind"),
     ],
 )
 def test_what_means_nothing_is_refused_with_the_reason(data: bytes, complaint: str) -> None:
@@ -141,7 +141,7 @@ def test_what_else_is_heard_is_shown_too() -> None:
     assert line(Remark(refusal)) == "op=rejected reason=invalid topic=/imu"
     topics = {"op": "topics", "time": 5.0, "topics": [{"topic": "/a", "rate": 1.0}, {"topic": "/b", "rate": 1.0}, None]}
     assert line(Remark(topics)) == "topics 3: /a /b"
-    assert line(Problem("no JSON", b"\xff\xff")) == "undecodable (no JSON): ffff"
+    assert line(Problem("not JSON", b"\xff\xff")) == "undecodable (not JSON): ffff"
     assert line(Problem("empty", b"")) == "undecodable (empty): no bytes"
     assert line(Problem("long", b"x" * 61)) == f"undecodable (long): {'78' * 60}...(61 bytes)"
 
@@ -160,5 +160,5 @@ def test_json_is_what_was_received() -> None:
     assert json.loads(json_line(Schema(NOON, "/imu", "p/msg/T", schema, {}))) == said
     assert "topic" not in json.loads(json_line(Schema(NOON, "", "p/msg/T", schema, {})))
     assert json.loads(json_line(Remark({"op": "topics"}))) == {"op": "topics"}
-    assert json.loads(json_line(Problem("no JSON", b"\xff"))) == {"problem": "no JSON", "bytes": 1, "hex": "ff"}
+    assert json.loads(json_line(Problem("not JSON", b"\xff"))) == {"problem": "not JSON", "bytes": 1, "hex": "ff"}
     assert "\n" not in json_line(message(data))

@@ -131,7 +131,7 @@ def test_tcp_connects_again_when_the_gateway_went_away(port: socket.socket, said
             gateway.sendall(b'{"n":2}\n')
             [second] = source.arrivals(5)
     assert said == [
-        f"tcp {address} has gone, after 6 bytes of a message; trying again",
+        f"tcp {address} has closed, after 6 bytes of a message; trying again",
         f"tcp {address} is connected",
     ]
     assert (first.data, second.data) == (b'{"n":1}', b'{"n":2}')
@@ -157,7 +157,7 @@ def test_tcp_leaves_a_gateway_whose_stream_makes_no_sense(port: socket.socket, s
         assert received(source, 1) == [b"abc"]
         until(source, lambda: said)
         assert gateway.recv(1) == b""
-    assert "is left (a packet of 4294967295 bytes); trying again" in said[0]
+    assert "was disconnected (a packet of 4294967295 bytes); trying again" in said[0]
 
 
 @contextmanager
@@ -196,7 +196,7 @@ def test_a_websocket_is_connected_again_when_the_gateway_went_away(said: Said) -
 
     with websocket_gateway(handler) as address, closing(WebsocketSource(address, said.append)) as source:
         assert received(source, 2) == [b"{}", b"{}"]
-    assert said[0].startswith(f"websocket {address} has gone (")
+    assert said[0].startswith(f"websocket {address} has closed (")
     assert said[1] == f"websocket {address} is connected"
 
 
@@ -210,7 +210,7 @@ def test_what_is_no_websocket_is_said(port: socket.socket, said: Said) -> None:
     answering.start()
     with closing(WebsocketSource(Address(*port.getsockname()), said.append)) as source:
         assert list(source.arrivals(0.01)) == []
-        assert "cannot be reached (it is no websocket: " in said[0]
+        assert "cannot be reached (it is not a websocket: " in said[0]
         assert "404" in said[0]
     answering.join()
 

@@ -94,7 +94,7 @@ def test_an_address_that_this_computer_lacks_is_told(
     path = recorded(tmp_path / "it.mcap", seen(imu(), peer=ELSEWHERE))
     assert main(["replay", str(path), "--to", place(receiver), "--speed", "max"]) == 0
     assert [data for data, _ in received(receiver, 1)] == [imu()]
-    assert "lacks the addresses of 198.51.100.7:5000 (198.51.100.7)" in capsys.readouterr().err
+    assert "does not have the addresses of 198.51.100.7:5000 (198.51.100.7)" in capsys.readouterr().err
 
 
 def test_nobody_who_listens_is_an_error(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,7 +106,10 @@ def test_a_listener_that_the_table_lacks_is_told(
     path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["replay", str(path), "--table", table(tmp_path, 5000, "rovers")]) == 2
-    assert "no listener 'rover' as the recording has\nhelp: did you mean 'rovers'?" in capsys.readouterr().err
+    assert (
+        "the table does not have the listener 'rover' of the recording\nhelp: did you mean 'rovers'?"
+        in capsys.readouterr().err
+    )
     assert main(["replay", str(path)]) == 2
     assert "give --to" in capsys.readouterr().err
 

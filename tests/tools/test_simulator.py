@@ -144,7 +144,9 @@ def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> N
 
 
 def test_names_of_nobody_are_told(wire: Wire, table_path: Callable[..., Path]) -> None:
-    with pytest.raises(UsageError, match=r"nothing is sent that 'statoin' could silence; did you mean 'station'\?"):
+    with pytest.raises(
+        UsageError, match=r"no endpoint or payload case that is sent is called 'statoin'; did you mean 'station'\?"
+    ):
         Simulator(wire, read_table(table_path()), seed=1, silences=[Silence("statoin", 0.0, 1.0)])
     with pytest.raises(UsageError, match=r"table.yaml:\d+:\d+: there is no endpoint 'bord'; did you mean 'board'\?"):
         Simulator(wire, read_table(table_path(source="bord")), seed=1)

@@ -28,8 +28,8 @@ def test_a_line_tells_time_peer_case_and_fields(wire: Wire) -> None:
 
 
 def test_repairs_are_told(wire: Wire) -> None:
-    assert tapped_datagram(0, "board", b"\x12", wire).line(with_hex=False).endswith("(trimmed: 1 zeros put back)")
-    assert tapped_datagram(0, "board", b"\x12\0\0\0", wire).line(with_hex=False).endswith("(padded: 2 zeros taken off)")
+    assert tapped_datagram(0, "board", b"\x12", wire).line(with_hex=False).endswith("(trimmed: 1 zeros restored)")
+    assert tapped_datagram(0, "board", b"\x12\0\0\0", wire).line(with_hex=False).endswith("(padded: 2 zeros removed)")
 
 
 def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> None:

@@ -51,7 +51,7 @@ def test_send_goes_from_endpoint_to_listener_and_says_when_the_router_will_not_t
         data, peer = router.recvfrom(100)
         assert (data, peer[0], capsys.readouterr().err) == (EMPTY_PLAIN, "127.0.6.10", "")
         assert main(words) == 0
-        assert "the table takes plain from station only\nhelp: add --from station" in capsys.readouterr().err
+        assert "the table accepts plain only from station\nhelp: add --from station" in capsys.readouterr().err
 
 
 def test_listen_prints_the_envelopes_that_arrive(table_path: Callable[..., Path]) -> None:
@@ -65,7 +65,7 @@ def test_listen_prints_the_envelopes_that_arrive(table_path: Callable[..., Path]
         board.bind(("127.0.6.30", 0))
         assert tap.stdout is not None
         assert tap.stderr is not None
-        assert tap.stderr.readline() == f"listening on {station}; Ctrl-C ends it\n"
+        assert tap.stderr.readline() == f"listening on {station}; press Ctrl-C to stop\n"
         board.sendto(EMPTY_PLAIN, station)
         assert tap.stdout.read().split(" ", 1)[1] == "board plain (all default)\n"
     assert tap.returncode == 0
@@ -90,10 +90,10 @@ def test_listen_waits_for_a_topic_and_prints_what_it_carries() -> None:
     command = [sys.executable, "-m", "router", "listen", "topic://tap_test", "--count", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
         assert tap.stderr is not None
-        assert tap.stderr.readline() == "waiting for a publisher of tap_test; Ctrl-C ends it\n"
+        assert tap.stderr.readline() == "waiting for a publisher of tap_test; press Ctrl-C to stop\n"
         with publishing(Point(x=1.5), Point(z=-2.0)):
             out, err = tap.communicate(timeout=60)
-    assert err == "listening to tap_test of geometry_msgs/msg/Point; Ctrl-C ends it\n"
+    assert err == "listening to tap_test of geometry_msgs/msg/Point; press Ctrl-C to stop\n"
     assert [line.split(" ", 1)[1] for line in out.splitlines()] == [
         "geometry_msgs/msg/Point x=1.5",
         "geometry_msgs/msg/Point z=-2.0",
@@ -105,7 +105,7 @@ def test_listen_that_waits_for_a_topic_ends_with_a_signal(number: signal.Signals
     command = [sys.executable, "-m", "router", "listen", "topic://nobody_publishes_this"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
         assert tap.stderr is not None
-        assert tap.stderr.readline() == "waiting for a publisher of nobody_publishes_this; Ctrl-C ends it\n"
+        assert tap.stderr.readline() == "waiting for a publisher of nobody_publishes_this; press Ctrl-C to stop\n"
         tap.send_signal(number)
         out, err = tap.communicate()
     assert (tap.returncode, out, err) == (0, "", "")
