@@ -38,7 +38,7 @@ class Wire:
     envelope: Envelope
 
     def case(self, name: str) -> PayloadCase:
-        """Raises UsageError for a payload case that does not exist."""
+        """Return a payload case. Raises UsageError if it does not exist."""
         if name not in self.envelope.cases:
             hint = did_you_mean(name, self.envelope.cases)
             raise UsageError(f"{self.envelope.name} has no payload case '{name}'", hint)
@@ -84,7 +84,7 @@ def wire_of_table(table: RouteTable) -> Wire:
 
 
 def wire_of_protos(root: Path) -> Wire:
-    """The envelope `PBEnvelope.payload` of a folder of `.proto` files. Raises TableError."""
+    """Return the envelope `PBEnvelope.payload` of a folder of `.proto` files. Raises TableError."""
     span = SourceSpan(shown_path(root))
     schema = load_protos(Located(root, span), Located(ENVELOPE, span))
     return Wire(find_envelope(schema, Located(ONEOF, span)))

@@ -173,7 +173,7 @@ class Diagnostic:
         return self.code.severity
 
     def __str__(self) -> str:
-        """The one-line form, `file:line:column: severity[code]: what; hint`."""
+        """Return the one-line form, `file:line:column: severity[code]: what; hint`."""
         hint = f"; {self.hint}" if self.hint else ""
         return f"{self.span}: {self.severity.value}[{self.code.value}]: {self.message}{hint}"
 
@@ -212,7 +212,7 @@ class OperatorError(RouterError):
         self.hint = hint
 
     def __str__(self) -> str:
-        """The one-line form, `what; hint`."""
+        """Return the one-line form, `what; hint`."""
         return f"{self.what}; {self.hint}" if self.hint else self.what
 
 
@@ -259,7 +259,7 @@ def nearest_path(path: Path) -> Path | None:
 
 
 def plural(count: int, noun: str) -> str:
-    """`1 error`, `2 errors`."""
+    """Return `1 error`, `2 errors`."""
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
@@ -316,7 +316,7 @@ def _common_start(names: Collection[str]) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
-    """A hint for a name that does not exist: the nearest known one, else a short list, else nothing."""
+    """Return a hint for a name that does not exist: the most similar known one, else a short list, else nothing."""
     candidates = sorted(set(known))
     if close := nearest(name, candidates, closeness):
         return f"did you mean '{close}'?"
@@ -331,7 +331,7 @@ MOST_MEANT = 3
 
 
 def one_of(names: Sequence[str]) -> str:
-    """A hint that offers several names; empty if there are none."""
+    """Return a hint that offers several names; empty if there are none."""
     quoted = [f"'{name}'" for name in names[:MOST_MEANT]]
     if not quoted:
         return ""

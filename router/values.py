@@ -208,23 +208,23 @@ def words(tree: Tree, path: str = "") -> Iterator[str]:
 
 
 def list_text(first: Iterable[str], length: int, limit: int) -> str:
-    """`[1,2]` of the first `limit` elements at most; `[1,2,...](360)` where there are more."""
+    """Return `[1,2]` with at most `limit` elements; `[1,2,...](360)` if there are more."""
     listed = ",".join(first)
     return f"[{listed},...]({length})" if length > limit else f"[{listed}]"
 
 
 def one_line(listed: Iterable[str], empty: str = "(all default)") -> str:
-    """The words as one line, or `empty`."""
+    """Return the words as one line, or `empty`."""
     return " ".join(word if word.isprintable() and " " not in word else repr(word) for word in listed) or empty
 
 
 def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
-    """A protobuf message as one line: the fields that are not their default."""
+    """Print a protobuf message as one line, without fields that have their default."""
     return one_line(words(protobuf_tree(message, kind, digits)))
 
 
 def scalar_text(value: Any, kind: Type, digits: int | None = None) -> str:
-    """A scalar of this type; an enum by name, bytes as hex. `digits` as in float_text."""
+    """Print a scalar of this type: an enum by name, bytes as hex. `digits` as in float_text."""
     if isinstance(kind, Enum):
         return next((name for name, number in kind.values if number == value), str(value))
     return plain_text(value, kind.bits if isinstance(kind, Float) else 64, digits)
@@ -261,7 +261,7 @@ def float_text(value: float, bits: int, digits: int | None = None) -> str:
 
 
 def age_text(seconds: float | None) -> str:
-    """`0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
+    """Print an age: `0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
     if seconds is None:
         return "never"
     if seconds < 10:
@@ -363,5 +363,5 @@ def _is_array(value: Any) -> bool:
 
 
 def _elements(array: Any) -> list[Any]:
-    """The elements as Python's own numbers."""
+    """Return the elements as Python numbers."""
     return array.tolist() if hasattr(array, "tolist") else list(array)

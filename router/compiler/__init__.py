@@ -1,4 +1,4 @@
-"""The meaning of a route table: from a RouteTable and the types to findings or a Program."""
+"""Compilation of a route table: from a RouteTable and the types to findings or a Program."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""ROS messages as CDR bytes: formats of scalars, strings and lengths, and bytes that are known when the table is read.
+"""ROS messages as CDR bytes: formats of scalars, strings and lengths, and bytes that are known at compile time.
 
-Plain CDR, little-endian (XCDR1, as Fast DDS and Cyclone DDS speak it): four bytes of header, then each scalar aligned
-to its own size, counted from behind the header. Writers append to `data`, the message without its header. What cannot
-be written raises MappingError, struct.error or UnicodeError.
+Plain CDR, little-endian (XCDR1, as in Fast DDS and Cyclone DDS): four bytes of header, then each scalar aligned to its
+own size, counted from the end of the header. Writers append to `data`, the message without its header. Invalid values
+raise MappingError, struct.error or UnicodeError.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _INTEGERS = {8: "B", 16: "H", 32: "I", 64: "Q"}
 
 
 def scalar_format(declared: Type) -> str:
-    """The struct letter of a primitive type other than a string."""
+    """Return the struct letter of a primitive type other than a string."""
     match declared:
         case Bool():
             return "?"
@@ -35,7 +35,7 @@ def scalar_format(declared: Type) -> str:
         case Float():
             return "f" if declared.bits == 32 else "d"
         case _:
-            raise AssertionError(f"{declared} is no scalar of a ROS message")
+            raise AssertionError(f"{declared} is not a scalar of a ROS message")
 
 
 def put_text(data: bytearray, text: str) -> None:
@@ -49,10 +49,7 @@ def put_text(data: bytearray, text: str) -> None:
 
 
 def put_wide_text(data: bytearray, text: str) -> None:
-    """Append a wstring: its length in UTF-16 code units, and each of those in 32 bits, as rmw_fastrtps does it.
-
-    There is no final NUL.
-    """
+    """Append a wstring like rmw_fastrtps: its length in UTF-16 code units, then each unit in 32 bits, without a NUL."""
     encoded = text.encode("utf-16-le")
     units = struct.unpack(f"<{len(encoded) // 2}H", encoded)
     put_length(data, len(units))
@@ -83,16 +80,16 @@ class Known(NamedTuple):
 
 
 NO_FIELDS = Known(b"\0", 1)
-"""A message without fields: IDL has none, so rosidl adds the byte `structure_needs_at_least_one_member`."""
+"""A message without fields: IDL does not allow it, so rosidl adds the byte `structure_needs_at_least_one_member`."""
 
 
 def known_length(length: int) -> Known:
-    """The length in front of a sequence."""
+    """Encode the length of a sequence."""
     return Known(struct.pack("<I", length), 4)
 
 
 def known_value(value: Any, declared: Type) -> Known:
-    """A value of a primitive type."""
+    """Encode a value of a primitive type."""
     if isinstance(declared, String):
         data = bytearray()
         (put_wide_text if declared.wide else put_text)(data, value)
@@ -102,7 +99,7 @@ def known_value(value: Any, declared: Type) -> Known:
 
 
 def known_default(declared: Type, default: Any) -> Iterator[Known]:
-    """The value that rclpy's constructor gives a field: `default`, or zeros and empty lists if that is None."""
+    """Encode the value that rclpy's constructor assigns: `default`, or zeros and empty lists if that is None."""
     match declared:
         case MessageType():
             for member in declared.fields:
@@ -135,7 +132,7 @@ def _zero(declared: Type) -> object:
 
 
 def message_size(plan: Record) -> tuple[int, bool]:
-    """The size of the CDR bytes with header, and whether it is exact; else strings and sequences count as empty."""
+    """Return the size of the CDR bytes with header, and whether it is exact: strings and sequences count as empty."""
     size, is_exact = 0, True
     for alignment, length, is_known in _sizes(plan):
         size += -size % alignment + length
@@ -144,7 +141,7 @@ def message_size(plan: Record) -> tuple[int, bool]:
 
 
 def _sizes(plan: Plan) -> Iterator[tuple[int, int, bool]]:  # noqa: C901 - a case a plan
-    """Alignment and size of each scalar, or of known bytes; and whether nothing comes with it that varies in size."""
+    """Yield alignment and size of each scalar, or of known bytes, and whether that size is fixed."""
     match plan:
         case Record():
             for _, member in plan.members:

@@ -1,6 +1,6 @@
-"""Check a table and everything that it refers to, and collect all findings.
+"""Check of a table and everything that it refers to. Collects all findings.
 
-The same check serves `validate`, `explain` and `run`.
+`validate`, `explain` and `run` use the same check.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Pause garbage collection, which would go through all that is made of a large table again and again, in vain."""
+    """Pause garbage collection, which would repeatedly traverse all objects of a large table without freeing any."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -44,7 +44,7 @@ def uncollected() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Checked:
-    """A table after all checks. `program` is None while there is an error among the findings."""
+    """A table after all checks. `program` is None if any finding is an error."""
 
     path: Path
     diagnostics: Sequence[Diagnostic]
@@ -63,14 +63,14 @@ class Checked:
 
     @cached_property
     def program(self) -> Program | None:
-        """Compiled when first asked for; None while there are errors."""
+        """The program, compiled on first use; None if there are errors."""
         return self.program_in(Counters())
 
     @uncollected()
     def program_in(self, counters: Counters) -> Program | None:
-        """Compile the program, which counts in `counters`; None while there are errors.
+        """Compile the program, which counts in `counters`; None if there are errors.
 
-        One that takes over from another program continues the counters of that one (`Counters.continued`).
+        A program that replaces another one continues its counters (`Counters.continued`).
         """
         from router.compiler.link import link
 
@@ -83,8 +83,8 @@ def check_table(
 ) -> Checked:
     """Check a table and everything that it refers to. Mistakes in these files are findings, never exceptions.
 
-    `environ` fills the table's variables, None means the process environment. Pass one `definitions` to
-    several calls to read `.proto` files and ROS interfaces once.
+    `environ` has the values of variables, by default the process environment. Pass one `definitions` to several calls
+    to read `.proto` files and ROS interfaces once.
     """
     table, findings = load_table(path, environ)
     if table is None:
@@ -128,14 +128,14 @@ def _has_errors(findings: Iterable[Diagnostic]) -> bool:
 
 
 def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: int) -> Mapping[str, BoardLimits]:
-    """What each endpoint that is a board can take; `limit` is the largest envelope in bytes."""
+    """Return the limits of each board by name; `limit` is the largest envelope in bytes."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
     return {each.name: BoardLimits(fields, limit, each.allow_non_finite) for each in boards}
 
 
 def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:
-    counted = {id(limits.fields): limits.fields for limits in boards.values()}  # boards have the fields in common
+    counted = {id(limits.fields): limits.fields for limits in boards.values()}  # boards share the fields
     sizes = {key: places(fields) for key, fields in counted.items()}
     for name, limits in boards.items():
         messages, lists = sizes[id(limits.fields)]
@@ -146,7 +146,7 @@ def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Ite
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:
-    """The protos of the table and its envelope. Raises TableError."""
+    """Return the protos of the table and its envelope. Raises TableError."""
     if table.envelope is None:
         return without_protos()
     schema = definitions.protos(table.envelope)

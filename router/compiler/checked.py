@@ -16,11 +16,11 @@ from router.types.protobuf import PayloadCase
 
 @dataclass(frozen=True, slots=True)
 class CheckedTarget:
-    """A target of a route, as the table declares it, with what its check has found.
+    """A target of a route, as the table declares it, with the results of its check.
 
-    `endpoint` is set for a destination, `type` for a topic that is published. Without a `plan` the datagram is
-    forwarded unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command
-    to it feeds or disarms.
+    `endpoint` is set for a destination, `type` for a published topic. Without a `plan`, the datagram is forwarded
+    unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command to this
+    target feeds or disarms.
     """
 
     declared: Destination | Topic
@@ -34,12 +34,12 @@ class CheckedTarget:
 
     @property
     def is_command(self) -> bool:
-        """Whether what it gets are commands: they go to a board, or feed or disarm a deadman."""
+        """Whether its messages are commands: they go to a board, or feed or disarm a deadman."""
         return bool(self.deadmen) or (self.endpoint is not None and self.endpoint.kind is EndpointKind.BOARD)
 
     @property
     def priority(self) -> Priority:
-        """Commands go first unless the route says something else."""
+        """The priority of the route; by default commands come first."""
         return self.declared_priority or (Priority.COMMAND if self.is_command else Priority.TELEMETRY)
 
     @property
@@ -58,7 +58,7 @@ class CheckedTarget:
 
     @property
     def is_deferred(self) -> bool:
-        """Whether messages to it may be deferred, and then sent by another thread."""
+        """Whether its messages may be deferred and then sent by another thread."""
         has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 
@@ -68,8 +68,8 @@ class CheckedSubscription:
     """A topic that an outbound route subscribes to, with a target for each destination.
 
     `when` is the topic's own. With `for_each`, a list, `when` and the targets are evaluated for each element: `item`
-    and `index` of `count`. `stamp` is the message's `header.stamp` (ns) where the route has a `ttl` and the type has
-    the stamp.
+    and `index` of `count`. `stamp` is the message's `header.stamp` (ns), if the route has a `ttl` and the type has a
+    stamp.
     """
 
     topic: Topic
@@ -92,9 +92,9 @@ class CheckedCollect:
 
 @dataclass(frozen=True, slots=True)
 class CheckedRoute:
-    """A route whose payload case exists. If it has findings of severity error, no program is made of it.
+    """A route whose payload case exists. If there are errors, it is not compiled.
 
-    `targets` are those of a route from UDP, `subscriptions` the topics of a route from ROS.
+    A route from UDP has `targets`, a route from ROS has `subscriptions`.
     """
 
     route: Route

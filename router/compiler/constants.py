@@ -1,6 +1,6 @@
-"""Messages of constants: what deadmen send in place of commands.
+"""Messages of constants, which deadmen send in place of commands.
 
-Their expressions are computed here, once. The bytes are those that `lowering` gives constants of any message.
+Their expressions are evaluated here, once. `lowering` encodes them like constants of any message.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ _RELATIONS: Mapping[tree.Relation, Callable[[Any, Any], bool]] = {
 
 
 def computed(plan: Record) -> Record:
-    """The plan with constants in place of expressions, which read no message. Raises MappingError."""
+    """Evaluate the expressions of a plan, which read no message. Raises MappingError."""
     with _failing():
         return _record(plan, {})
 
 
 def envelope_of(plan: Record, case: PayloadCase) -> bytes:
-    """The envelope of a computed payload. Raises MappingError."""
+    """Encode the envelope of a computed payload. Raises MappingError."""
     with _failing():
         return _bytes(protobuf_message(Lowering(Names({})), plan, case))
 
 
 def cdr_of(plan: Record) -> bytes:
-    """The CDR of a computed ROS message. Raises MappingError."""
+    """Encode a computed ROS message as CDR. Raises MappingError."""
     with _failing():
         return _bytes(cdr_message(Lowering(Names({})), plan))
 
@@ -65,7 +65,7 @@ def _bytes(placed: Sequence[Placed]) -> bytes:
 
 @contextmanager
 def _failing() -> Iterator[None]:
-    """Raise MappingError for a value that there is not, or that does not fit."""
+    """Raise MappingError for a value that does not exist or does not fit."""
     try:
         yield
     except (ArithmeticError, LookupError, ValueError, struct.error) as error:
@@ -73,7 +73,7 @@ def _failing() -> Iterator[None]:
 
 
 def scalars(plan: Record, fields: BoardMessage) -> Iterator[tuple[BoardField, object]]:
-    """The scalars of a computed payload, each with its field, as far as boards have bounds for it."""
+    """Yield the scalars of a computed payload with their fields, if boards have limits for them."""
     for member, made in plan.members:
         field = fields.get(member.number)
         for element in made.items if isinstance(made, Items) else (made,):
@@ -92,7 +92,7 @@ def _record(plan: Record, variables: _Variables) -> Record:
 
 
 def _computed(plan: Plan, variables: _Variables) -> Plan:
-    """The plan with constants in place of expressions."""
+    """Return the plan with constants in place of expressions."""
     match plan:
         case Leaf():
             return Leaf(plan.type, _constant(_value(plan.node, variables), plan), plan.span)
@@ -118,7 +118,7 @@ def _constant(value: Any, plan: Leaf) -> tree.Node:
 
 
 def _turns(lists: Sequence[tuple[str, tree.Node]], variables: _Variables) -> Iterator[_Variables]:
-    """The variables for the elements of lists side by side."""
+    """Yield the variables for each index of parallel lists."""
     values = [_value(node, variables) for _, node in lists]
     for elements in zip(*values, strict=True):
         yield {**variables, **{name: element for (name, _), element in zip(lists, elements, strict=True)}}
@@ -164,14 +164,14 @@ def _value(node: tree.Node, variables: _Variables) -> Any:  # noqa: C901, PLR091
 
 
 def _fitting(value: Any, kind: Kind) -> Any:
-    """The value. Raises MappingError for an integer outside of the range of its kind."""
+    """Return the value. Raises MappingError for an integer outside the range of its kind."""
     if isinstance(kind, IntKind) and not kind.low <= value <= kind.high:
         raise MappingError(f"{value} is outside {kind.low}..{kind.high}")
     return value
 
 
 def _result(node: tree.Call, arguments: Sequence[Any]) -> Any:
-    """The result of a function, or of one of `tree.CHECKS`."""
+    """Evaluate a function, or one of `tree.CHECKS`."""
     value, *others = arguments
     match node.function:
         case "fit":
@@ -196,16 +196,16 @@ def _of_size(value: str | bytes, most: int) -> str | bytes:
 
 
 def _of_enum(value: str | int, kind: Kind) -> int:
-    """The number of an enum's value, which is given by name or number."""
+    """Return the number of an enum's value, given by name or number."""
     assert isinstance(kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     for name, number in kind.enum.values:
         if value in (name, number):
             return number
-    raise MappingError(f"{value!r} is no value of {kind.enum.name}")
+    raise MappingError(f"{value!r} is not a value of {kind.enum.name}")
 
 
 def _sum(values: Sequence[Any], kind: Kind) -> Any:
-    """Of integers, each partial sum has to fit."""
+    """Return the sum. Each partial sum of integers must fit."""
     if isinstance(kind, IntKind):
         limits = UINT64 if kind.high > INT64.high else INT64
         return functools.reduce(lambda total, value: _fitting(total + value, limits), values, 0)

@@ -1,7 +1,7 @@
 """From a checked value to the plan of the field that it fills.
 
 Messages are converted field by field, lists element by element, scalars by a node that converts or checks them. No
-conversion is lossy unless the table says so. Known ranges are checked here, rounded floats at run time, where a value
+conversion is lossy unless the table requests it. Known ranges are checked here, rounded floats at run time: a value
 that does not fit drops the message for that target. An enum saturates in a narrower integer, as in the boards'
 firmware. Every function raises ExpressionError if the value does not fit.
 """
@@ -38,11 +38,11 @@ from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 _EXACT_INTEGER_BITS = {32: 24, 64: 53}
-"""Up to this many bits every integer is exactly a float of that width."""
+"""Integers of up to this many bits are exact in a float of that width."""
 
 
 def convert(value: tree.Node, target: Type, scope: Scope) -> Plan:
-    """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
+    """Return the plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
     want_readable(value)
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
@@ -55,13 +55,13 @@ def convert(value: tree.Node, target: Type, scope: Scope) -> Plan:
 
 
 def same_named(holder: tree.Node, member: Field) -> tree.Node | None:
-    """The field of `holder` with the name of `member`, or None."""
+    """Return the field of `holder` with the name of `member`, or None."""
     found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
     return field_of(holder, found, holder.span) if found else None
 
 
 def unset(member: Field, span: SourceSpan) -> Unset:
-    """The plan of a field that nothing fills."""
+    """Return the plan of a field that nothing fills."""
     return Unset(member.type, member.default, span)
 
 
@@ -112,7 +112,7 @@ def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, s
 
 
 def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
-    """Fill a field by one of its name. The error says which one it is."""
+    """Fill a field from one of the same name. Errors name the field."""
     try:
         return convert(given, member.type, scope)
     except ExpressionError as error:
@@ -139,7 +139,7 @@ def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
 
 
 def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
-    """Fill an element by one of another list. No entry of the table can fill its fields: the hint says what can."""
+    """Fill an element from one of another list. The hint of an error says how to fill its fields."""
     try:
         return convert(element, target, scope)
     except ExpressionError as error:
@@ -167,7 +167,7 @@ def _want_length(value: tree.Node, target: List, length: int) -> None:
 
 
 def converted(value: tree.Node, target: Type) -> tree.Node:
-    """The expression that fills a scalar field. Raises ExpressionError when it does not fit."""
+    """Return the expression that fills a scalar field. Raises ExpressionError if it does not fit."""
     _want_finite(value, target)
     match target:
         case Bool():
@@ -183,11 +183,11 @@ def converted(value: tree.Node, target: Type) -> tree.Node:
         case Bytes():
             return _to_bytes(value, target)
         case List() | MessageType():
-            raise AssertionError(f"{target} is no scalar")
+            raise AssertionError(f"{target} is not a scalar")
 
 
 def _want_finite(value: tree.Node, target: Type) -> None:
-    """Raise ExpressionError if `nan` or `inf` would fill what is no float."""
+    """Raise ExpressionError if `nan` or `inf` would fill a field that is not a float."""
     literal = tree.constant_of(value)
     if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
         hint = f"text needs its own quotes: \"'{literal}'\"" if isinstance(target, String) else ""
@@ -201,7 +201,7 @@ _OF_LIST = "; min(x), max(x), sum(x) and len(x) turn a list into a number"
 
 
 def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
-    """The error for a value whose kind cannot fill the type."""
+    """Return the error for a value whose kind cannot fill the type."""
     if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
         hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
     if not isinstance(target, (List, MessageType)):
@@ -235,7 +235,7 @@ def _to_int(value: tree.Node, target: Int) -> tree.Node:
 
 
 def _saturate(value: tree.Node, limits: IntKind) -> tree.Node:
-    """An enum limited to an integer's range."""
+    """Limit an enum to an integer's range."""
     if limits.holds(INT32):
         return value
     kind = IntKind(max(INT32.low, limits.low), min(INT32.high, limits.high))
@@ -302,7 +302,7 @@ def _to_string(value: tree.Node, target: String) -> tree.Node:
 
 
 def _want_text(value: tree.Node, text: str, target: String) -> None:
-    """Raise ExpressionError if a literal cannot stand in the field."""
+    """Raise ExpressionError if a text literal does not fit the field."""
     try:
         length = len(text.encode())
     except UnicodeEncodeError as error:
@@ -330,7 +330,7 @@ def _to_enum(value: tree.Node, target: Enum) -> tree.Node:
 
 
 def _member(value: tree.Node, target: Enum) -> tree.Node:
-    """A number as a value of the enum, refused at run time if a closed one does not have it."""
+    """Return a number as a value of the enum; a closed enum rejects unknown values at run time."""
     literal = tree.constant_of(value)
     if not target.is_closed:
         return value
@@ -367,7 +367,7 @@ def _to_bytes(value: tree.Node, target: Bytes) -> tree.Node:
 
 
 def _is_octet(kind: Kind) -> bool:
-    """Whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
+    """Return whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
     if not isinstance(kind, IntKind):
         return False
     return kind.is_rounded or OCTET.holds(kind)

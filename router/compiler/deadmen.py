@@ -1,4 +1,4 @@
-"""Check deadmen: their timing, the payload that they send, and commands to boards without one.
+"""Check of deadmen: their timing, the payload that they send, and commands to boards without a deadman.
 
 `gateways` uses it for the deadmen of topics that clients publish on.
 """
@@ -31,17 +31,17 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 SHORTEST_REPEAT = 10_000_000
-"""ns. Shorter would flood a board, which may still be busy with the last datagram."""
+"""ns. A shorter interval would flood a board, which may still be busy with the last datagram."""
 
 SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 20_000_000, 10 * NS_PER_SECOND
-"""ns. Commands rarely come more often than the former; within the latter a rover goes far. Other units are meant."""
+"""ns. Commands rarely arrive faster, and a rover moves far within 10 s: other values are probably in the wrong unit."""
 
 _NOTHING = MessageType("a deadman")
-"""The source message of a deadman's payload: one without fields."""
+"""The source message of a deadman's payload: a message without fields."""
 
 
 def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
-    """The deadman of a route, None if it has none or the payload is invalid."""
+    """Check the deadman of a route. Return None if it has none, or if it is invalid."""
     deadman = route.deadman
     if deadman is None:
         _want_deadman(lookup, route)
@@ -65,7 +65,7 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
-    """Warn of the first board that gets commands from a route without deadman."""
+    """Warn about the first board that gets commands from a route without a deadman."""
     for destination in route.destinations:
         name = destination.endpoint.value
         if route.no_deadman is None and name in lookup.boards:
@@ -94,7 +94,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 def timing_findings(
     deadman: Deadman | InboundDeadman, ttl: Located[int] | None, max_rate: float | None, sends: str
 ) -> Iterator[Diagnostic]:
-    """Findings for a deadman that trips between commands, or sends too often, or whose times look like a mistake.
+    """Yield findings for a deadman that trips between commands, sends too often, or has implausible times.
 
     `max_rate` (Hz) limits all its commands.
     """
@@ -112,7 +112,7 @@ def timing_findings(
 def _doubtful_times(
     deadman: Deadman | InboundDeadman, ttl: Located[int] | None
 ) -> Iterator[tuple[SourceSpan, str, str]]:
-    """Where, what, and what to write in its place."""
+    """Yield position, message and hint for each implausible time."""
     timeout, repeat = deadman.timeout, deadman.repeat
     time = duration(timeout.value)
     if timeout.value > LONGEST_TIMEOUT:
@@ -133,10 +133,10 @@ def _doubtful_times(
 
 
 def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """Report the first board that the route commands and the deadman does not stop."""
+    """Report the first board that receives commands from the route but is not stopped by the deadman."""
     stopped = {to.value for to in deadman.to}
     if not stopped <= lookup.table.endpoints.keys():
-        return  # that is the mistake
+        return  # unknown endpoints have a finding already
     for destination in route.destinations:
         name = destination.endpoint.value
         if name not in stopped and name in lookup.boards:
@@ -161,7 +161,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
     message = f"it would interrupt commands of '{case}', which '{board}' also receives"
-    # Commands to another motor of the board must not disarm it: it would stay silent for as long as they come.
+    # Commands to another motor of the board must not disarm it: it would stay silent as long as they arrive.
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
@@ -174,7 +174,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 
 def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> bool:
-    """Report commands that may wait longer than the timeout: sent late, they would undo the deadman."""
+    """Report commands that may be held back beyond the timeout: sent late, they would undo the deadman."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
         return False
     for destination in route.destinations:
@@ -189,14 +189,14 @@ def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> boo
 
 
 def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
-    """The routes whose commands disarm the deadman; there must be one for each case in `disarmed_by`."""
+    """Return the routes whose commands disarm the deadman. Report cases in `disarmed_by` without such a route."""
     table = lookup.table
     found = [
         each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
     ]
     served = {each.case.value for each in found}
     served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-    are_known = all(to.value in table.endpoints for to in deadman.to)  # else that is the mistake
+    are_known = all(to.value in table.endpoints for to in deadman.to)  # else they have a finding already
     for name in deadman.disarmed_by or ():
         if name.value not in lookup.envelope.cases:
             message = f"{lookup.envelope.name} has no payload case '{name.value}'"
@@ -213,14 +213,14 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
 
 
 def _commanding(table: RouteTable, route: Route, deadman: Deadman) -> set[str]:
-    """The payload cases of other routes to what the deadman stops."""
+    """Return the payload cases of other routes to the endpoints of the deadman."""
     stopped = {to.value for to in deadman.to}
     others = [each for each in table.routes if each.name != route.name]
     return {each.case.value for each in others if stopped & {to.endpoint.value for to in each.destinations}}
 
 
 def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> tuple[Record, bytes] | None:
-    """What the deadman sends, as a computed plan and as the envelope; None with a finding."""
+    """Return the payload of the deadman as a computed plan and as an envelope; None with a finding."""
     plan = constant_plan(lookup, deadman.fields, case.type, deadman.case.span)
     if plan is None:
         return None
@@ -233,7 +233,7 @@ def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> tuple[Recor
 
 
 def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: PayloadCase) -> bool:
-    """Report the first board that cannot take what the deadman sends. Its size was checked with the payload case."""
+    """Report the first board that cannot decode the deadman's payload. Its size was checked with the payload case."""
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
         bounds = board.fields.get(case.number)
@@ -258,7 +258,7 @@ def deadman_plan(
 def constant_plan(
     lookup: Lookup, fields: FieldMap, target: MessageType, span: SourceSpan, ros_type: MessageType | None = None
 ) -> Record | None:
-    """The plan of a message that is filled with constants, None if there are findings. No field need be filled.
+    """Return the plan of a message of constants, None if there are findings. It may be empty.
 
     Expressions can name the constants of `ros_type`.
     """
@@ -270,7 +270,7 @@ def constant_plan(
 
 
 def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[str, ...]:
-    """The routes whose deadmen each command to `destination` feeds or disarms: its own route first."""
+    """Return the routes whose deadmen each command to `destination` feeds or disarms, its own route first."""
     disarmed = lookup.disarmed.get(route.case.value, ())
     others = [other.name for other in disarmed if takes_over(route, destination.endpoint.value, other)]
     feeds_own = route.deadman is not None and destination in feeding(route, route.deadman)
@@ -278,16 +278,16 @@ def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[
 
 
 def feeding(route: Route, deadman: Deadman) -> list[Destination]:
-    """The destinations whose commands feed a route's own deadman: those that it stops.
+    """Return the destinations whose commands feed a route's own deadman: those that the deadman stops.
 
-    If the route sends to none of those, all of its destinations.
+    If the route does not send to any of these, return all of its destinations.
     """
     stopped = {to.value for to in deadman.to}
     return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)
 
 
 def takes_over(route: Route, endpoint: str, other: Route) -> bool:
-    """Whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
+    """Return whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
     deadman = other.deadman
     return (
         deadman is not None

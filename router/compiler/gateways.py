@@ -1,6 +1,6 @@
-"""Check gateways: their names, their patterns, and the topics that their clients publish on.
+"""Check of gateways: their names, their patterns, and the topics that their clients publish on.
 
-Clashes of their addresses are checked in `network`, those of their topics in `topics`.
+`network` checks clashes of their addresses, `topics` those of their topics.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from router.types.model import MessageType
 
 
 def check_gateways(lookup: Lookup) -> tuple[GatewayPlan, ...]:
-    """The gateways of the table; findings go to `lookup`."""
+    """Check the gateways of the table; findings go to `lookup`."""
     checked = []
     for gateway in lookup.table.gateways.values():
         lookup.findings += [*_name_findings(lookup.table, gateway), *_pattern_findings(gateway)]
@@ -36,7 +36,7 @@ def check_gateways(lookup: Lookup) -> tuple[GatewayPlan, ...]:
 
 
 def _name_findings(table: RouteTable, gateway: Gateway) -> Iterator[Diagnostic]:
-    """Names that a listener or a route has too: they share the labels of metrics, and the arguments of `explain`."""
+    """Yield findings for names that a listener or a route also has: metrics and `explain` cannot distinguish them."""
     names = {
         "listener": set(table.listeners),
         "route": {name for route in table.routes for name in (route.name, route.case.value)},
@@ -56,7 +56,7 @@ def _pattern_findings(gateway: Gateway) -> Iterator[Diagnostic]:
 
 
 def _client_topics(lookup: Lookup, gateway: Gateway) -> dict[str, InboundPlan]:
-    """The topics that clients of a gateway may publish on, without those whose types do not exist."""
+    """Return the topics that clients of a gateway may publish on, except those whose types do not exist."""
     found: dict[str, InboundPlan | None] = {}
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)
@@ -81,7 +81,7 @@ def _inbound(lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str) -> I
 def _deadman(
     lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str, ros_type: MessageType
 ) -> DeadmanPlan | None:
-    """The deadman of a topic, with the CDR bytes that it publishes; None if there is none, or with a finding."""
+    """Return the deadman of a topic, with the CDR bytes that it publishes; None if there is none, or with a finding."""
     deadman = inbound.deadman
     if deadman is None:
         return None

@@ -1,6 +1,6 @@
-"""Assemble the program: routes, what must be opened for them, and the counters.
+"""Assembly of the program: routes, the sockets and topics that they need, and the counters.
 
-Expects a table without errors: nothing here is checked.
+Expects a table without errors and checks nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def link(checked: Checked, counters: Counters) -> Program | None:
-    """Make the program of a table, which counts in `counters`; None if it has errors."""
+    """Make the program of a table, which counts in `counters`; None if the table has errors."""
     table, schema, envelope, lowered = checked.table, checked.schema, checked.envelope, checked.lowered
     if table is None or schema is None or envelope is None or lowered is None:
         return None
@@ -60,7 +60,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
 
 
 def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
-    """The topics that routes publish on."""
+    """Yield the topics that routes publish on."""
     for checked in routes:
         for used in checked.targets:
             if used.topic and used.type:
@@ -68,14 +68,14 @@ def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageT
 
 
 def _published_by_clients(gateways: Iterable[GatewayPlan]) -> Iterator[TopicPlan]:
-    """The topics that clients of gateways publish on, under absolute names."""
+    """Yield the topics that clients of gateways publish on, under absolute names."""
     for gateway in gateways:
         for inbound in gateway.inbound.values():
             yield _topic(inbound.settings.topic, inbound.type, inbound.label)
 
 
 def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:
-    """One plan for each topic, however many routes name it; they agree on its type and QoS."""
+    """Return one plan per topic, however many routes name it: they agree on its type and QoS."""
     plans: dict[str, TopicPlan] = {}
     for plan in (*(_topic(topic, declared, topic.topic.value) for topic, declared in used), *more):
         plans.setdefault(plan.label, plan)
@@ -94,7 +94,7 @@ def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:
 def _route_plan(
     checked: CheckedRoute, sources: frozenset[str | None], feed: CheckedSubscription | None = None
 ) -> RoutePlan:
-    """The plan of `feed`, or of a route from UDP."""
+    """Return the plan of `feed`, or of a route from UDP."""
     route = checked.route
     targets = feed.targets if feed else checked.targets
     return RoutePlan(

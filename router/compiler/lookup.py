@@ -1,4 +1,4 @@
-"""What a table refers to: `.proto` folders and ROS interfaces, and the names of its routes looked up in them."""
+"""Lookup of the names in a table: `.proto` folders, ROS interfaces, endpoints and payload cases."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from router.types.ros import RosInterfaces, definition, ros_interfaces
 class Definitions:
     """Protos and ROS interfaces, read once for several tables.
 
-    `known` are protos that were read before; they are used as long as all that was read for them is unchanged.
+    `known` are protos that were read before; they are reused if their files are unchanged.
     """
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
@@ -35,7 +35,7 @@ class Definitions:
         self._known = known
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
-        """The protos of an envelope. Raises TableError; an invalid folder is read and reported again for each table."""
+        """Return the protos of an envelope. Raises TableError; an invalid folder is read again for each table."""
         exclude = tuple(each.value for each in settings.exclude)
         key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock), exclude
         if key not in self._protos:
@@ -59,7 +59,7 @@ class Definitions:
 
 
 _ALIKE = 0.8
-"""How near the names of two endpoints are for one to be suggested in place of the other: commands go there."""
+"""Similarity required to suggest another endpoint. It is high, because commands go there."""
 NO_NAMES: Mapping[str, Node] = {}
 
 
@@ -67,7 +67,7 @@ NO_NAMES: Mapping[str, Node] = {}
 class Lookup:
     """Looks up the names of one table and collects findings.
 
-    `board_limit` is as in `board_findings`; `boards` says by endpoint what boards can take.
+    `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint.
     """
 
     table: RouteTable
@@ -83,7 +83,7 @@ class Lookup:
 
     @cached_property
     def disarmed(self) -> Mapping[str, Sequence[Route]]:
-        """By payload case, the routes that name it in `disarmed_by` of their deadman."""
+        """The routes whose deadman names a payload case in `disarmed_by`, by case."""
         found: dict[str, list[Route]] = {}
         for route in self.table.routes:
             for case in {each.value for each in (route.deadman and route.deadman.disarmed_by) or ()}:
@@ -99,7 +99,7 @@ class Lookup:
         return found
 
     def endpoint(self, name: Located[str], also: Iterable[str] = ()) -> Endpoint | None:
-        """The endpoint, or None with a finding, unless its declaration has one. `also` are other valid names."""
+        """Return the endpoint, or None with a finding, unless its declaration has one. `also` are other valid names."""
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
@@ -108,19 +108,19 @@ class Lookup:
         return found
 
     def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
-        """The endpoint `name`, which gets payloads of `case` that come from `sources`; None where there is none."""
+        """Return the endpoint `name`, a recipient of payloads of `case` from `sources`; None if it does not exist."""
         endpoint = self.endpoint(name)
         if endpoint is None:
             return None
         finding = loop_finding(self.table, endpoint, name.span, case.name, sources)
         if finding and finding.message not in {earlier.message for earlier in self.findings}:
-            self.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route
+            self.findings.append(finding)  # an endpoint that is the router itself is reported once, not per route
         if endpoint.kind is EndpointKind.BOARD:
             self.findings += board_findings(case, self.schema, self.board_limit, name.span)
         return endpoint
 
     def ros_type(self, topic: Topic) -> MessageType | None:
-        """The message type of a topic, or None with a finding; without one where the topic has no `type`."""
+        """Return the message type of a topic, or None with a finding; without a finding if the topic has no `type`."""
         if topic.type is None:
             return None
         name = topic.type.value
@@ -135,7 +135,7 @@ class Lookup:
         return found
 
     def _report_type(self, name: Located[str], package: Located[str] | None) -> None:
-        """Report an unknown type. `package` is that of the table's defaults where the type is made of it."""
+        """Report an unknown type. `package` is the default package if the type was made from it."""
         known = self.definitions.interfaces.names()
         packages = {full.partition("/")[0] for full in known}
         if package is not None and package.value not in packages:
@@ -156,9 +156,9 @@ class Lookup:
         names: Mapping[str, Node] = NO_NAMES,
         route: Route | None = None,
     ) -> Scope:
-        """The scope of expressions over `message`, with the constants of `ros_type` and of the types in it.
+        """Return the scope of expressions over `message`, with the constants of `ros_type` and of the types in it.
 
-        `route` takes `message` from endpoints, or is None.
+        `route` is a route that takes `message` from endpoints, or None.
         """
         nested = tuple(nested_types(ros_type)) if ros_type else ()
         sources = tuple(source.value for source in route.sources) if route else ()
@@ -168,7 +168,7 @@ class Lookup:
     def value(
         self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
     ) -> Node | None:
-        """A checked expression of one of `kinds`, or None with a finding that begins with `wanted`."""
+        """Check that an expression is of one of `kinds`. If not, return None and report `wanted`."""
         try:
             node = check(expression, scope)
             if not isinstance(node.kind, kinds):
@@ -187,7 +187,7 @@ class Lookup:
 
 
 def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str:
-    """What to write for an endpoint that there is not."""
+    """Return a hint for an endpoint that does not exist."""
     if "," in name:
         names = [each.strip() for each in name.split(",") if each.strip()]
         return f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
@@ -201,7 +201,7 @@ def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str
 
 
 def nested_types(declared: Type) -> Iterable[MessageType]:
-    """A ROS message type and all message types in it, each once."""
+    """Return a ROS message type and all message types in it, each once."""
     found: dict[str, MessageType] = {}
     waiting: list[Type] = [declared]
     while waiting:
@@ -215,12 +215,12 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
 
 
 def definitions_of(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
-    """By name of the type and of each type in it, the fields as rclpy spells them: they determine the layout of CDR."""
+    """Return the fields of a type and of each type in it as rclpy spells them, which determine the layout of CDR."""
     return {nested.name: definition(nested) for nested in nested_types(message)}
 
 
 def _ros_type_hint(name: str, known: Collection[str]) -> str:
-    """Types of that name in whatever package, else what its package has, else where types come from."""
+    """Return a hint: types of that name in any package, else types of its package, else where types come from."""
     parts = [part for part in re.split(r"[/:.]+", name) if part] or [name]
     package, short = parts[0], parts[-1]
     if (exact := f"{package}/msg/{short}") in known:
@@ -241,5 +241,5 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
 
 
 _SAME_PACKAGE = 0.85
-"""How near the name of a package is to be a misspelt one: `my_interfaces` is not `rcl_interfaces`."""
+"""Similarity required of a misspelt package name: `my_interfaces` is not `rcl_interfaces`."""
 _SOURCE = "build '{}' and source its workspace (`source install/setup.bash`)"

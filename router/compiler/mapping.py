@@ -1,6 +1,6 @@
-"""What fills a target: `fields:` and the target's type become a plan, one node for every field.
+"""Mappings: `fields` and the target's type become a plan with a node for every field.
 
-Every entry that is wrong is a finding, and the rest of the mapping is still checked.
+Every invalid entry is a finding, and the rest of the mapping is still checked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from router.types.model import Field, MessageType, String, Type
 from router.types.paths import ways
 
 _FRAME = re.compile(r"/?\w+(?:[/-]\w+)+|/\w+")
-"""Text that looks like a division or a difference: `base/imu_link`, `imu-link`."""
+"""Names of frames that parse as a division or a difference: `base/imu_link`, `imu-link`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +46,11 @@ class FieldMapping:
 
 
 _MISSPELT = 0.9
-"""How near a name is to one of the target's own fields if it can only be that."""
+"""Similarity from which a name can only be a misspelt field of the target."""
 
 
 def _of_one_key(spans: Sequence[SourceSpan], depth: int) -> tuple[int, int]:
-    """The first and the last of the names that stand in one key, `a.b.c`, with the one at `depth`."""
+    """Return the indexes of the first and last name in the same key, `a.b.c`, as the name at `depth`."""
     first = last = depth
     while first > 0 and spans[first - 1].end_column + 1 == spans[first].column:
         first -= 1
@@ -60,7 +60,7 @@ def _of_one_key(spans: Sequence[SourceSpan], depth: int) -> tuple[int, int]:
 
 
 def _nested(entry: FieldEntry, target: MessageType) -> FieldEntry:
-    """The entry, or where `{text: value}` is for a message with a field `text`, the entry for that field."""
+    """Return the entry, or for `{text: value}` and a message with a field `text`, the entry of that field."""
     holder: Type | None = target
     for name in entry.path:
         member = holder.field(name) if isinstance(holder, MessageType) else None
@@ -88,8 +88,8 @@ def build(
 ) -> FieldMapping:
     """Map a message of type `target`. `span` is the position of findings that concern no single entry.
 
-    `auto` takes fields of `whole`, or of the source message if that is None. Without `fields` it is `auto`, and every
-    field of `ros_type`, which is source or target, must have one of its name on the other side.
+    `auto` takes fields of `whole`, or of the source message if that is None. Without `fields`, it is `auto`, and every
+    field of `ros_type`, which is source or target, needs a field of the same name on the other side.
     """
     if fields is None:
         outcome = build(FieldMap(span, auto=True, entries=()), target, scope, span, whole)
@@ -115,11 +115,11 @@ def build(
 
 
 _MOST_NAMES = 4
-"""Of the fields that a finding lists."""
+"""Maximum number of fields that a finding lists."""
 
 
 def _left_out(message: MessageType, rows: Sequence[Row]) -> list[str]:
-    """The fields of `message` that rows of an automatic mapping do not name."""
+    """Return the fields of `message` that are not in the rows of an automatic mapping."""
     named = {row.target for row in rows}
     return [
         path for path in _paths(message, "") if not any(path == each or path.startswith(f"{each}.") for each in named)
@@ -127,7 +127,7 @@ def _left_out(message: MessageType, rows: Sequence[Row]) -> list[str]:
 
 
 def _paths(message: MessageType, prefix: str) -> Iterator[str]:
-    """The paths of all fields that are no messages."""
+    """Yield the paths of all fields that are not messages."""
     for member in message.fields:
         if isinstance(member.type, MessageType) and member.type.fields:
             yield from _paths(member.type, f"{prefix}{member.name}.")
@@ -138,7 +138,7 @@ def _paths(message: MessageType, prefix: str) -> Iterator[str]:
 class _Builder:
     """Builds one mapping. `automatic` is the message whose fields fill those of the same name, or None.
 
-    `origin` is the prefix of these fields in rows: `item.`, or nothing for the source message.
+    `origin` is the prefix of automatic fields in rows: `item.`, or empty for the source message.
     """
 
     def __init__(self, scope: Scope, span: SourceSpan, origin: str) -> None:
@@ -154,7 +154,7 @@ class _Builder:
     # entries by field
 
     def sort(self, entries: Sequence[FieldEntry], target: MessageType) -> _Branch:
-        """The entries by field. Unknown fields and fields that are given twice are reported and left out."""
+        """Return the entries by field. Unknown and duplicate fields are reported and left out."""
         root = _Branch(target)
         self._taken = {entry.path[: depth + 1] for entry in entries for depth in range(len(entry.path))}
         for entry in map(functools.partial(_nested, target=target), entries):
@@ -163,7 +163,7 @@ class _Builder:
         return root
 
     def _holders(self, entry: FieldEntry, target: MessageType) -> list[MessageType]:
-        """The message types along the path of an entry, empty if it leads to no field."""
+        """Return the message types along the path of an entry, empty if it leads to no field."""
         holders: list[MessageType] = []
         holder: Type = target
         for depth, (name, span) in enumerate(zip(entry.path, entry.path_spans, strict=True)):
@@ -185,7 +185,7 @@ class _Builder:
         return holders
 
     def _unknown(self, entry: FieldEntry, depth: int, holder: MessageType) -> None:
-        """Report that `holder` has no field of the name at `depth`, once for a key that stands above several others."""
+        """Report that `holder` has no field of the name at `depth`, once for a key above several others."""
         name, span = entry.path[depth], entry.path_spans[depth]
         if (entry.path[: depth + 1], span) in self._reported:
             return
@@ -251,7 +251,7 @@ class _Builder:
         return plan
 
     def _chosen_finding(self, member: Field, choices: Choices) -> Diagnostic | None:
-        """The finding for the first value of a map that does not fill the field by itself."""
+        """Return the finding for the first value of a map that does not fit the field."""
         values = [value for _, value in choices.values]
         for value in values if choices.otherwise is None else [*values, choices.otherwise]:
             try:
@@ -274,7 +274,7 @@ class _Builder:
 
 
 def _text(expression: Expression) -> str:
-    """An expression as the table has it, on one line."""
+    """Return an expression as the table has it, on one line."""
     if expression.choices is not None or expression.literal:
         return str(expression)
     if expression.items is not None:
@@ -283,7 +283,7 @@ def _text(expression: Expression) -> str:
 
 
 def presence_findings(plan: Plan) -> Iterator[Diagnostic]:
-    """Messages of a plan with two members of one oneof, or without a required field."""
+    """Yield findings for messages with two members of one oneof, or without a required field."""
     match plan:
         case Record():
             yield from _oneof_findings(plan)

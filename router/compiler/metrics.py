@@ -1,7 +1,7 @@
-"""The counters: every series that the router exports, and where in a flat list of integers it is counted.
+"""The counters: every series that the router exports, and its index in a flat list of integers.
 
-The metrics are declared once, in `METRICS`; the collector, the documentation and the compiler read
-them from here. Counting itself is `counts[index] += 1` in the thread that owns the list.
+The metrics are declared once, in `METRICS`, for the collector, the documentation and the compiler. A thread counts with
+`counts[index] += 1` in its own list.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import NamedTuple
 class Metric:
     """One metric. `kind` is counter, histogram, number, level, or time (nanoseconds in the counters, seconds exported).
 
-    One thread sets a number or a time; several add to a level and subtract from it. `tells_commands`: it is exported
-    with a label COMMAND as well, which follows from its `route` and `target`.
+    One thread sets a number or a time; several add to a level and subtract from it. A metric that `tells_commands` is
+    also exported with the label COMMAND, which follows from its `route` and `target`.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Metric:
 
 
 COMMAND = "command"
-"""The label that is `true` where commands are counted, else `false`."""
+"""The label that is `true` for commands, else `false`."""
 
 
 METRICS = (
@@ -128,7 +128,7 @@ REJECT_REASONS: Mapping[str, str] = {
     "ignored": "a payload case that the table ignores",
     "source_mismatch": "from an address that is not a source of the route, or on the wrong listener",
 }
-"""Why no route took a datagram, with what each means."""
+"""Reasons why no route accepted a datagram, with their meaning."""
 
 DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "a mapping failed for these values, for example by division by zero",
@@ -143,7 +143,7 @@ DROP_REASONS: Mapping[str, str] = {
     "incomplete": "a frame that was not complete within its timeout, or for which there was no room",
     "loop": "it came from this router: stays 0, because tables with loops are rejected",
 }
-"""Why a target did not get a message, with what each means."""
+"""Reasons why a message was not delivered to a target, with their meaning."""
 
 GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "too_large": "longer than the gateway accepts, before or after decompression",
@@ -154,47 +154,47 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "invalid": "a field is missing, unknown, of another type or out of range",
     "rate_limited": "schemas were requested too often",
 }
-"""Why a gateway refused what a client sent, with what each means."""
+"""Reasons why a gateway rejected a client's message, with their meaning."""
 
 GATEWAY_DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "not a message of the topic's type, or text that is not UTF-8",
     "too_large": "longer than `max_message`, or than a datagram",
     "overloaded": "it arrived while earlier ones were still being converted",
 }
-"""Why no client of a gateway got a ROS message, with what each means."""
+"""Reasons why a gateway delivered a ROS message to no client, with their meaning."""
 
 INTENDED_REASONS = frozenset({"rate_limited", "ignored"})
-"""Drops and rejections that the table asks for: they are not reported."""
+"""Drops and rejections that the table requests: they are not reported."""
 
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
-"""Those of DROP_REASONS for which a client's message is not published."""
+"""The DROP_REASONS that apply to messages of clients."""
 
 TOPIC_STATES: Mapping[str, str] = {
     "served": "a client gets it",
     "several_types": "served with the type that most of its publishers use",
     "not_installed": "not served: its type is not installed here",
 }
-"""What a gateway can do with a topic that its patterns match."""
+"""States of a topic that a gateway's patterns match."""
 
 CLIENT_DROP_REASONS: Mapping[str, str] = {
     "superseded": "a newer value of the topic took its place, because the client is slow",
     "send_error": "the network refused it",
     "left": "it was queued for a client that disconnected",
 }
-"""Why one client of a gateway did not get a message, with what each means."""
+"""Reasons why a message was not delivered to one client of a gateway, with their meaning."""
 
 RECORD_DROP_REASONS: Mapping[str, str] = {
     "overflow": "the disk was slower than the network for longer than the buffer lasts",
     "write_error": "the file could not be written, for example because the disk is full, or the router failed",
 }
-"""Why a recording lacks a datagram, with what each means."""
+"""Reasons why a datagram is missing from a recording, with their meaning."""
 
 RELOAD_RESULTS: Mapping[str, str] = {
     "ok": "the new table is running",
     "invalid": "the table has errors, or changes something that needs a restart",
     "failed": "something that it names cannot be opened",
 }
-"""What became of a reload, with what each means. Unless it is ok, the old table goes on."""
+"""Results of a reload, with their meaning. Unless it is ok, the old table keeps running."""
 
 STARTS: Mapping[str, str] = {
     "kept": "it forwarded by a kept program while the table was compiled",
@@ -208,7 +208,7 @@ CLIENTS = "clients"
 """The `target` and `source` label of a gateway's clients."""
 
 QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")
-"""The policies that can keep a publisher and a subscriber apart."""
+"""The policies that can make a publisher and a subscription incompatible."""
 
 UNKNOWN_CASE = "unknown"
 """The `payload_case` label of a field number that the envelope does not have."""
@@ -217,18 +217,18 @@ HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000
 
 
 class Series(NamedTuple):
-    """What is counted: a metric, with its label values in the metric's order."""
+    """A metric with its label values, in the metric's order."""
 
     metric: str
     labels: tuple[str, ...]
 
 
 HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
-"""The indexes of a histogram, in a row: one for each bound, everything slower, the sum (ns)."""
+"""Consecutive indexes of a histogram: one for each bound, one for everything slower, and the sum (ns)."""
 
 
 class Mismatch(NamedTuple):
-    """What a listener got from a host that no route takes this payload case from."""
+    """A datagram from a host that is not a source of its payload case."""
 
     listener: str
     host: str
@@ -237,10 +237,10 @@ class Mismatch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
+    """A loss. `kind` is `drop` (for one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
 
-    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is how many such
-    losses there were since the last report of them. `mismatch`: of a `source_mismatch`.
+    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is the number of such
+    losses since the last report. `mismatch` is set for the reason `source_mismatch`.
     """
 
     kind: str
@@ -255,10 +255,10 @@ class Report:
 
 @dataclass(slots=True)
 class Counters:
-    """The index of each series in the lists of integers in which threads count.
+    """The index of each series in the threads' lists of integers.
 
-    Counters may continue those of an earlier program (`continued`): series that both have keep their indexes. Series
-    that only the earlier one had are no longer current, but keep their indexes until `settle` frees them.
+    Counters may continue those of an earlier program (`continued`): common series keep their indexes. Series that only
+    the earlier program had are no longer current, but keep their indexes until `settle` frees them.
     """
 
     _indexes: dict[tuple[str, ...], int] = field(default_factory=dict)  # the first one, by metric and labels
@@ -278,7 +278,7 @@ class Counters:
         )
 
     def set_commands(self, route: str, target: str, *, are_commands: bool) -> None:
-        """Say whether what a target of a route gets are commands."""
+        """Set whether a target of a route receives commands."""
         self._commanded[route, target] = are_commands
 
     def are_commands(self, route: str, target: str) -> bool:
@@ -328,15 +328,15 @@ class Counters:
         return [0] * self._size
 
     def grow(self, counts: list[int]) -> None:
-        """Extend the list of a thread that has counted in earlier counters, in place, where it is shorter."""
+        """Extend a thread's list from earlier counters in place, if it is shorter."""
         if len(counts) < self._size:
             counts.extend([0] * (self._size - len(counts)))
 
     def settle(self, threads: Iterable[list[int]]) -> None:
         """Free the indexes of series that are no longer current, given the lists of all threads.
 
-        To be called when no thread counts in them any more. Counters and histograms that have counted something stay,
-        so that totals never decrease.
+        Call this when no thread uses them any more. Counters and histograms that have counted something stay, so that
+        totals never decrease.
         """
         lists = list(threads)
         for series in [series for series in self._indexes if series not in self._current]:

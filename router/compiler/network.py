@@ -1,4 +1,4 @@
-"""Addresses: clashes between them, destinations that lead back to the router, and how senders are identified."""
+"""Checks of addresses: clashes, and destinations that lead back to the router; identification of senders."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class _Held:
 
 
 def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Findings for the addresses of a table and for what listens on them."""
+    """Yield findings for the addresses of a table and for its listeners."""
     for first, second in combinations(_held(table), 2):
         if first.is_udp == second.is_udp and _overlap(first, second):
             message = f"{second.owner} uses the address of {first.owner}"
             hint = "only one of them can receive there; use another port"
-            if first.interface != second.interface:  # what is bound to no interface takes that of all of them
+            if first.interface != second.interface:  # a socket without an interface receives on all interfaces
                 hint += f", or give {second.owner if first.interface else first.owner} an 'interface'"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _listener_findings(table)
@@ -65,7 +65,7 @@ def _held(table: RouteTable) -> Iterator[_Held]:
 
 
 def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Gateways that send to the router itself, or have the same Zenoh key."""
+    """Yield findings for gateways that send to the router itself, or have the same Zenoh key."""
     keys: dict[str, Gateway] = {}
     for gateway in table.gateways.values():
         if gateway.address is not None and gateway.transport.value is Transport.UDP:
@@ -78,7 +78,7 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
-    """Findings for a gateway that sends to a listener or gateway of this table: messages could loop for ever."""
+    """Yield findings for a gateway that sends to a listener or gateway of this table: messages could loop endlessly."""
     own = {f"listener '{listener.name}'": listener.address.value for listener in table.listeners.values()}
     for other in table.gateways.values():
         if other.receive is not None:
@@ -90,7 +90,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
 
 
 def _overlap(one: _Held, other: _Held) -> bool:
-    """Whether the kernel refuses to bind both: it does unless they are bound to different interfaces."""
+    """Return whether the addresses overlap, so that the kernel cannot bind both; different interfaces do not."""
     if one.interface and other.interface and one.interface != other.interface:
         return False
     hosts = one.address.value.host, other.address.value.host
@@ -98,7 +98,7 @@ def _overlap(one: _Held, other: _Held) -> bool:
 
 
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Endpoints that name an unknown listener, and listeners that none of the sending endpoints may use."""
+    """Yield findings for unknown listeners of endpoints, and for listeners that accept no sending endpoint."""
     for endpoint in table.endpoints.values():
         for named, known in (
             (endpoint.listener, [*table.listeners]),
@@ -109,18 +109,18 @@ def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
                 yield Diagnostic(named.span, Code.UNKNOWN_LISTENER, f"there is no listener '{named.value}'", hint)
     sources = {source.value for route in table.routes for source in route.sources}
     senders = [endpoint for endpoint in table.endpoints.values() if endpoint.name in sources]
-    believed_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
-    if not senders or ANY in sources or None in believed_by or table.broken:
+    accepted_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
+    if not senders or ANY in sources or None in accepted_by or table.broken:
         return
     for listener in table.listeners.values():
-        if listener.name not in believed_by:
+        if listener.name not in accepted_by:
             message = f"listener '{listener.name}' accepts none of the sending endpoints, so it rejects everything"
             hint = f"remove it, or give an endpoint 'listener: {listener.name}'"
             yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
 
 
 def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | None:
-    """A finding if a received datagram could be from either endpoint."""
+    """Return a finding if a received datagram could be from either endpoint."""
     if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
         return None
     if one.listener and other.listener and one.listener.value != other.listener.value:
@@ -141,7 +141,7 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
 def loop_finding(
     table: RouteTable, endpoint: Endpoint, span: SourceSpan, case: str, sources: AbstractSet[str]
 ) -> Diagnostic | None:
-    """A finding if a destination, named at `span`, is one of `sources` of the same `case`, or the router itself."""
+    """Return a finding if a destination, named at `span`, is one of `sources` of `case`, or the router itself."""
     if endpoint.name in sources:
         message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
@@ -161,9 +161,9 @@ def _reaches(address: Address, own: Address) -> bool:
 
 
 def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
-    """The listener from whose address and port datagrams leave for an endpoint; None for a port of their own.
+    """Return the listener whose address and port datagrams to an endpoint are sent from; None for a separate port.
 
-    Listeners that differ in their interfaces have one address and port.
+    Listeners that differ only in their interfaces share one address and port.
     """
     if endpoint.send_from is not None:
         return None if endpoint.send_from.value == EPHEMERAL else endpoint.send_from.value
@@ -176,11 +176,11 @@ def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
 def recognisers(
     endpoints: Mapping[str, Endpoint], listener: str | None
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
-    """The names of endpoints by IP address, and by (IP address, port), for what `listener` receives.
+    """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
-    Endpoints of other listeners are left out. None is for datagrams that came by no listener of the table, and has all
-    endpoints. An IP address that several endpoints share without source ports recognises none of them; the table may
-    have that only where none is a source.
+    Endpoints of other listeners are omitted; None stands for no listener of the table and returns all endpoints. An IP
+    address that several endpoints share without source ports identifies none of them; this is only valid if none is a
+    source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""The plan of a message: a tree with its structure that says where the value of each field comes from.
+"""The plan of a message: a tree of the same structure, with the origin of each field's value.
 
 `mapping` makes plans; `lowering` turns them into routines of the machine.
 """
@@ -15,7 +15,7 @@ from router.types.model import Field, List, MessageType, Type
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One scalar, which `node` computes; `constant` is its value if that is known at compile time."""
+    """A scalar, computed by `node`; `constant` is its value if that is known at compile time."""
 
     type: Type
     node: Node
@@ -48,9 +48,9 @@ class Items:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list that is filled from one or more lists (or bytes) side by side: `element` fills one element.
+    """A list filled from one or more parallel lists (or bytes): `element` fills one element.
 
-    `lists` are pairs of a variable and the list whose elements it takes. Lists of different length are refused at run
+    `lists` are pairs of a variable and the list whose elements it takes. Lists of different length are rejected at run
     time.
     """
 
@@ -62,7 +62,7 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Unset:
-    """A field that nothing fills: it keeps its default, or stays absent in protobuf."""
+    """A field that is not filled: it keeps its default, or stays absent in protobuf."""
 
     type: Type
     default: object

@@ -1,4 +1,4 @@
-"""The compiled table: what is known of its routes, what the carrier runs, and what must be opened. Plain data."""
+"""The compiled table, as plain data: its routes, the carrier's routines, and the sockets and topics to open."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRANGER = None
 
 
 def source_label(source: str | None) -> str:
-    """The `source` label of a sender: its name, or `unknown` for a stranger on a route that takes any."""
+    """Return the `source` label of a sender: its name, or `unknown` for a stranger on a route from `any`."""
     return source if source is not None else "unknown"
 
 
@@ -40,16 +40,16 @@ class QosPlan:
 
     @property
     def serves_late_joiners(self) -> bool:
-        """Late subscribers get the last messages, so they must be published also while nobody is subscribed."""
+        """Whether late subscribers get the last messages, which must then be published even without subscribers."""
         return self.durability == "transient_local"
 
 
 @dataclass(frozen=True, slots=True)
 class TopicPlan:
-    """One ROS publisher or subscription: `label` names it in metrics, `topic` is the name that ROS resolves.
+    """A ROS publisher or subscription: `label` names it in metrics, `topic` is the name that ROS resolves.
 
-    `definitions` determine the layout of its CDR bytes: by name of the type itself and of each type nested in it, the
-    fields as rclpy spells them.
+    `definitions` determine the layout of its CDR bytes: the fields of the type and of each nested type, by type name,
+    as rclpy spells them.
     """
 
     label: str
@@ -61,12 +61,11 @@ class TopicPlan:
 
 @dataclass(frozen=True, slots=True)
 class TargetPlan:
-    """A target of a route: `label` in metrics.
+    """A target of a route, with its `label` in metrics.
 
-    `is_deferred` says that it may be served later and by another thread: it has `on_limit: latest`, or its
-    endpoint has a bandwidth. `is_command`: what it gets are commands. `deadmen` are the routes whose deadmen each
-    command to it feeds (its own route's) or disarms. It holds no positions of the table, since a reload keeps state
-    by it.
+    A target that `is_deferred` may be served later and by another thread: it has `on_limit: latest`, or its endpoint
+    has a bandwidth. `is_command`: its messages are commands. `deadmen` are the routes whose deadmen each command feeds
+    (its own route's) or disarms. It contains no positions, because a reload uses it as the key of state.
     """
 
     label: str
@@ -81,10 +80,10 @@ class TargetPlan:
 
 @dataclass(frozen=True, slots=True)
 class DeadmanPlan:
-    """A route's deadman: what is sent to which endpoints when no fresh command was sent for `timeout` (all ns).
+    """A route's deadman: the datagrams that are sent if no fresh command was sent for `timeout` (all times in ns).
 
-    `at_start` says that it is sent when the router starts as well. `disarmed_by` are names of routes, not the payload
-    cases of the table.
+    With `at_start`, they are also sent when the router starts. `disarmed_by` are names of routes, not the payload cases
+    of the table.
     """
 
     route: str
@@ -99,7 +98,7 @@ class DeadmanPlan:
 class InboundPlan:
     """A topic that a gateway's clients may publish on; `label` is its absolute name, which they use.
 
-    The datagrams of its deadman are CDR bytes, and the topic stands where a route's deadman has an endpoint.
+    The datagrams of its deadman are CDR bytes, with the topic in place of an endpoint.
     """
 
     settings: Inbound
@@ -109,13 +108,13 @@ class InboundPlan:
 
     @property
     def is_command(self) -> bool:
-        """Whether what clients publish there are commands: they have a deadman or a `ttl`."""
+        """Whether messages of clients are commands: the topic has a deadman or a `ttl`."""
         return self.deadman is not None or self.settings.ttl is not None
 
 
 @dataclass(frozen=True, slots=True)
 class GatewayPlan:
-    """A gateway, with the topics that its clients may publish on by absolute name."""
+    """A gateway, with the topics that its clients may publish on, by absolute name."""
 
     settings: Gateway
     inbound: Mapping[str, InboundPlan]
@@ -123,10 +122,10 @@ class GatewayPlan:
 
 @dataclass(frozen=True, slots=True)
 class RoutePlan:
-    """A route from UDP, or a route from ROS as one of its topics feeds it.
+    """A route from UDP, or a route from ROS for one of its topics.
 
-    `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS has none.
-    `ttl` and `collect_timeout` in ns, None for none.
+    `sources` are the endpoints that may send the message, possibly with STRANGER; a route from ROS has none. `ttl` and
+    `collect_timeout` are in ns, or None.
     """
 
     route: str
@@ -140,11 +139,10 @@ class RoutePlan:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A compiled table. `senders` are the endpoints that something is sent to, `lowered` is what the carrier runs.
+    """A compiled table. `senders` are all endpoints that are sent to, `lowered` has the routines of the carrier.
 
-    `inbound` has the routes by envelope field number: several where a case has several routes, which differ in their
-    sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores, `boards` what each
-    endpoint that is a board can take, by name.
+    `inbound` has the routes by envelope field number; several routes of a case differ in their sources. `outbound` has
+    the routes by topic. `ignored` has the numbers of ignored cases, `boards` the limits of each board by name.
     """
 
     table: RouteTable
@@ -172,7 +170,7 @@ class Program:
 
     @property
     def client_deadmen(self) -> list[DeadmanPlan]:
-        """Those of topics that clients of gateways may publish on."""
+        """The deadmen of topics that clients of gateways may publish on."""
         return [each.deadman for gateway in self.gateways for each in gateway.inbound.values() if each.deadman]
 
     @property

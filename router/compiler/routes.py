@@ -1,4 +1,4 @@
-"""Check routes against what exists: every name resolved, every mapping typed, all findings collected."""
+"""Check of routes: resolves every name, types every mapping, and collects all findings."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from router.types.model import List, MessageType
 from router.types.protobuf import PayloadCase
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
-"""Findings that are dropped for a route with an invalid part, which was left out and reported before."""
+"""Findings that are suppressed for a route with an invalid part, which was left out and has a finding."""
 
 
 def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
-    """The routes of the table whose payload case exists; findings go to `lookup`."""
+    """Check the routes of the table. Return those whose payload case exists; findings go to `lookup`."""
     _coverage(lookup)
     return tuple(checked for route in lookup.table.routes if (checked := _checked(lookup, route)))
 
@@ -47,7 +47,7 @@ def _coverage(lookup: Lookup) -> None:
     covered = {name if name in cases else nearest(name, cases) for name in names}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
     missing = [name for name in cases if name not in covered]
-    if missing and table.routes_span is not None:  # a table of gateways has no routes for any
+    if missing and table.routes_span is not None:  # a table with only gateways has no routes
         plural = "payload case" if len(missing) == 1 else "payload cases"
         message = f"no route for the {plural} {', '.join(missing)}"
         hint = "add a route, or ignore it with `ignore: reason`"
@@ -70,7 +70,7 @@ _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
 
 
 def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
-    """The findings, those about names that need `for_each` or `collect` once: that one key is the mistake."""
+    """Yield the findings; those about names that need `for_each` or `collect` once, since the key is the mistake."""
     said = set()
     for finding in findings:
         if finding.message not in said:
@@ -79,7 +79,7 @@ def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
 
 
 def _without_for_each(message: MessageType) -> dict[str, tuple[str, str]]:
-    """The names that a route from ROS lacks without `for_each`, with what to do: see `Scope.absent`."""
+    """Return the names that are missing without `for_each`, with message and hint: see `Scope.absent`."""
     lists = [member.name for member in message.fields if isinstance(member.type, List)]
     hint = f"add `for_each: {lists[0] if len(lists) == 1 else 'LIST'}`"
     hint += f"; its lists are {', '.join(lists)}" if len(lists) > 1 else ""
@@ -121,7 +121,7 @@ def _sources(lookup: Lookup, route: Route) -> None:
 
 
 def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
-    """The destinations of a route, each with its endpoint, or None and a finding where there is none."""
+    """Return the destinations of a route, each with its endpoint, or None with a finding if that does not exist."""
     sources = {source.value for source in route.sources}
     seen: set[str] = set()
     for destination in route.destinations:
@@ -135,7 +135,7 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
 def _destination(
     lookup: Lookup, route: Route, destination: Destination, endpoint: Endpoint | None, scope: Scope
 ) -> CheckedTarget:
-    """A destination without its plan."""
+    """Check a destination. Return it without its plan."""
     return CheckedTarget(
         destination,
         endpoint=endpoint,
@@ -184,7 +184,7 @@ def _publish(
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:
-    """The names in expressions of topics beside the fields of a frame's first datagram."""
+    """Return the names that expressions of topics can use in addition to the fields of a frame's first datagram."""
     return {
         ITEMS: Variable(ListKind(MessageKind(case.type)), span, ITEMS),
         COUNT: Variable(UINT32, span, COUNT),
@@ -213,7 +213,7 @@ HEADER = "std_msgs/msg/Header"
 
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
-    """Check the topics that feed a route from ROS, and what each destination gets of them."""
+    """Check the topics of a route from ROS, and their mappings to each destination."""
     found = destinations(lookup, route, case)
     subscriptions = []
     for topic in route.source_topics:
@@ -229,7 +229,7 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
 def _subscription(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
 ) -> CheckedSubscription | None:
-    """A topic with its targets. None if the type of `item` is unknown: every use of it would be reported."""
+    """Check a topic and its targets. Return None if the type of `item` is unknown: every use would be reported."""
     scope = lookup.scope(ros_type, ros_type)
     stamp = _stamp(scope, topic.span) if route.ttl else None
     for_each = None
@@ -241,7 +241,7 @@ def _subscription(
     else:
         scope.absent = _without_for_each(ros_type)
     when = lookup.when(topic.when, scope)
-    own = any(destination.fields for destination, _ in found)  # then the route need not have any
+    own = any(destination.fields for destination, _ in found)  # then the route needs none
     targets = []
     for destination, endpoint in found:
         fields = destination.fields or route.fields
@@ -255,13 +255,13 @@ def _subscription(
 
 
 def _element_type(elements: Node) -> MessageType | None:
-    """The message type of the elements of `for_each`, None if they are no messages."""
+    """Return the message type of the elements of `for_each`, None if they are not messages."""
     element = elements.kind.element if isinstance(elements.kind, ListKind) else None
     return element.type if isinstance(element, MessageKind) else None
 
 
 def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
-    """The field `header.stamp`, or None."""
+    """Return the field `header.stamp`, or None."""
     header = scope.message.field("header")
     if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
         return None
@@ -270,7 +270,7 @@ def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
 
 
 def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | None:
-    """The list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
+    """Return the list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
     node = lookup.value(
         expression, scope, (ListKind,), "'for_each' takes a list", 'quote a list literal: "[left, right]"'
     )
@@ -281,7 +281,7 @@ def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | No
 
 
 def _element_names(elements: Node) -> dict[str, Node]:
-    """The names in expressions beside the fields of the message, with `for_each`."""
+    """Return the names that expressions can use with `for_each`, in addition to the fields of the message."""
     assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
     assert elements.kind.element is not None  # noqa: S101
     return {
@@ -295,7 +295,7 @@ def _element_names(elements: Node) -> dict[str, Node]:
 
 
 def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Routes of one payload case that take it from the same endpoint, or from the same topic."""
+    """Yield findings for routes of one payload case with the same source."""
     earlier: dict[str, dict[str, SourceSpan]] = {}
     for route in table.routes:
         taken = earlier.setdefault(route.case.value, {})
@@ -310,14 +310,14 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _origins(route: Route, table: RouteTable) -> dict[str, Located[str]]:
-    """The sources of a route: topics by absolute name, which begins with `/`, or endpoints."""
+    """Return the sources of a route: topics by absolute name, which begins with `/`, or endpoints."""
     if route.is_outbound:
         return {resolved(topic.topic.value, table.node): topic.topic for topic in route.source_topics}
     return {source.value: source for source in route.sources}
 
 
 def _taken(key: str, taken: Mapping[str, SourceSpan]) -> str | None:
-    """The entry of `taken` that clashes with `key`, or None. `any` clashes with all endpoints."""
+    """Return the entry of `taken` that clashes with `key`, or None. `any` clashes with all endpoints."""
     if key in taken:
         return key
     if key == ANY:

@@ -1,6 +1,6 @@
-"""Which topics a gateway sends, and how often: its patterns, over absolute topic names.
+"""Selection of the topics that a gateway sends, and of their rates, by patterns over absolute topic names.
 
-Patterns are expected to be valid; `pattern_problem` says what is wrong with one.
+Except for `pattern_problem`, patterns must be valid.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _WILDCARDS = re.compile(r"[*?]")
 _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
 _ANY_PARTS = "**"
 _REMEMBERED = 4096
-"""Topics whose answers are kept, as they are asked for at each discovery."""
+"""Number of topics whose answers are cached, because each discovery needs them."""
 
 
 class PatternProblem(NamedTuple):
-    """Why a pattern is invalid, and what to do."""
+    """A problem of an invalid pattern, and its remedy."""
 
     what: str
     hint: str
@@ -53,7 +53,7 @@ class _Answer(NamedTuple):
 
 
 class TopicSelector:
-    """Selects topics for one gateway. `inbound` are the absolute names of those that its clients publish on."""
+    """Selects topics for one gateway. `inbound` are the absolute names of topics that its clients publish on."""
 
     def __init__(self, settings: Gateway, inbound: Collection[str]) -> None:
         include = settings.include or (TopicPattern("/**", is_regex=False, span=settings.span),)
@@ -69,19 +69,19 @@ class TopicSelector:
         return self.chosen_by(topic) is not None
 
     def chosen_by(self, topic: str) -> TopicPattern | None:
-        """The first pattern that includes the topic, or None.
+        """Return the first pattern that includes the topic, or None.
 
-        Hidden topics, and those that clients publish on, are included only by their own name.
+        Hidden topics, and those that clients publish on, are only included by name.
         """
         return self._answers(topic).chosen
 
     def period(self, topic: str) -> int:
-        """The period of a topic in ns, or EACH."""
+        """Return the period of a topic in ns, or EACH."""
         rate = self._answers(topic).rate
         return rate.period if rate else self._publish_period
 
     def rated_by(self, topic: str) -> TopicPattern | None:
-        """The pattern of `rates` that sets the period, or None for `publish_period`."""
+        """Return the pattern of `rates` that sets the period, or None for `publish_period`."""
         rate = self._answers(topic).rate
         return rate.pattern if rate else None
 
@@ -98,12 +98,12 @@ class TopicSelector:
 
 
 def is_hidden(topic: str) -> bool:
-    """Whether ROS hides the topic: a part of its name begins with `_`, as with the topics of actions."""
+    """Return whether ROS hides the topic: a part of its name begins with `_`, as with the topics of actions."""
     return any(part.startswith("_") for part in _parts(topic))
 
 
 def is_name(pattern: TopicPattern) -> bool:
-    """Whether the pattern is the name of one topic."""
+    """Return whether the pattern is the name of one topic."""
     return not pattern.is_regex and not _WILDCARDS.search(pattern.text)
 
 
@@ -119,7 +119,7 @@ def matcher(pattern: TopicPattern) -> Callable[[str], object]:
 
 
 def _regex(glob: str) -> str:
-    """The regular expression of a glob. `**` matches any number of parts, at the end at least one."""
+    """Return the regular expression of a glob. `**` matches any number of parts, at the end at least one."""
     *inner, last = _parts(glob)
     parts = [r"(?:/[^/]+)*" if part == _ANY_PARTS else _part_regex(part) for part in inner]
     return "".join([*parts, r"(?:/[^/]+)+" if last == _ANY_PARTS else _part_regex(last)])

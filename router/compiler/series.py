@@ -1,4 +1,4 @@
-"""All series of a program, opened before anything is counted: scrapes show every series from the start, at 0."""
+"""Opening of all series of a program before anything is counted, so that scrapes show every series from the start."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
 
 
 def _open_own(counters: Counters, table: RouteTable) -> None:
-    """The series of mirror, recorder and reloads."""
+    """Open the series of the mirror, the recorder and reloads."""
     _open(counters, ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"))
     _open_each(counters, "config_reloads", last=RELOAD_RESULTS)
     if table.record is not None:
@@ -70,7 +70,7 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
 
 
 def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
-    """The series of a route, or of one of the topics that a route from ROS takes messages from."""
+    """Open the series of a route, or of one source topic of a route from ROS."""
     route = plan.route
     _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route)
     published = [target.label for target in plan.targets if target.is_topic]

@@ -1,4 +1,4 @@
-"""ROS topics: their names, their QoS, and the checks across all routes and gateways that name one topic."""
+"""ROS topics: names, QoS, and checks across all routes and gateways that name a topic."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PROFILES: Mapping[str, QosPlan] = {
 
 
 def diagnostics_topic(node: NodeSettings) -> Topic | None:
-    """The topic /diagnostics, if the table asks for it."""
+    """Return the topic /diagnostics, if the table enables it."""
     if node.diagnostics is None:
         return None
     span = node.diagnostics
@@ -40,9 +40,9 @@ def diagnostics_topic(node: NodeSettings) -> Topic | None:
 
 
 def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: list[Diagnostic]) -> RouteTable:
-    """The table with a type for each topic of a route whose payload case exists, or a finding for it.
+    """Return the table with a type, or a finding, for each topic of a route whose payload case exists.
 
-    Without `type` it is the message of `defaults.package` that has the name of the payload's protobuf message.
+    The default is the message of `defaults.package` with the name of the payload's protobuf message.
     """
 
     def typed(topic: Topic, case: PayloadCase) -> Topic:
@@ -69,7 +69,7 @@ def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: li
 
 
 def topic_name_finding(topic: Topic) -> Diagnostic | None:
-    """A finding if the name of a topic is invalid."""
+    """Return a finding if the name of a topic is invalid."""
     name = topic.topic.value
     if not _NAME.fullmatch(name):
         hint = "use letters, digits and '_', with '/' between parts; no part starts with a digit"
@@ -81,7 +81,7 @@ def topic_name_finding(topic: Topic) -> Diagnostic | None:
 
 
 def resolved(name: str, node: NodeSettings) -> str:
-    """The absolute name under which ROS knows a topic of this node."""
+    """Return the absolute ROS name of a topic of this node."""
     namespace = node.namespace.rstrip("/")
     if name.startswith("~/"):
         return f"{namespace}/{node.name}/{name[2:]}"
@@ -89,7 +89,7 @@ def resolved(name: str, node: NodeSettings) -> str:
 
 
 def qos_of(topic: Topic) -> QosPlan:
-    """The complete QoS: the profile, what the table says beside it, and `queue_depth` as its depth."""
+    """Return the complete QoS: the profile, the table's other settings, and `queue_depth` as the depth."""
     given = topic.qos
     plan = PROFILES[given.profile.value if given and given.profile else "default"]
     words = [key.name for key in keys_of(Qos) if key.name != "profile"]
@@ -100,7 +100,7 @@ def qos_of(topic: Topic) -> QosPlan:
 
 
 def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
-    """Contradictions in the QoS of one topic, and a QoS with which one subscriber could block the router."""
+    """Yield findings for contradictions in one topic's QoS, and for a QoS that lets a subscriber block the router."""
     given = topic.qos
     if given is None:
         return
@@ -116,7 +116,7 @@ def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
         if depth := given.depth or topic.queue_depth:
             yield conflict(depth.span, "history keep_all has no depth", "remove the depth, or write keep_last")
         elif publishes and plan.reliability != "best_effort":
-            # The middleware makes a reliable publisher wait for a full history: measured, 100 ms per message.
+            # A full history blocks a reliable publisher in the middleware: measured, 100 ms per message.
             message = "with keep_all, a single stalled subscription would block the router"
             yield conflict(given.history.span, message, "set a depth instead, or reliability: best_effort")
     if plan.durability == "transient_local" and plan.reliability == "best_effort":
@@ -127,7 +127,7 @@ def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """One mention of a topic in the table. `owner` is what findings call the route or gateway that names it."""
+    """One use of a topic in the table. `owner` names the route or gateway in findings."""
 
     topic: Topic
     owner: str
@@ -140,8 +140,8 @@ class _Use:
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
     """Check topics that several routes or gateways name.
 
-    They have one type, one QoS for each direction, matching QoS of publisher and subscriber, no way back to a sender,
-    and no deadman that publishes against others. Of a gateway these are the topics that its clients publish on.
+    They must have one type, one QoS per direction, compatible QoS of publisher and subscription, no way back to a
+    sender, and no deadman that competes with other publishers. For a gateway, these are its clients' topics.
     """
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
@@ -157,7 +157,7 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
-    """All mentions of topics by absolute name."""
+    """Return all uses of topics by absolute name."""
     uses: dict[str, list[_Use]] = {}
     for use in _all_uses(table, routes):
         if topic_name_finding(use.topic) is None:
@@ -176,7 +176,7 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
 
 
 def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
-    """Findings for endpoints that would get their own messages back through a topic."""
+    """Yield findings for endpoints that would get their own messages back through a topic."""
     sources = {source.value for source in publisher.sources}
     for destination in subscriber.destinations:
         sender = destination.endpoint
@@ -187,7 +187,7 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
 
 
 def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
-    """Findings for deadmen of gateways that publish on a topic of others, or that feed the deadman of a route."""
+    """Yield findings for deadmen of gateways that publish on a topic of others, or feed the deadman of a route."""
     if use.deadman is None:
         return
     for other in others:
@@ -222,7 +222,7 @@ def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
 
 
 def _unheard(offered: QosPlan, requested: QosPlan) -> str:
-    """Why DDS would not match the two, or an empty string."""
+    """Return why DDS would not match the two, or an empty string."""
     if offered.reliability == "best_effort" and requested.reliability == "reliable":
         return "it requests reliable, but best_effort is offered"
     if offered.durability == "volatile" and requested.durability == "transient_local":
@@ -237,5 +237,5 @@ def _unheard(offered: QosPlan, requested: QosPlan) -> str:
 
 
 def _is_longer(offered: int | None, requested: int | None) -> bool:
-    """Whether a duration is longer than another; None is infinite."""
+    """Return whether a duration is longer than another; None is infinite."""
     return requested is not None and (offered is None or offered > requested)

@@ -1,4 +1,4 @@
-"""Check the `config` of Zenoh gateways with the library, which opens nothing for that. Findings quote no values."""
+"""Check of the `config` of Zenoh gateways with the library, without opening anything. Findings quote no values."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from router.table.model import Gateway, Networks, ZenohConfig
 from router.table.nodes import Path
 
 OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
-"""Keys of the library that the table has beside `config`, with their names there."""
+"""Keys of the library that tables have beside `config`, with their names there."""
 
 
 CLIENT = "client"
-"""The mode without a listener; connects only to `connect` or to what multicast finds."""
+"""The mode without a listener: connects only to `connect` or to peers discovered by multicast."""
 
 
 def library_config(config: ZenohConfig | None) -> zenoh.Config:
-    """The library's configuration. Raises ZError, whose text may contain secrets: see `reason`."""
+    """Return the library's configuration. Raises ZError, whose text may contain secrets: see `reason`."""
     made: zenoh.Config
     if config is None:
         made = zenoh.Config()
@@ -34,7 +34,7 @@ def library_config(config: ZenohConfig | None) -> zenoh.Config:
 
 
 def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
-    """What the library refuses in a `config`, and keys that belong beside it."""
+    """Yield findings for settings that the library rejects, and for keys that belong beside `config`."""
     try:
         made = library_config(config)
     except zenoh.ZError as error:
@@ -49,12 +49,12 @@ def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
 
 
 def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnostic]:
-    """A Zenoh gateway that listens on all networks, or looks for others, beside `networks`."""
+    """Yield a finding for a gateway that listens on all networks, or discovers others, in spite of `networks`."""
     settings = gateway.zenoh
     try:
         config = library_config(settings.config) if settings else None
     except zenoh.ZError:
-        return  # has a finding of its own
+        return  # has its own finding
     if settings is None or config is None:
         return
     by_itself = {"multicast": not settings.connect and not settings.listen, "gossip": settings.mode != CLIENT}
@@ -75,12 +75,12 @@ def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnost
 
 
 def is_default(config: zenoh.Config, key: str) -> bool:
-    """Whether `key` has its default."""
+    """Return whether `key` has its default."""
     return bool(config.get_json(key) == zenoh.Config().get_json(key))
 
 
 def reason(error: object) -> str:
-    """The text of an error without the values that it quotes and the positions in the library's source."""
+    """Return the text of an error without quoted values and positions in the library's source."""
     text = re.sub(r" at /\S+:\d+\.?$", "", str(error).strip())
     if '{"access_control":' in text or "is invalid" in text:
         return "its values contradict each other, for example a user without a password"
@@ -96,7 +96,7 @@ _PLACED = (
     r"Error\(\"(?P<what>.*)\", line: (?P<line>\d+), column: (?P<column>\d+)\)",
     r"problem: \"(?P<what>[^\"]*)\", problem_mark: Mark { line: (?P<line>\d+), column: (?P<column>\d+)",
 )
-"""The forms in which the library reports positions in JSON5 and YAML. JSON5's has the line itself before the text."""
+"""Formats of positions in the library's errors for JSON5 and YAML. JSON5's has the line itself before the text."""
 
 
 def _without_values(text: str) -> str:
@@ -117,7 +117,7 @@ def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
 
 
 def _blamed(value: Any, here: Path, message: str) -> Path:
-    """The path of the innermost member of `value` that alone makes the library refuse it with the same message."""
+    """Return the path of the innermost member of `value` that alone causes the same error."""
     if isinstance(value, (dict, list)) and _refused(here, type(value)()) != message:
         for step, member in value.items() if isinstance(value, dict) else enumerate(value):
             is_missing = message.startswith("missing field") and not isinstance(member, (dict, list))

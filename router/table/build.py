@@ -156,7 +156,7 @@ class _Builder:
         self.broken: set[str] = set()
 
     def one(self, root: MappingNode, name: str, build: Callable[[Entry], T]) -> T | None:
-        """The part under a key of the root; None when it is absent or broken."""
+        """Build the part under a key of the root; None if it is absent or broken."""
         entry = root.entries.get(name)
         return self._built(name, entry, build, _nothing) if entry else None
 

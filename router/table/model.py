@@ -226,7 +226,7 @@ class FieldMap:
     entries: tuple[FieldEntry, ...]
 
     def __str__(self) -> str:
-        """`{brake: true}`."""
+        """Return the text of a table: `{brake: true}`."""
         entries = ["auto"] if self.auto else []
         entries += [f"{'.'.join(entry.path)}: {entry.value}" for entry in self.entries]
         return f"{{{', '.join(entries)}}}"

@@ -1,1 +1,1 @@
-"""What exists: protobuf descriptors, ROS interfaces, the lock file, what boards can hold."""
+"""Type definitions: protobuf descriptors, ROS interfaces, the lock file, limits of boards."""

@@ -1,7 +1,7 @@
-"""What a datagram for a board may hold, by field: its firmware decodes with nanopb, into structures of a fixed size.
+"""Limits of the datagrams for a board, by field: its firmware decodes with nanopb, into structures of a fixed size.
 
-`boards` says how large fields may be. The carrier checks each datagram before it is sent (`native/board.h`), the
-compiler what deadmen send.
+`boards` computes how large fields may be. The carrier checks each datagram before it is sent (`native/board.h`), the
+compiler checks the payloads of deadmen.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from router.types.boards import OptionsOf, why_unbounded
 from router.types.descriptors import message_of
 
 MOST_MESSAGES, MOST_LISTS = 65536, 4096
-"""Places of messages and of lists in the envelope of a board."""
+"""Maximum number of messages and of lists, nested ones included, in the envelope of a board."""
 
 _FLOATS = (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE)
 
 
 @dataclass(frozen=True, slots=True)
 class BoardField:
-    """The bounds of a field. `path` names it from the payload case on: `arm_ctrl.name`.
+    """The bounds of a field. `path` begins with the payload case: `arm_ctrl.name`.
 
-    `longest` is in bytes, of a string or bytes, `most` in elements. None is no bound. With `has_fixed_length` or
-    `has_fixed_count` there is exactly as much, or nothing. `message` has the fields of a message.
+    `longest` is the limit of a string or bytes in bytes, `most` the limit of a list in elements; None means no limit.
+    With `has_fixed_length` or `has_fixed_count` the size is exactly the limit, or zero. `message` has the fields of a
+    message.
     """
 
     path: str
@@ -44,11 +45,11 @@ class BoardField:
 
 
 BoardMessage = Mapping[int, BoardField]
-"""The fields of a message that are checked, by number."""
+"""The fields of a message that are checked, by field number."""
 
 
 def places(message: BoardMessage) -> tuple[int, int]:
-    """How many places of messages and of lists there are in a message, with its own."""
+    """Return the number of messages and of lists in a message, itself and nested ones included."""
     below = [places(field.message) for field in message.values() if field.message is not None]
     lists = sum(field.most is not None for field in message.values())
     return 1 + sum(messages for messages, _ in below), lists + sum(lists for _, lists in below)
@@ -56,14 +57,14 @@ def places(message: BoardMessage) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class BoardLimits:
-    """What one board can take. `longest` is the size of its largest envelope in bytes."""
+    """The limits of one board. `longest` is the size of its largest envelope in bytes."""
 
     fields: BoardMessage
     longest: int
     allows_non_finite: bool
 
     def misfit(self, field: BoardField, value: object) -> str:
-        """Why a scalar of a payload does not fit its field; empty if it does."""
+        """Return why a scalar of a payload does not fit its field; empty if it does."""
         if isinstance(value, float) and not self.allows_non_finite and not math.isfinite(value):
             return f"{field.path} is {value}"
         if not isinstance(value, (str, bytes)) or field.longest is None:
@@ -76,9 +77,9 @@ class BoardLimits:
 def board_fields(
     message: Descriptor, options_of: OptionsOf, path: str = "", inside: frozenset[Descriptor] = frozenset()
 ) -> BoardMessage:
-    """The fields of a message that have bounds, or hold floats, at any depth.
+    """Return the fields of a message that have bounds or contain floats, at any depth.
 
-    Left out is what has no bound: no payload case with such a field may be sent to a board.
+    Unbounded fields are omitted: no payload case with such a field may be sent to a board.
     """
     fields = {}
     for descriptor in message.fields:

@@ -1,8 +1,8 @@
-"""What a board can take: boards decode with nanopb into structures of a fixed size.
+"""Sizes that a board can decode: boards decode with nanopb into structures of a fixed size.
 
-nanopb's `.options` files say how large strings, bytes and repeated fields are. The largest encoding of a message in
-bytes is that of nanopb's `*_size` macros; boards reject a datagram that is longer. The rules of counting are checked
-against nanopb's generator in the tests: an int32 takes up to 10 bytes, an enum as many as its largest declared value.
+nanopb's `.options` files limit strings, bytes and repeated fields. The largest encoding of a message in bytes equals
+nanopb's `*_size` macro; boards reject longer datagrams. Tests compare the sizes with nanopb's generator: an int32 takes
+up to 10 bytes, an enum as many as its largest declared value.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TYPES = {"FT_DEFAULT": True, "FT_STATIC": True, "FT_INLINE": True, "FT_CALLBACK
 class BoardOptions:
     """nanopb's options of one field. Sizes in bytes, a string's with its final NUL.
 
-    `is_static` is False where the board holds the field by pointer or callback, which has no bound.
+    `is_static` is False if the board stores the field by pointer or callback, which has no bound.
     """
 
     max_size: int | None = None
@@ -53,7 +53,7 @@ class BoardOptions:
 
     @property
     def string_size(self) -> int | None:
-        """As `max_size` of a string: `max_length` wins where both are given."""
+        """The size of a string with its NUL: from `max_length`, else `max_size`."""
         return self.max_length + 1 if self.max_length is not None else self.max_size
 
 
@@ -62,7 +62,7 @@ NO_OPTIONS = BoardOptions()
 
 @dataclass(frozen=True, slots=True)
 class OptionsLine:
-    """`changes` of what has a full name that `pattern`, with wildcards, matches."""
+    """A line of an `.options` file: `changes` for all full names that `pattern`, with wildcards, matches."""
 
     span: SourceSpan
     pattern: str
@@ -71,14 +71,14 @@ class OptionsLine:
 
 @dataclass(frozen=True, slots=True)
 class OptionsFile:
-    """The lines of one file, in their order."""
+    """The lines of one `.options` file, in order."""
 
     lines: tuple[OptionsLine, ...] = ()
 
     def of(self, message: str, field: str) -> BoardOptions:
-        """Full name of the message (or of the enclosing ones, by pattern), name of the field.
+        """Return the options of a field, by the full name of its message and its own name.
 
-        As in nanopb, options of a message hold for its fields, and later lines win over earlier ones.
+        As in nanopb, options of a message apply to its fields, and later lines override earlier ones.
         """
         options = NO_OPTIONS
         for name in (message, f"{message}.{field}"):
@@ -88,7 +88,7 @@ class OptionsFile:
         return options
 
     def unused(self, proto: FileDescriptorProto) -> Iterator[Diagnostic]:
-        """A warning for each line that matches nothing in its `.proto` file, so that what it bounds is unbounded."""
+        """Yield a warning for each line that matches nothing in its `.proto` file, which leaves a field unbounded."""
         names = set(_names(proto))
         for line in self.lines:
             if any(fnmatchcase(name, line.pattern) for name in names):
@@ -100,7 +100,7 @@ class OptionsFile:
 
 
 def _names(proto: FileDescriptorProto) -> Iterator[str]:
-    """The full names that nanopb knows options for."""
+    """Yield the full names that nanopb accepts options for."""
     scope = f"{proto.package}." if proto.package else ""
     yield from (f"{scope}{enum.name}" for enum in proto.enum_type)
     yield from (f"{scope}{extension.name}" for extension in proto.extension)
@@ -116,7 +116,7 @@ def _names(proto: FileDescriptorProto) -> Iterator[str]:
 
 
 def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
-    """An `.options` file and what is wrong with it."""
+    """Read an `.options` file. Return it with its findings."""
     try:
         text = inputs.read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -139,7 +139,7 @@ def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
 
 
 def _changes(text: str) -> tuple[Mapping[str, int | bool], Iterable[tuple[str, str]]]:
-    """What one line sets, and (message, hint) of what cannot be understood."""
+    """Return the options that a line sets, and (message, hint) for each problem."""
     text = text.strip()
     changes: dict[str, int | bool] = {}
     if not text:
@@ -175,16 +175,16 @@ OptionsOf = Callable[[FieldDescriptor], BoardOptions]
 
 @dataclass(frozen=True, slots=True)
 class Unbounded:
-    """A field without a largest encoding; `path` leads to it from the message that was asked for."""
+    """A field without a largest encoding; `path` leads to it from the message that was examined."""
 
     path: tuple[FieldDescriptor, ...]
     why: str
 
 
 def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
-    """The largest encoding of a message in bytes, None where a field has no bound.
+    """Return the largest encoding of a message in bytes, None if a field has no bound.
 
-    Of a oneof only the largest member counts. Extensions do not count.
+    Only the largest member of a oneof counts. Extensions do not count.
     """
     if any(unbounded_fields(message, options_of)):
         return None
@@ -192,7 +192,7 @@ def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
 
 
 def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
-    """The largest encoding of what a message holds beside one of its oneofs, fields without a bound left out."""
+    """Return the largest encoding of a message without one of its oneofs. Fields without a bound do not count."""
     message = oneof.containing_type
     unbounded = {found.path[0] for found in unbounded_fields(message, options_of)}
     members = {*oneof.fields, *unbounded}
@@ -200,14 +200,14 @@ def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
 
 
 def framed_size(number: int, payload: int) -> int:
-    """The encoding of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
+    """Return the size of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
     return len(varint(number << 3)) + len(varint(payload)) + payload
 
 
 def unbounded_fields(
     message: Descriptor, options_of: OptionsOf, path: tuple[FieldDescriptor, ...] = ()
 ) -> Iterator[Unbounded]:
-    """Every field inside the message, at any depth, that has no largest encoding."""
+    """Yield every field inside the message, at any depth, that has no largest encoding."""
     inside = {step.containing_type for step in path}
     for field in message.fields:
         here = (*path, field)
@@ -222,7 +222,7 @@ def unbounded_fields(
 
 
 def why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
-    """Why a field has no largest encoding, None if it has one: what it contains does not count."""
+    """Return why a field has no largest encoding, None if it has one. The fields inside it are not considered."""
     if field.type == FieldDescriptor.TYPE_GROUP:
         return "is a group, which nanopb does not support"
     if field.is_repeated and options.max_count is None:
@@ -254,7 +254,7 @@ def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
     size = len(varint(field.number << 3)) + _value_size(field, options, options_of)
     if not field.is_repeated or options.max_count is None:
         return size
-    # Room for the unpacked form, which every decoder must take; for one element the packed form is longer.
+    # Room for the unpacked form, which every decoder must accept; for one element the packed form is longer.
     return size * options.max_count + (1 if options.max_count == 1 else 0)
 
 
@@ -274,10 +274,10 @@ def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: Optio
 
 
 def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: SourceSpan) -> list[Diagnostic]:
-    """Why a board cannot take this payload case; empty when it can.
+    """Return findings if a board cannot decode this payload case.
 
-    `limit` is the largest envelope in bytes that boards accept (see `lock.locked_size`), `span` the place in
-    the table that sends the case to a board.
+    `limit` is the largest envelope in bytes that boards accept, `span` the place in the table that sends the case to a
+    board.
     """
     unbounded = unbounded_fields(schema.descriptor(case.type.name), schema.board_options)
     findings = [_unbounded_finding(case, found, schema, span) for found in unbounded]

@@ -1,7 +1,4 @@
-"""What a field's descriptor refers to, and how its `.proto` file spells its type.
-
-protobuf's type hints allow None wherever a field may be of another kind.
-"""
+"""References of field descriptors, without the None in protobuf's type hints, and the spelling of field types."""
 
 from __future__ import annotations
 
@@ -10,28 +7,28 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
 
 def container(field: FieldDescriptor) -> Descriptor:
-    """The message that declares the field."""
+    """Return the message that declares the field."""
     if field.containing_type is None:
-        raise TypeError(f"{field.full_name} is no member of a message")
+        raise TypeError(f"{field.full_name} is not a member of a message")
     return field.containing_type
 
 
 def message_of(field: FieldDescriptor) -> Descriptor:
-    """The type of a message or group field."""
+    """Return the type of a message or group field."""
     if field.message_type is None:
-        raise TypeError(f"{field.full_name} is no message")
+        raise TypeError(f"{field.full_name} is not a message")
     return field.message_type
 
 
 def enum_of(field: FieldDescriptor) -> EnumDescriptor:
-    """The type of an enum field."""
+    """Return the type of an enum field."""
     if field.enum_type is None:
-        raise TypeError(f"{field.full_name} is no enum")
+        raise TypeError(f"{field.full_name} is not an enum")
     return field.enum_type
 
 
 def declared_type(field: FieldDescriptor) -> str:
-    """`sint32`, `repeated float`, `delimited Motor`: what decides a field's bytes on the wire."""
+    """Return the type that determines a field's encoding: `sint32`, `repeated float`, `delimited Motor`."""
     if field.message_type is not None:
         name = field.message_type.full_name
         if field.type == FieldDescriptor.TYPE_GROUP:

@@ -1,7 +1,7 @@
-"""The zeros at the end of an envelope: which a sender may leave out, or add.
+"""Trailing zeros of envelopes, which a sender may omit or add.
 
-The protocol lets a sender leave out the zeros at the end of an envelope, and boards may send frames of a fixed size,
-padded with zeros. Both can be undone, because a tag is never zero and the last field states its length.
+The protocol lets a sender omit the zeros at the end of an envelope, and boards may send frames of a fixed size, padded
+with zeros. Both can be undone, because a tag is never zero and the last field states its length.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ _FIXED = {I64: I64_SIZE, I32: I32_SIZE}
 def restored(data: bytes, limit: int = MAX_DATAGRAM) -> bytes:
     """Return the envelope with the trailing zeros that it had when it was encoded.
 
-    Returns `data` itself where that is complete, or cannot be such an envelope: a cut tag, groups, or a field that
-    would make it longer than `limit` bytes. A datagram that was cut inside its last field looks like one whose zeros
-    were removed; its payload then most often has a zero for a tag, which the parser refuses.
+    Returns `data` itself if it is complete or cannot be such an envelope: a truncated tag, groups, or a field that
+    would make it longer than `limit` bytes. A datagram truncated inside its last field looks like one whose zeros were
+    removed; its payload then usually has a zero as a tag, which the parser rejects.
     """
     position, size = 0, len(data)
     with_zero = data + b"\0"
@@ -45,6 +45,6 @@ def restored(data: bytes, limit: int = MAX_DATAGRAM) -> bytes:
 
 
 def trimmed(data: bytes) -> bytes:
-    """Return an envelope without its trailing zeros, if `restored` can tell from the rest how many there were."""
+    """Return an envelope without its trailing zeros, if `restored` can reconstruct them from the rest."""
     bare = data.rstrip(b"\0")
     return bare if restored(bare) == data else data

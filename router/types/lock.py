@@ -1,11 +1,11 @@
-"""Field numbers are permanent: compares the `.proto` files with the lock file.
+"""Comparison of the `.proto` files with the lock file: field numbers are permanent.
 
-A number that changes its meaning is an error, since boards in the field keep the old one. What is merely
-new is a warning until `router schema lock` records it.
+A number that changes its meaning is an error, because boards in the field keep the old one. An addition is a warning
+until `router schema lock` records it.
 
-The wire has no names of packages and oneofs. So a locked declaration that is gone is taken for the one of the same
-name in another package, and their members are compared. A message or enum of another name is another one, whatever is
-in it: that it was only renamed cannot be told.
+The wire format has no names of packages and oneofs. A locked declaration that has disappeared is therefore compared
+with the one of the same name in another package. A message or enum with a different name counts as another one,
+whatever its content: a rename cannot be detected.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from router.types.protobuf import Envelope, ProtoSchema
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """A break of the wire: what it is called for `router schema lock --accept`, and the finding.
+    """An incompatible change of the wire format: its name for `router schema lock --accept`, and the finding.
 
     `owner` is the message or enum. `entries` are its locked members whose numbers lose their meaning.
     """
@@ -50,10 +50,10 @@ class Conflict:
 
 
 class LockComparison:
-    """The `.proto` files compared with their lock file, which is read once.
+    """The differences between the `.proto` files and their lock file, which is read once.
 
-    `lock` is what the file holds, None where there is none. `conflicts` break the wire, `additions` are warnings of
-    what is merely new, `faults` say what is wrong with the file itself.
+    `lock` is the content of the file, or None. `conflicts` are incompatible changes, `additions` are warnings about new
+    declarations, `faults` are problems with the file itself.
     """
 
     def __init__(self, schema: ProtoSchema, envelope: Envelope) -> None:
@@ -74,13 +74,13 @@ class LockComparison:
 
     @property
     def max_size(self) -> int | None:
-        """The envelope's largest encoding in bytes that the lock records, None without a readable lock."""
+        """The envelope's largest encoding in bytes according to the lock, None without a readable lock."""
         return self.lock.max_size if self.lock is not None else None
 
     def findings(self, named: Located[Path] | None = None) -> list[Diagnostic]:
-        """Every difference, and what is wrong with the lock file itself, ordered by place.
+        """Return every difference, or the problems of the lock file itself, ordered by position.
 
-        `named` is where the table names the lock file: then it must exist.
+        `named` is the lock file that the table names, if it does: then it must exist.
         """
         if self.lock is not None:
             errors = [conflict.finding for conflict in self.conflicts]
@@ -95,9 +95,9 @@ class LockComparison:
         return [Diagnostic(self._schema.span(self._envelope.name), Code.NOT_LOCKED, message, hint)]
 
     def extended(self, accepted: Collection[Conflict] = ()) -> Lock:
-        """The lock with everything added that is new. Nothing else is taken out than what the accepted conflicts break.
+        """Return the lock with all additions, and without the entries that the accepted conflicts break.
 
-        Raises TableError when the lock file is broken. Every other conflict must have been refused.
+        Raises TableError if the lock file is broken. The caller must have refused all other conflicts.
         """
         if self.faults:
             raise TableError(self.faults)
@@ -139,7 +139,7 @@ class LockComparison:
             self._add(span, message, "flash the boards, then ")
 
     def _compare(self, owner: str, locked: Declaration, current: Declaration) -> None:
-        """Members of one message or enum, by number; locked ones whose number is reserved are out of use."""
+        """Compare the members of one message or enum by number, except locked ones whose number is now reserved."""
         reserved = self._schema.reserved_numbers(owner)
         live = [entry for entry in by_number(locked) if not any(entry.number in span for span in reserved)]
         moved = set()
@@ -222,12 +222,12 @@ def _place(entry: Entry) -> str:
 
 
 def _shown(entry: Entry) -> str:
-    """As in a `.proto` file: `float ph_value = 1`, but with `enum` before the type of an enum."""
+    """Print an entry as in a `.proto` file: `float ph_value = 1`, but with `enum` before the type of an enum."""
     return f"`{entry.type} {entry.name} = {entry.number}`".replace("` ", "`")
 
 
 def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
-    """What records these protos, to be typed where the router runs."""
+    """Return the command that records these protos, to be run in the router's working directory."""
     message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
     words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]
     if schema.lock != schema.root / LOCK_NAME:
@@ -240,7 +240,7 @@ def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
 
 
 def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
-    """What the lock would be for the `.proto` files as they are."""
+    """Return the lock that describes the `.proto` files as they are."""
     messages = {}
     for name in schema.messages:
         if (file := schema.sources.file(name)) in schema.files:
@@ -281,9 +281,9 @@ def _extended(
 
 
 def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
-    """The lock with its messages, enums and oneofs called as they are now, and from which name to which.
+    """Return the lock with the current names of messages, enums and oneofs, and the renames from old to new.
 
-    An envelope that is gone is taken for the present one: it is another then, but its numbers count.
+    An envelope that has disappeared is compared with the current one, although it is another: its numbers count.
     """
     moved = _moved(lock, current)
     names = dict(moved)
@@ -303,7 +303,7 @@ def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
 
 
 def _moved(lock: Lock, current: Lock) -> dict[str, str]:
-    """From the full name of what is gone to that of what is new, if only the package differs, and that is certain."""
+    """Map full names that have disappeared to new ones, where only the package differs unambiguously."""
     moved: dict[str, str] = {}
     for locked, there in ((lock.messages, current.messages), (lock.enums, current.enums)):
         new = [(_without_package(name, current.messages), name) for name in there if name not in locked]
@@ -315,7 +315,7 @@ def _moved(lock: Lock, current: Lock) -> dict[str, str]:
 
 
 def _without_package(name: str, messages: Container[str]) -> str:
-    """`Motor.State` of `rover.Motor.State`, if there is a message `rover.Motor`."""
+    """Return `Motor.State` for `rover.Motor.State`, if there is a message `rover.Motor`."""
     around, _, last = name.rpartition(".")
     return f"{_without_package(around, messages)}.{last}" if around in messages else last
 
@@ -336,7 +336,7 @@ def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> d
 
 
 def _renamed_oneofs(locked: Declaration, current: Declaration) -> dict[str, str]:
-    """From the name of a oneof that is gone to that of a new one with a member of it."""
+    """Map the name of a oneof that has disappeared to that of a new one with one of its members."""
     was = {entry.oneof for entry in locked.entries}
     if was == {entry.oneof for entry in current.entries}:
         return {}

@@ -1,4 +1,4 @@
-"""The lock file: every field number that was ever given out, and what it was given to. Read and written here."""
+"""Reading and writing of the lock file: every field number that was ever assigned, and its field."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from router.errors import Code, SourceSpan, TableError, shown_path
 LOCK_NAME = "envelope.lock.json"
 
 ENVELOPE, ONEOF = "PBEnvelope", "payload"
-"""The envelope's names where there is neither table nor lock to say them."""
+"""The envelope's names if neither a table nor a lock specifies them."""
 
 _FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A field's or enum value's number and name; `type` as `descriptors.declared_type`, empty for enum values.
+    """A field or enum value: number, name, and `type` as in `descriptors.declared_type`, empty for enum values.
 
-    `oneof` is the one that a field is in, empty for none.
+    `oneof` is the oneof of a field, empty for none.
     """
 
     number: int
@@ -37,7 +37,7 @@ class Entry:
 class Declaration:
     """A message or an enum: the file that declares it, relative to the folder of the protos, and its members.
 
-    `reserved` are ranges of numbers, the first and the last of each.
+    `reserved` are ranges of numbers, as (first, last).
     """
 
     file: str
@@ -47,7 +47,7 @@ class Declaration:
 
 @dataclass(frozen=True, slots=True)
 class Lock:
-    """`max_size` is the envelope's largest encoding in bytes, which the boards were flashed with."""
+    """The content of a lock file. `max_size` is the envelope's largest encoding in bytes in the boards' firmware."""
 
     message: str
     oneof: str
@@ -57,7 +57,7 @@ class Lock:
 
 
 def read_lock(path: Path) -> Lock | None:
-    """None where there is no such file. Raises TableError for a broken one."""
+    """Read a lock file; None if it does not exist. Raises TableError if it is broken."""
     span = SourceSpan(shown_path(path))
     try:
         content = json.loads(inputs.read_text(path), object_pairs_hook=_without_duplicates)
@@ -79,7 +79,7 @@ def read_lock(path: Path) -> Lock | None:
 
 
 def lock_text(lock: Lock) -> str:
-    """As the file holds it: sorted, one line for each number."""
+    """Return the text of the file: sorted, one line per number."""
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
@@ -94,7 +94,7 @@ def lock_text(lock: Lock) -> str:
 
 
 def _declaration(declared: Declaration, kind: str, members: Mapping[str, str]) -> dict[str, object]:
-    """`reserved` is a list of ranges, the first and the last number of each; left out where there is none."""
+    """Return a declaration as JSON data. `reserved`, a list of ranges, is omitted if empty."""
     content: dict[str, object] = {"file": declared.file, kind: members}
     if declared.reserved:
         content["reserved"] = [f"{first} to {last}" for first, last in sorted(declared.reserved)]
@@ -102,12 +102,12 @@ def _declaration(declared: Declaration, kind: str, members: Mapping[str, str]) -
 
 
 def _field(entry: Entry) -> str:
-    """`float x`, or `oneof payload: Imu imu`."""
+    """Print a field: `float x`, or `oneof payload: Imu imu`."""
     return f"oneof {entry.oneof}: {entry.type} {entry.name}" if entry.oneof else f"{entry.type} {entry.name}"
 
 
 def _values(entries: Iterable[Entry]) -> dict[str, str]:
-    """The name of each number, or its names."""
+    """Return the name or names of each number."""
     values: dict[str, str] = {}
     for entry in entries:
         known = values.get(str(entry.number))
@@ -116,7 +116,7 @@ def _values(entries: Iterable[Entry]) -> dict[str, str]:
 
 
 def write_lock(path: Path, lock: Lock) -> None:
-    """Write all of it or nothing. Raises TableError."""
+    """Write the file atomically. Raises TableError."""
     scratch = path.with_name(f".{path.name}.new")
     try:
         scratch.write_text(lock_text(lock), encoding="utf-8")
@@ -128,17 +128,17 @@ def write_lock(path: Path, lock: Lock) -> None:
 
 
 def short_name(name: str) -> str:
-    """Without package."""
+    """Return a name without its package."""
     return name.rpartition(".")[2]
 
 
 def by_number(declaration: Declaration) -> list[Entry]:
-    """The members in an order that does not change from run to run."""
+    """Return the members in a reproducible order."""
     return sorted(declaration.entries, key=lambda entry: (entry.number, entry.name))
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Two branches that gave out one number leave two equal keys after a merge."""
+    """Reject duplicate keys, which remain after a merge of two branches that assign the same number."""
     content = dict(pairs)
     if len(content) < len(pairs):
         twice = next(key for index, (key, _) in enumerate(pairs) if key in dict(pairs[:index]))
@@ -147,7 +147,7 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _parsed(content: Any) -> Lock:
-    """Raises ValueError, LookupError, TypeError or AttributeError where the content has another structure."""
+    """Parse the content. Raises ValueError, LookupError, TypeError or AttributeError if its structure differs."""
     envelope = content["envelope"]
     return Lock(
         message=str(envelope["message"]),
@@ -164,7 +164,7 @@ def _declared(content: Any, kind: str, entries: Callable[[Mapping[str, str]], It
 
 
 def _range(text: str) -> tuple[int, int]:
-    """`20 to 29`."""
+    """Parse a range: `20 to 29`."""
     first, last = text.split(" to ")
     return int(first), int(last)
 

@@ -17,7 +17,7 @@ class Bool:
 class Int:
     """A two's complement integer of 8, 16, 32 or 64 bits.
 
-    `octet` marks ROS's `byte`: a uint8 in every respect but how rclpy spells its type.
+    `octet` marks ROS's `byte`, which differs from a uint8 only in how rclpy spells its type.
     """
 
     bits: int
@@ -69,7 +69,7 @@ class Bytes:
 
 @dataclass(frozen=True, slots=True)
 class Enum:
-    """A protobuf enum; `values` are those that have names. A value may be any int32, unless it `is_closed` (proto2)."""
+    """A protobuf enum with its named `values`. A value may be any int32, unless the enum `is_closed` (proto2)."""
 
     name: str
     values: tuple[tuple[str, int], ...]
@@ -81,7 +81,7 @@ class Enum:
 
 @dataclass(frozen=True, slots=True)
 class List:
-    """`length` elements exactly (a ROS array), or at most `bound`, or any number."""
+    """A list of exactly `length` elements (a ROS array), at most `bound`, or any number."""
 
     element: Type
     length: int | None = None
@@ -96,13 +96,11 @@ class List:
 class Field:
     """One member of a message.
 
-    `number` is the protobuf field number (0 for ROS). `has_presence` says that "not set" differs from
-    the default, `is_required` that there is no message without it (proto2, and both parts of a map entry).
-    `oneof` is the protobuf oneof that it is a member of; an optional field may have one of its own. `is_unchecked` text
-    may be something else than UTF-8, as in proto2: protobuf then gives bytes. `is_group` says that its message stands
-    between two tags, without a length.
-    `default` is a ROS field's declared default, None where the type's zero is meant. `comment` is the
-    documentation beside it, as one line.
+    `number` is the protobuf field number (0 for ROS). With `has_presence`, "not set" differs from the default; a field
+    that `is_required` must be set (proto2, and both parts of a map entry). `oneof` is the field's protobuf oneof; an
+    optional field may have its own. Text that `is_unchecked` may not be UTF-8, as in proto2: protobuf then returns
+    bytes. A message that `is_group` is encoded between two tags, without a length. `default` is a ROS field's declared
+    default, None for the type's zero. `comment` is its documentation, as one line.
     """
 
     name: str
@@ -121,10 +119,9 @@ class Field:
 class MessageType:
     """A protobuf message (`SensorBoardIMUInfo`) or a ROS one (`sensor_msgs/msg/Imu`).
 
-    Compared by identity: a name has one MessageType per schema. Fields keep their declared order,
-    which for ROS decides the bytes. Protobuf messages may contain themselves, so `fields` is filled
-    by the code that builds the type, once, and not changed afterwards. With `is_map_entry` a list of it is a
-    protobuf map.
+    Compared by identity: a name has one MessageType per schema. Fields keep their declared order, which determines the
+    encoding in ROS. Protobuf messages may contain themselves, so the code that builds the type fills `fields` once,
+    afterwards. A list of a type that `is_map_entry` is a protobuf map.
     """
 
     name: str

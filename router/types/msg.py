@@ -1,8 +1,8 @@
-"""The ROS interface language: the text of one `.msg` file becomes fields and constants.
+"""Parser of the ROS interface language: from the text of one `.msg` file to fields and constants.
 
-Other messages are not looked up here. Quotes, escapes and ranges of constants and default values follow rosidl_adapter,
-the parser that ROS builds its interfaces with. rosbags has such a parser too, but it drops default values and takes
-`wstring` for a message.
+References to other messages are not resolved here. Quotes, escapes and ranges of constants and default values follow
+rosidl_adapter, the parser that ROS builds its interfaces with. The parser of rosbags drops default values and treats
+`wstring` as a message.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CONSTANT_NAME = re.compile(r"[A-Z](?:_?[A-Z0-9])*")
 
 
 class MsgError(ValueError):
-    """What is wrong with one line; `line`, `column` and `end_column` as in SourceSpan."""
+    """A mistake in one line; `line`, `column` and `end_column` as in SourceSpan."""
 
     def __init__(self, message: str, line: int, column: int, end_column: int) -> None:
         super().__init__(message)
@@ -50,7 +50,7 @@ class MsgError(ValueError):
 class MsgDefinition:
     """Fields and constants as declared. A field of another message has a MessageType of its name, without fields.
 
-    `lines` are those of the fields, by name.
+    `lines` are the line numbers of the fields, by name.
     """
 
     fields: tuple[Field, ...]
@@ -59,7 +59,7 @@ class MsgDefinition:
 
 
 def parse_msg(package: str, text: str) -> MsgDefinition:
-    """The definition in `text`; names without a package are of `package`. Raises MsgError at the first fault."""
+    """Parse `text`; names without a package belong to `package`. Raises MsgError at the first mistake."""
     fields: dict[str, Field] = {}
     lines: dict[str, int] = {}
     constants: dict[str, object] = {}
@@ -70,9 +70,9 @@ def parse_msg(package: str, text: str) -> MsgDefinition:
         code, sign, comment = raw.partition("#")
         header = header and raw.startswith("#")
         if not code.strip():
-            if code and sign and last is not None:  # an indented comment goes on with the line above
+            if code and sign and last is not None:  # an indented comment continues the line above
                 last = fields[last.name] = replace(last, comment=_one_line(last.comment, comment))
-            else:  # what is above a declaration belongs to it, but for the file's first block
+            else:  # comments above a declaration belong to it, except the file's first block
                 comments = [*comments, comment] if sign and not header else []
             continue
         line = _Line(number, code.replace("\t", " "))
@@ -100,7 +100,7 @@ def _refuse_second(name: str, known: Mapping[str, object], line: _Line) -> None:
 
 
 class _Line:
-    """One declaration: `type name`, `type name default` or `type NAME=value`, comment already cut off."""
+    """One declaration without its comment: `type name`, `type name default` or `type NAME=value`."""
 
     def __init__(self, number: int, text: str) -> None:
         self._number = number
@@ -115,7 +115,7 @@ class _Line:
         return "=" in self._rest
 
     def error(self, message: str, blamed: str) -> MsgError:
-        """An error at `blamed`, a stretch of the line's text."""
+        """Return an error at `blamed`, a part of the line's text."""
         start = max(self._text.find(blamed), 0)
         return MsgError(message, self._number, start + 1, start + 1 + max(len(blamed), 1))
 
@@ -173,7 +173,7 @@ _ELEMENT = re.compile(r"""\s*("(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'|[^,]*)\s*(,|$)
 
 
 def parse_value(type_: Type, text: str) -> object:
-    """The value that `text` stands for; a list's as a tuple. Raises ValueError, its text being the finding."""
+    """Parse a value, a list as a tuple. Raises ValueError with the text of the finding."""
     if isinstance(type_, List):
         return _parse_list(type_, text)
     if isinstance(type_, Bool):
@@ -193,7 +193,7 @@ def parse_value(type_: Type, text: str) -> object:
 
 
 def is_zero(value: object) -> bool:
-    """Whether a value is what its type holds when nothing is said."""
+    """Return whether a value is the default of its type."""
     if isinstance(value, tuple):
         return all(map(is_zero, value))
     if isinstance(value, float):
@@ -238,7 +238,7 @@ def _parse_list(type_: List, text: str) -> tuple[object, ...]:
         if element is None or not element[1]:
             raise ValueError(f"'{text}' is not a list of {type_.element}")
         item = parse_value(type_.element, element[1].rstrip())
-        items.append(item.strip() if isinstance(item, str) else item)  # even inside quotes, as rosidl_adapter does
+        items.append(item.strip() if isinstance(item, str) else item)  # even inside quotes, like rosidl_adapter
         at = element.end()
     if type_.length is not None and len(items) != type_.length:
         raise ValueError(f"the array has {type_.length} elements, its default {len(items)}")

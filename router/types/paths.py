@@ -1,4 +1,4 @@
-"""Paths to fields of messages in messages: what a name means that is written without the names before it."""
+"""Paths to nested fields: resolves a name that is written without the names before it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from router.errors import nearest
 from router.types.model import List, MessageType
 
 DEEPEST = 2
-"""Messages between the one that a path begins in and the one that has its first name."""
+"""Maximum number of messages that a path omits before its first name."""
 _ALIKE = 0.8
-"""How near a misspelt name further down is to be suggested."""
+"""Similarity required to suggest a nested field for a misspelt name."""
 
 
 def leads(message: MessageType, names: Sequence[str]) -> bool:
-    """Whether `names` is a path from the message to a field."""
+    """Return whether `names` is a path from the message to a field."""
     *way, last = names
     holder = message
     for name in way:
@@ -26,9 +26,9 @@ def leads(message: MessageType, names: Sequence[str]) -> bool:
 
 
 def ways(message: MessageType, names: Sequence[str], *, with_lists: bool = False) -> list[str]:
-    """The paths, shortest first, that end in `names`; else those that end in a name that is near a single one.
+    """Return the paths that end in `names`, shortest first; for a single name, else those that end in a similar one.
 
-    `with_lists` they may go through the first element of a list, as in `samples[0].value`.
+    `with_lists`, they may go through the first element of a list, as in `samples[0].value`.
     """
     below = list(_below(message, with_lists=with_lists))
     wanted = ".".join(names)
@@ -41,7 +41,7 @@ def ways(message: MessageType, names: Sequence[str], *, with_lists: bool = False
 
 
 def _below(message: MessageType, *, with_lists: bool) -> Iterator[tuple[str, MessageType]]:
-    """The messages in a message, each with the path to its fields; those in lists come last."""
+    """Yield the messages in a message, each with the path to its fields; those in lists come last."""
     level: list[tuple[str, MessageType]] = [("", message)]
     behind: list[tuple[str, MessageType]] = []
     for _ in range(DEEPEST):

@@ -1,6 +1,6 @@
-"""The files of a folder of `.proto` files: their texts, faults that protoc has no good message for, and the envelope.
+"""A folder of `.proto` files: texts, problems for which protoc has no good message, and the file of the envelope.
 
-What a text declares and imports is found without a compiler, also where the file does not compile.
+Declarations and imports are found without a compiler, so this also works for files that do not compile.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did
 from router.lean import left_out
 from router.types.lock_file import Lock
 
-with left_out("_hashlib"):  # OpenSSL: 4 MB and 8 ms, where Python's own is enough
+with left_out("_hashlib"):  # OpenSSL costs 4 MB and 8 ms; Python's own implementation is enough
     from hashlib import sha256
 
 PROTO = ".proto"
@@ -29,10 +29,10 @@ _SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", 
 
 @dataclass(frozen=True)
 class Folder:
-    """`files` has the bytes of all readable files by name relative to `root`, with `/`, sorted.
+    """The files of a folder. `files` has the bytes of all readable ones, sorted by name relative to `root`, with `/`.
 
-    `faults` are the findings of a file, readable or not, by the same names. `excluded` are the names of files that are
-    in neither, each with what excludes it.
+    `faults` are the findings of files, readable or not, by the same names. `excluded` has the names of files that are
+    in neither, with the entry of `exclude` that excludes them.
     """
 
     root: Path
@@ -46,7 +46,7 @@ class Folder:
 
     @cached_property
     def sha256(self) -> str:
-        """Over names and contents."""
+        """The hash of names and contents."""
         digest = sha256()
         for name, content in self.files.items():
             digest.update(os.fsencode(f"{name}\0{len(content)}\0"))
@@ -55,7 +55,7 @@ class Folder:
 
 
 def _meant(root: Path, blame: SourceSpan) -> str:
-    """What to write for a folder that is not there, in the table at `blame`."""
+    """Return a hint for a missing folder that the table names at `blame`."""
     path = Path(inputs.real_path(root))
     if inputs.is_file(path):
         return "that is a file: name its folder"
@@ -67,10 +67,10 @@ def _meant(root: Path, blame: SourceSpan) -> str:
 
 
 def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] = ()) -> Folder:
-    """The `.proto` and `.options` files below `root`; hidden ones and those that `exclude` names are left alone.
+    """Read the `.proto` and `.options` files below `root`, except hidden ones and those in `exclude`.
 
-    What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder,
-    and for what `exclude` names in vain.
+    Findings about the folder itself, or about a file's name, point at `blame`. Raises TableError for an invalid folder,
+    and for entries of `exclude` that match nothing.
     """
     if not inputs.is_dir(root):
         raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {inputs.real_path(root)}", _meant(root, blame))
@@ -98,7 +98,10 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
 
 
 def _excluded(root: Path, names: Iterable[str], exclude: Sequence[Located[str]]) -> Mapping[str, Located[str]]:
-    """Which of the files are excluded, a `.proto` with its `.options`, and by what. Raises TableError."""
+    """Return the excluded files, a `.proto` with its `.options`, and the entries that exclude them.
+
+    Raises TableError.
+    """
     excluded: dict[str, Located[str]] = {}
     findings = []
     for each in exclude:
@@ -115,18 +118,18 @@ def _excluded(root: Path, names: Iterable[str], exclude: Sequence[Located[str]])
 
 
 def _exclude_hint(written: str, protos: Sequence[str]) -> str:
-    """Which file is meant: one of this name in another folder, or a similar one."""
+    """Return a hint with the file that is meant: one of this name in another folder, or a similar one."""
     same = [name for name in protos if PurePosixPath(name).name == PurePosixPath(written).name]
     return f"did you mean '{same[0]}'?" if len(same) == 1 else did_you_mean(written, same or protos)
 
 
 def proto_of(name: str) -> str:
-    """The `.proto` file that a `.proto` or `.options` file is about."""
+    """Return the `.proto` file of a `.proto` or `.options` file."""
     return name.removesuffix(OPTIONS) + PROTO if name.endswith(OPTIONS) else name
 
 
 def walk(root: Path) -> Iterator[Path]:
-    """All files and folders below a folder, but hidden ones, through links to other folders as well, each once."""
+    """Yield all files and folders below a folder once, except hidden ones. Follows links to other folders."""
     seen = set()
     waiting = [root]
     while waiting:
@@ -141,10 +144,10 @@ def walk(root: Path) -> Iterator[Path]:
 def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
     try:
         content.decode()
-    except UnicodeDecodeError as error:  # protoc lets it pass in comments
+    except UnicodeDecodeError as error:  # protoc accepts it in comments
         line = content.count(b"\n", 0, error.start) + 1
         yield Diagnostic(SourceSpan(shown_path(path), line), Code.BAD_FILE, "the file is not UTF-8")
-    if path.suffix == PROTO and not _SYNTAX.search(content):  # protoc would take it for proto2
+    if path.suffix == PROTO and not _SYNTAX.search(content):  # protoc would treat it as proto2
         hint = 'start it with `syntax = "proto3";`'
         yield Diagnostic(SourceSpan(shown_path(path)), Code.BAD_PROTO, "the file does not declare its syntax", hint)
 
@@ -159,7 +162,7 @@ _SIGNS = frozenset("{;}")
 
 @dataclass(frozen=True, slots=True)
 class Scanned:
-    """`names` are the full names of all messages and enums, nested ones as well; `messages` those of messages."""
+    """The declarations of a file: full `names` of all messages and enums, nested ones included, and of `messages`."""
 
     package: str
     names: tuple[str, ...]
@@ -172,19 +175,19 @@ class Scanned:
 
 @lru_cache(maxsize=64)
 def scan(content: bytes) -> Scanned:
-    """The declarations and imports of a file, in order. Several questions are asked about each file."""
+    """Return the declarations and imports of a file, in order. Cached, because each file is examined several times."""
     package = ""
     names: list[str] = []
     messages: set[str] = set()
     imports: list[str] = []
-    blocks: list[str] = []  # for each open brace the full name of the message, or that of the one around
+    blocks: list[str] = []  # for each open brace, the full name of the innermost message
     for statement, opens in _statements(content):
         match statement:
             case ["package", name]:
                 package = name
             case ["import", *_, name]:
                 imports.append(name.strip("\"'"))
-            case [*_, ("message" | "enum") as kind, name] if opens:  # `export` or `local` may stand before it
+            case [*_, ("message" | "enum") as kind, name] if opens:  # `export` or `local` may precede it
                 around = blocks[-1] if blocks else package
                 names.append(f"{around}.{name}" if around else name)
                 if kind == "message":
@@ -199,7 +202,7 @@ def scan(content: bytes) -> Scanned:
 
 
 def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
-    """The words before each `;` or brace, and whether a block begins there. A `}` is a statement of its own."""
+    """Yield the words before each `;` or brace, and whether a block begins there. A `}` is its own statement."""
     words: list[str] = []
     for match in _TOKEN.finditer(content):
         if match["comment"]:
@@ -215,7 +218,7 @@ def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
 
 
 def declaring(name: str, files: Mapping[str, bytes]) -> list[tuple[str, str]]:
-    """The files that declare a message or an enum of this full or short name, each with the full name."""
+    """Return the files that declare a message or an enum of this full or short name, each with the full name."""
     short = re.compile(rb"\b" + re.escape(name.rpartition(".")[2].encode()) + rb"\b")
     return [
         (file, full)
@@ -227,7 +230,7 @@ def declaring(name: str, files: Mapping[str, bytes]) -> list[tuple[str, str]]:
 
 
 def reached(start: str, files: Mapping[str, bytes]) -> set[str]:
-    """The file and all that it imports, directly or not, whether they exist or not."""
+    """Return the file and all that it imports, directly or indirectly, existing or not."""
     found: set[str] = set()
     waiting: Iterable[str] = [start]
     while waiting:
@@ -241,9 +244,9 @@ _OF_PROTOBUF = "google/protobuf/"
 
 
 def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], locked: Lock | None) -> tuple[str, str]:
-    """The file that declares the envelope, and its full name there. Of several, the one that the lock has goes first.
+    """Return the file that declares the envelope, and its full name there. Prefers the one in the lock.
 
-    Raises TableError when there is none or more than one, and when `protos` is the wrong folder.
+    Raises TableError if there is none, if several match, or if `protos` is the wrong folder.
     """
     wanted = message.value
     declared = declaring(wanted, folder.protos)
@@ -271,7 +274,7 @@ def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], 
 
 
 def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> list[Diagnostic]:
-    """What is wrong when no file declares the envelope: perhaps it is in one that cannot be read."""
+    """Return findings for a missing envelope, and for unreadable files, which may declare it."""
     for file in folder.protos:
         if (above := _folder_above(folder, file)) is not None:
             return [_too_deep(folder, protos, above, file)]
@@ -288,7 +291,7 @@ def _imports(content: bytes) -> list[str]:
 
 
 def _folder_above(folder: Folder, file: str) -> Path | None:
-    """The folder above this one that the imports of a file are relative to, if they are."""
+    """Return the parent folder that the imports of a file are relative to, or None."""
     imports = _imports(folder.files[file])
     if not imports or any(name in folder.files or name in folder.faults for name in imports):
         return None

@@ -1,7 +1,4 @@
-"""Places in `.proto` files: of every message, field, enum and enum value, and the comment beside it.
-
-Made of protoc's source info.
-"""
+"""Positions of messages, fields, enums and enum values in `.proto` files, and comments, from protoc's source info."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ _WORD = re.compile(rb'"[^"\n]*"?|[\w.]+|.')
 
 
 class ProtoText:
-    """The lines of a file, read when first needed. protoc counts lines and columns from 0."""
+    """The lines of a file, read on first use. protoc counts lines and columns from 0."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -32,21 +29,21 @@ class ProtoText:
         return inputs.read_bytes(self.path).split(b"\n")
 
     def span(self, location: Sequence[int]) -> SourceSpan:
-        """A location of protoc's source info: line, column, end column, or with the end's line as third."""
+        """Return the span of a location of protoc's source info: line, column, [end line,] end column."""
         if len(location) == 3:
             return self._between(location[0], location[1], location[2])
         line = self._line(location[0])
         return self._between(location[0], location[1], _width(line.rstrip()))
 
     def word(self, line: int, column: int) -> SourceSpan:
-        """The name, number or sign that begins at the place."""
+        """Return the span of the name, number or sign that begins at a position."""
         text = self._line(line)
         start = _offset(text, column)
         word = _WORD.match(text, start)
         return self._span(line, start, word.end() if word else start)
 
     def before(self, line: int, column: int) -> str:
-        """What stands before the place on its line, without blanks at its end."""
+        """Return the text before a position on its line, without trailing whitespace."""
         text = self._line(line)
         return text[: _offset(text, column)].decode(errors="replace").rstrip()
 
@@ -58,14 +55,14 @@ class ProtoText:
         return self._span(line, _offset(text, start), _offset(text, end))
 
     def _span(self, line: int, start: int, end: int) -> SourceSpan:
-        """From byte offsets, which are not columns where the text is not ASCII."""
+        """Return a span from byte offsets, which differ from columns if the text is not ASCII."""
         text = self._line(line)
         first = len(text[:start].decode(errors="replace")) + 1
         return SourceSpan(shown_path(self.path), line + 1, first, first + len(text[start:end].decode(errors="replace")))
 
 
 def _offset(text: bytes, column: int) -> int:
-    """The byte at protoc's column: it counts bytes, but a tab goes on to the next multiple of eight."""
+    """Return the byte offset of protoc's column: it counts bytes, but a tab advances to the next multiple of eight."""
     at = 0
     for offset, byte in enumerate(text):
         if at >= column:
@@ -82,7 +79,7 @@ _Path = tuple[int, ...]
 
 
 class Part(enum.Enum):
-    """What of a declaration a finding blames."""
+    """The part of a declaration that a finding points at."""
 
     NAME = enum.auto()
     NUMBER = enum.auto()
@@ -90,13 +87,13 @@ class Part(enum.Enum):
 
 
 class _Place(NamedTuple):
-    """`parts` holds the steps from `path` to the name, the number and the type, the likeliest first."""
+    """A declaration: `parts` has the steps from `path` to its name, number and type, the likeliest first."""
 
     path: _Path
     parts: Mapping[Part, tuple[int, ...]]
 
 
-# Field numbers of google/protobuf/descriptor.proto, of which source info's paths consist.
+# Field numbers of google/protobuf/descriptor.proto, which make up the paths of source info.
 _FILE_MESSAGE, _FILE_ENUM = 4, 5
 _MESSAGE_FIELD, _MESSAGE_NESTED, _MESSAGE_ENUM = 2, 3, 4
 _ENUM_VALUE = 2
@@ -106,10 +103,10 @@ _VALUE_PARTS = {Part.NAME: (1,), Part.NUMBER: (2,)}
 
 
 class ProtoSources:
-    """Asked by full name: `PBEnvelope`, `PBEnvelope.imu_info`, `SensorState`, `SensorState.SENSOR_IDLE`.
+    """Positions by full name: `PBEnvelope`, `PBEnvelope.imu_info`, `SensorState`, `SensorState.SENSOR_IDLE`.
 
-    An enum's values are named below their enum here, which is not protobuf's own scoping. What protoc says of a file is
-    kept as its bytes until a place in it is asked for, as it seldom is, and takes ten times as much memory then.
+    Unlike in protobuf, an enum's values are named below their enum. The source info of a file is kept serialized until
+    a position in it is needed, which is rare: parsed, it takes ten times as much memory.
     """
 
     def __init__(self, files: Iterable[FileDescriptorProto], paths: Mapping[str, Path]) -> None:
@@ -122,23 +119,23 @@ class ProtoSources:
             self._holders |= dict.fromkeys((name for name, _, _ in _holders(file)), file.name)
 
     def file(self, name: str) -> str:
-        """The file that declares a message or an enum, relative to the folder of the protos, with `/`."""
+        """Return the file that declares a message or an enum, relative to the folder of the protos, with `/`."""
         return self._holders[name]
 
     def span(self, name: str, part: Part = Part.NAME) -> SourceSpan:
-        """The place of a declaration, or of a part of it where it has that part."""
+        """Return the span of a declaration, or of a part of it if it has that part."""
         file = self._holders.get(name) or self._holders[name.rpartition(".")[0]]
         if file not in self._opened:
             self._opened[file] = _File(FileDescriptorProto.FromString(self._encoded[file]), self._paths[file])
         return self._opened[file].span(name, part)
 
     def close(self) -> None:
-        """Free what was made to find places. It is made again for the next one."""
+        """Free the parsed source info. The next lookup parses it again."""
         self._opened.clear()
 
 
 class _File:
-    """The places in one file."""
+    """The positions in one file."""
 
     def __init__(self, file: FileDescriptorProto, path: Path) -> None:
         self._text = ProtoText(path)
@@ -161,13 +158,13 @@ class _File:
             if (location := self._locations.get((*place.path, step))) is not None:
                 return self._text.span(location)
         path = place.path
-        while (around := self._locations.get(path)) is None:  # as for the entries of a map, written nowhere
+        while (around := self._locations.get(path)) is None:  # for example map entries, which are not in the text
             path = path[:-2]
         return self._text.span(around)
 
 
 def field_comments(files: Iterable[FileDescriptorProto]) -> dict[str, str]:
-    """The comments above and beside fields, each as one line, by full name. Fields without one are left out."""
+    """Return the comments above and beside fields, each as one line, by full name; only for fields with comments."""
     found: dict[str, str] = {}
     for file in files:
         comments = {
@@ -187,7 +184,7 @@ _Holder = tuple[str, _Path, Union[DescriptorProto, EnumDescriptorProto]]
 
 
 def _holders(file: FileDescriptorProto) -> Iterator[_Holder]:
-    """The messages and enums of a file, nested ones too, each with its full name and path."""
+    """Yield the messages and enums of a file, nested ones included, each with its full name and path."""
     prefix = f"{file.package}." if file.package else ""
     for index, message in enumerate(file.message_type):
         yield from _within(message, prefix, (_FILE_MESSAGE, index))

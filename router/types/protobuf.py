@@ -1,7 +1,7 @@
-"""The protobuf side of the type model: the envelope and what it imports, compiled at start-up.
+"""The protobuf side of the type model: the envelope and its imports, compiled at start-up.
 
-What else is in the folder of `.proto` files is no part of it, and what is wrong there is a warning. A map becomes a
-list of its entry messages and a group a message; extensions are left out.
+Other files in the folder are only checked, and problems in them are warnings. A map becomes a list of its entry
+messages, a group becomes a message; extensions are omitted.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ MessageClass = type[Message]
 class ProtoSchema:
     """Everything that the compiled `.proto` files below `root` declare, by full name.
 
-    What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes of all
-    `.proto` and `.options` files of the folder; `files` has the names of the compiled ones. `envelope` is the full name
-    of the message that was asked for, `lock` the path of the lock file, `exclude` what was not to be read, `warnings`
-    what is wrong with other files and with `.options` files. `inputs` is all that was read for it.
+    This includes their imports from `google/protobuf`. `sha256` covers the relative names and the bytes of all `.proto`
+    and `.options` files of the folder; `files` has the names of the compiled ones. `envelope` is the full name of the
+    envelope, `lock` the path of the lock file, `exclude` the excluded files, `warnings` the problems of other files and
+    of `.options` files. `inputs` is everything that was read.
     """
 
     def __init__(
@@ -78,15 +78,15 @@ class ProtoSchema:
         self.messages, self.enums = build_types(self._pool, names, field_comments(compiled.file), self.board_options)
 
     def message_class(self, name: str) -> MessageClass:
-        """The Python class of a message, by full name. Raises KeyError."""
+        """Return the Python class of a message, by full name. Raises KeyError."""
         return GetMessageClass(self.descriptor(name))
 
     def descriptor(self, name: str) -> Descriptor:
-        """By full name. Raises KeyError."""
+        """Return the descriptor of a message, by full name. Raises KeyError."""
         return self._pool.FindMessageTypeByName(name)
 
     def reserved_numbers(self, name: str) -> list[range]:
-        """What a message or an enum, by full name, says to be `reserved`."""
+        """Return the `reserved` numbers of a message or an enum, by full name."""
         if name in self.enums:
             declared = EnumDescriptorProto()
             self._pool.FindEnumTypeByName(name).CopyToProto(declared)
@@ -96,14 +96,14 @@ class ProtoSchema:
         return [range(span.start, span.end) for span in message.reserved_range]
 
     def board_options(self, field: FieldDescriptor) -> BoardOptions:
-        """What the `.options` file beside the field's `.proto` says about it."""
+        """Return the options of a field, from the `.options` file beside its `.proto` file."""
         if not self._options:
             return NO_OPTIONS
         options = self._options.get(container(field).file.name)
         return options.of(container(field).full_name, field.name) if options is not None else NO_OPTIONS
 
     def unbounded(self, message: str) -> str:
-        """Which field of a message, by full name, has no largest encoding, and why; how many more. "" without any."""
+        """Describe the first field of a message, by full name, without a largest encoding, and count others; or ""."""
         found = [*unbounded_fields(self.descriptor(message), self.board_options)]
         if not found:
             return ""
@@ -112,11 +112,11 @@ class ProtoSchema:
         return f"{path} {found[0].why}{more}"
 
     def span(self, message: str, field: str | None = None) -> SourceSpan:
-        """The place of a declaration in its `.proto` file: of a message or enum, of a field or enum value."""
+        """Return the span of a message or enum, or of a field or enum value, in its `.proto` file."""
         return self.sources.span(message if field is None else f"{message}.{field}", Part.NAME)
 
     def place(self, name: str) -> SourceSpan:
-        """The same, by full name; of what is declared outside of these files, that of the envelope."""
+        """Return the span of a declaration by full name; of one outside these files, the envelope's."""
         try:
             return self.sources.span(name, Part.NAME)
         except LookupError:
@@ -141,7 +141,7 @@ class PayloadCase:
 class Envelope:
     """The message around every payload, by full name.
 
-    `max_size` is its largest encoding in bytes over the cases that have one, nanopb's `PBEnvelope_size`.
+    `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count.
     """
 
     name: str
@@ -161,9 +161,8 @@ def load_protos(
 ) -> ProtoSchema:
     """Compile the file below `protos` that declares the envelope `message`, and what it imports.
 
-    Other files of the folder are checked only, but for those that `exclude` names, `with_others` compiled too where
-    nothing is wrong with them. Raises
-    TableError with every finding. What is wrong with the folder itself is blamed on the place that names it.
+    Other files of the folder, except those in `exclude`, are only checked; `with_others`, they are also compiled if
+    they have no errors. Raises TableError with all findings. Findings about the folder itself point at its name.
     """
     with inputs.noted() as read:
         schema = _load(protos, message, lock, exclude, with_others=with_others)
@@ -214,25 +213,25 @@ def _load(
 
 
 def _note_hidden(folder: Folder, compiled: Collection[str]) -> None:
-    """Files that only protoc has read, as others import them, are read here to be noted."""
+    """Read the files that only protoc has read, because others import them, so that they are recorded as inputs."""
     for name in compiled:
         if name not in folder.files and inputs.is_file(folder.root / name):
             inputs.read_bytes(folder.root / name)
 
 
 def without_protos() -> tuple[ProtoSchema, Envelope]:
-    """What a table refers to that has no envelope: no declarations, and an envelope without payload cases."""
+    """Return empty declarations, and an envelope without payload cases, for a table without an envelope."""
     schema = ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
     return schema, Envelope("", "", Empty, {}, 0)
 
 
 def lock_path(protos: Located[Path], lock: Located[Path] | None) -> Path:
-    """The lock file of these protos: beside them unless `lock` says where."""
+    """Return the path of the lock file: `lock`, by default beside the protos."""
     return Path(inputs.real_path(lock.value if lock is not None else protos.value / LOCK_NAME))
 
 
 def _readable_lock(path: Path) -> Lock | None:
-    """What is wrong with the lock is a finding of `LockComparison`."""
+    """Read the lock, if possible. `LockComparison` reports its problems."""
     try:
         return read_lock(path)
     except TableError:
@@ -244,11 +243,11 @@ def _faults(folder: Folder, proto: str) -> list[Diagnostic]:
 
 
 def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnostic], list[str]]:
-    """A warning for each file that was not compiled and has faults, and the `.proto` files among them without any."""
+    """Check the files that were not compiled. Return warnings about faulty ones, and the names of valid ones."""
     unused = [(name, faults) for name, faults in folder.faults.items() if proto_of(name) not in compiled]
     warnings = [_unused(proto_of(name), faults) for name, faults in unused]
     valid = [name for name in folder.protos if name not in compiled and name not in folder.faults]
-    if folder.excluded:  # what needs an excluded file is left out with it
+    if folder.excluded:  # files that need an excluded file are also left out
         valid = [name for name in valid if folder.excluded.keys().isdisjoint(reached(name, folder.files))]
     if not valid:
         return warnings, []
@@ -264,7 +263,7 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
 
 
 def _unused(proto: str, faults: Sequence[Diagnostic]) -> Diagnostic:
-    """The first fault of a file that is not compiled. `proto` is "" for one that only an import leads to."""
+    """Return the first fault of a file that is not compiled. `proto` is "" for a file that is only imported."""
     first = faults[0]
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     message = f"the envelope does not use this file, so it is left out: {first.message}{more}"
@@ -275,7 +274,7 @@ def _unused(proto: str, faults: Sequence[Diagnostic]) -> Diagnostic:
 
 
 def _excluded_finding(name: str, envelope: Located[str], folder: Folder) -> Diagnostic:
-    """`exclude` names a file that the envelope imports."""
+    """Return the finding for a file in `exclude` that the envelope imports."""
     by = folder.excluded[name]
     what = f"'{by.value}' cannot be excluded: the envelope {envelope.value} needs {name}"
     return Diagnostic(by.span, Code.BAD_VALUE, what, "exclude only what the envelope does not import")
@@ -288,7 +287,7 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
 
 
 def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Diagnostic]:
-    """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
+    """Return findings for messages of two packages with one short name: ROS and the table only use short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
         if not inputs.is_file(folder.root / file.name):
@@ -309,9 +308,9 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Dia
 
 
 def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
-    """The message that the schema was loaded for, with its oneof `named`.
+    """Return the envelope of the schema, with its oneof `named`.
 
-    Raises TableError: an oneof that does not exist, a member of it that is no message, what the router cannot decide.
+    Raises TableError if the oneof does not exist, if a member is not a message, or if the router cannot parse a type.
     """
     name = schema.envelope
     descriptor = schema.descriptor(name)
@@ -325,7 +324,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
         raise TableError(refused)
     cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
-    # A case without a bound is reported where a board shall take it.
+    # An unbounded case is only reported if it is sent to a board.
     bounded = [framed_size(case.number, case.max_size) for case in cases.values() if case.max_size is not None]
     max_size = max(bounded, default=0) + largest_beside(oneof, schema.board_options)
     return Envelope(name, oneof.name, schema.message_class(name), cases, max_size)
@@ -349,7 +348,7 @@ def build_types(
     comments: Mapping[str, str],
     options_of: Callable[[FieldDescriptor], BoardOptions],
 ) -> tuple[dict[str, MessageType], dict[str, Enum]]:
-    """All messages and enums of the files, nested ones too, by full name and in declared order."""
+    """Return all messages and enums of the files, nested ones included, by full name and in declared order."""
     files = [pool.FindFileByName(name) for name in file_names]
     descriptors = [
         message for file in files for top in file.message_types_by_name.values() for message in _with_nested(top)

@@ -1,4 +1,4 @@
-"""Runs protoc over files of a folder of `.proto` files, and turns its complaints into findings.
+"""Runs protoc on the files of a folder, and converts its errors to findings.
 
 The result is a FileDescriptorSet with source info.
 """
@@ -22,7 +22,7 @@ from router.types.proto_files import Folder, declaring, scan
 from router.types.proto_source import ProtoText
 
 EVERYTHING = "router_every_proto_of_the_folder.proto"
-"""The file that imports all others; its own errors only repeat theirs."""
+"""The file that imports all others. Its errors only repeat theirs."""
 
 _IMPORT_FAILED = re.compile(r'Import "(?P<name>.*)" was not found or had errors\.')
 _NUMBER_TAKEN = re.compile(
@@ -40,7 +40,7 @@ _MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
 
 @dataclass(frozen=True, slots=True)
 class Complaint:
-    """One error of protoc: file name relative to the root; line and column from 0, -1 for neither."""
+    """One error of protoc: file name relative to the root; line and column from 0, or -1."""
 
     file: str
     line: int
@@ -49,7 +49,7 @@ class Complaint:
 
 
 def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnostic]:
-    """One finding for each fault, in protoc's words but for imports; what only follows from another one is left out."""
+    """Convert errors to findings, in protoc's words except for imports. Omits consequences of other errors."""
     texts = {file: ProtoText(folder.root / file) for file in {complaint.file for complaint in complaints}}
     places: dict[tuple[str, int, int], list[Complaint]] = {}
     findings = []
@@ -57,14 +57,14 @@ def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnos
         places.setdefault((complaint.file, complaint.line, complaint.column), []).append(complaint)
     for first, *more in places.values():
         finding = _finding(first, folder.protos, texts[first.file])
-        # What else protoc says about the same place is advice, or the same again.
+        # Further messages about the same position are advice, or repetitions.
         advice = [other.message.rstrip(".") for other in more if other.message != first.message]
         findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
     return list(_once(findings))
 
 
 def _once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
-    """One finding for each mistake of a file; further lines with the same one are listed in it."""
+    """Yield one finding per mistake in a file; it lists further lines with the same mistake."""
     alike: dict[tuple[str, str, str], list[Diagnostic]] = {}
     for finding in findings:
         alike.setdefault((finding.span.file, finding.message, finding.hint), []).append(finding)
@@ -76,7 +76,7 @@ def _once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
 
 
 _MOST_LINES = 3
-"""Of those that a finding lists."""
+"""Maximum number of further lines in a finding."""
 
 
 def _without_consequences(complaints: Sequence[Complaint], names: Container[str]) -> Iterator[Complaint]:
@@ -86,19 +86,19 @@ def _without_consequences(complaints: Sequence[Complaint], names: Container[str]
         if complaint.file == EVERYTHING:
             continue
         if (member := _MEMBER_TAKEN.match(complaint.message)) and member["holder"] in twice:
-            continue  # its message is a finding, and so would be all its fields
+            continue  # its message has a finding already
         if (taken := _TYPE_TAKEN.match(complaint.message)) and taken["name"].rpartition(".")[0] in twice:
-            continue  # so too where the other message is in another file
+            continue  # likewise if the other message is in another file
         used = _NOT_IMPORTED.match(complaint.message)
         meant = used or _NOT_A_TYPE.match(complaint.message)
         if meant and meant["name"] in twice:
-            continue  # it means the other declaration of that name
+            continue  # it refers to the other declaration of that name
         if complaint.file in lacking and (_NOT_DEFINED.match(complaint.message) or used):
-            continue  # it would be, by the import
+            continue  # the failed import would define it
         if (imported := _IMPORT_FAILED.fullmatch(complaint.message)) and imported["name"] in names:
-            continue  # that file's own errors are findings already
+            continue  # the errors of that file are findings already
         if complaint.line < 0 and complaint.file not in names:
-            continue  # an imported file that does not exist; the import is a finding
+            continue  # an imported file that does not exist: the import has a finding
         yield complaint
 
 
@@ -121,7 +121,7 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
 
 
 def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
-    """Which of `files`, not imported yet, is meant: beside the importing one, or of that name elsewhere, or similar."""
+    """Return a hint with the file that is meant: beside the importer, of that name elsewhere, or a similar one."""
     beside = posixpath.normpath(posixpath.join(posixpath.dirname(importer), name))
     same = [file for file in files if posixpath.basename(file).lower() == posixpath.basename(name).lower()]
     if beside in same:
@@ -132,7 +132,7 @@ def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
 
 
 def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
-    """Which files declare a type that is not defined where it is used."""
+    """Return a hint with the files that declare a type that is not defined where it is used."""
     found = declaring(name, files)
     if not found:
         close = nearest(name, [known for content in files.values() for known in scan(content).names])
@@ -158,10 +158,10 @@ WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
 
 
 def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
-    """The descriptors of the named files and of what they import, dependencies first.
+    """Compile the named files and their imports. Return their descriptors, dependencies first.
 
     Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. Raises TableError with one
-    finding for each error of protoc, and StartError.
+    finding per error of protoc, and StartError.
     """
     with _scratch(folder, names) as include:
         if complaints := _complaints(include):
@@ -179,7 +179,7 @@ def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
 
 
 def check_protos(folder: Folder, compiled: Sequence[str], names: Sequence[str]) -> Sequence[Complaint]:
-    """What protoc says against the named files; those that were `compiled` come first, so that none of them clashes.
+    """Return protoc's errors for the named files. The `compiled` ones come first, so that clashes are blamed on others.
 
     Raises StartError.
     """
@@ -189,7 +189,7 @@ def check_protos(folder: Folder, compiled: Sequence[str], names: Sequence[str]) 
 
 @contextmanager
 def _scratch(folder: Folder, names: Sequence[str]) -> Iterator[list[str]]:
-    """The folders in which protoc finds EVERYTHING, in a temporary one that is removed. Raises StartError."""
+    """Provide the include folders for EVERYTHING, in a temporary folder that is removed. Raises StartError."""
     with ExitStack() as ending:
         try:
             include = _include(ending.enter_context(tempfile.TemporaryDirectory()), folder, names)
@@ -200,23 +200,23 @@ def _scratch(folder: Folder, names: Sequence[str]) -> Iterator[list[str]]:
 
 
 def _include(scratch: str, folder: Folder, names: Sequence[str]) -> list[str]:
-    """The folders in which protoc finds EVERYTHING, which imports the named files, and whatever they import."""
-    # One file that imports all others makes protoc go through every file although some are broken.
-    # Public imports, because protoc prints a warning for an unused private one.
+    """Create the file EVERYTHING, which imports the named files. Return the include folders for it."""
+    # One file that imports all others makes protoc examine every file even if some are broken.
+    # The imports are public, because protoc prints a warning for an unused private one.
     imports = "".join(f'import public "{name}";\n' for name in names)
     everything = Path(scratch, "everything")
     everything.mkdir()
     (everything / EVERYTHING).write_text(f'syntax = "proto3";\n{imports}', encoding="ascii")
-    protos = Path(scratch, "protos")  # a name without `:` and `=`, at which protoc splits
+    protos = Path(scratch, "protos")  # a name without `:` and `=`, where protoc splits
     protos.symlink_to(folder.root.absolute(), target_is_directory=True)
     return [str(everything), str(protos), str(WELL_KNOWN)]
 
 
 def _complaints(include: Sequence[str]) -> list[Complaint]:
-    """What is wrong with the files that EVERYTHING imports.
+    """Return the errors in the files that EVERYTHING imports.
 
-    `get_protos` returns errors as objects, where the ordinary entry point prints them to the process's
-    standard error. It makes Python modules too, but that costs 3 ms for 27 files.
+    `get_protos` returns errors as objects; the ordinary entry point prints them to standard error. It also generates
+    Python modules, which costs 3 ms for 27 files.
     """
     try:
         _protoc_compiler.get_protos(EVERYTHING.encode(), [path.encode() for path in include])

@@ -1,7 +1,7 @@
 """The ROS side of the type model: message types by name, with or without ROS on the machine.
 
-Definitions are read one at a time, when first asked for: from our own folder, from installed packages, and from those
-that the rosbags package carries.
+Definitions are read one at a time, on first use: from our own folder, from installed packages, and from the rosbags
+package.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ DEFAULTS_MISSING_IN_ROSBAGS: dict[tuple[str, str], object] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
 }
-"""rosbags keeps no default values; these are all of Jazzy's common interfaces that differ from zero."""
+"""All default values of Jazzy's common interfaces that differ from zero: rosbags does not keep them."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDefinition:
-    """`file` is where it was found: a `.msg` file, or the name of the rosbags module."""
+    """A definition and its `file`: a `.msg` file, or the name of the rosbags module."""
 
     file: str
     definition: MsgDefinition
@@ -46,7 +46,7 @@ class MsgFiles:
         self._folders = folders
 
     def find(self, name: str) -> FoundDefinition | None:
-        """By full name, `sensor_msgs/msg/Imu`. Raises TableError for a file that is no definition."""
+        """Find a definition by full name, `sensor_msgs/msg/Imu`. Raises TableError for an invalid file."""
         parts = _TYPE_NAME.fullmatch(name)
         if parts is None:
             return None
@@ -66,10 +66,10 @@ class MsgFiles:
 
 
 def msg_files() -> MsgFiles:
-    """Every prefix of the sourced workspaces, then the environment that Python runs in.
+    """Return the files of all sourced workspaces, then of Python's environment.
 
-    Ours come first in a checkout, where they are edited and then built, and last in an installation, where a team's own
-    copy of them is what it edits and builds.
+    Our own files come first in a checkout, where they are edited and then built, and last in an installation, where a
+    team edits and builds its own copy.
     """
     prefixes = [*filter(None, inputs.ENVIRONMENT.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     shares = [Path(prefix, "share") for prefix in prefixes]
@@ -89,10 +89,10 @@ def _read(path: Path, package: str) -> FoundDefinition:
 
 
 class RosbagsDefinitions:
-    """The interfaces of Jazzy as the rosbags package carries them, for machines without ROS.
+    """The interfaces of Jazzy from the rosbags package, for machines without ROS.
 
-    Imported when first asked, because that takes 0.1 s. Only their data is used: building a typestore
-    out of them takes longer, and loses what a `byte` is.
+    Imported on first use, because that takes 0.1 s. Only the data is used: building a typestore takes longer and does
+    not distinguish `byte`.
     """
 
     @cached_property
@@ -123,7 +123,7 @@ def _rosbags_field(message: str, name: str, node: Any) -> Field:
 
 
 def _rosbags_type(node: Any) -> Type:
-    """A node is (kind, content): BASE (name, bound), NAME full name, ARRAY and SEQUENCE (node, size), 0 for none."""
+    """Convert a node (kind, content): BASE (name, bound), NAME full name, ARRAY and SEQUENCE (node, size or 0)."""
     kind, content = node
     if kind.name == "ARRAY":
         return List(_rosbags_type(content[0]), length=content[1])
@@ -136,9 +136,9 @@ def _rosbags_type(node: Any) -> Type:
 
 
 class RosInterfaces:
-    """Message types by full name (`sensor_msgs/msg/Imu`), each read when first asked for.
+    """Message types by full name (`sensor_msgs/msg/Imu`), each read on first use.
 
-    A message without fields has none in the model either; on the wire ROS gives it one uint8.
+    A message without fields also has none in the model; in CDR, ROS adds one uint8.
     """
 
     def __init__(self, files: MsgFiles, rosbags: RosbagsDefinitions) -> None:
@@ -147,15 +147,15 @@ class RosInterfaces:
         self._known: dict[str, MessageType | None] = {}
 
     def get(self, name: str) -> MessageType | None:
-        """The type with all types nested in it, None where no source has it.
+        """Return a type with all nested types, None if it does not exist.
 
-        Raises TableError, blaming the `.msg` file, when a definition cannot be read, contains itself or
-        names a type that does not exist.
+        Raises TableError at the `.msg` file if a definition cannot be read, contains itself or refers to a type that
+        does not exist.
         """
         return self._get(name, ())
 
     def names(self) -> Collection[str]:
-        """Every name that `get` knows, for did-you-mean. Lists folders: for findings only."""
+        """Return every name that `get` accepts, for hints. Slow: lists folders."""
         return {*self._files.names(), *self._rosbags.names()}
 
     def _get(self, name: str, inside: tuple[str, ...]) -> MessageType | None:
@@ -189,12 +189,12 @@ class RosInterfaces:
 
 
 def ros_interfaces() -> RosInterfaces:
-    """The interfaces of this machine and this repository."""
+    """Return the interfaces of this machine and this repository."""
     return RosInterfaces(msg_files(), RosbagsDefinitions())
 
 
 def definition(message: MessageType) -> tuple[tuple[str, str], ...]:
-    """Field names and types as rclpy's `get_fields_and_field_types()` spells them."""
+    """Return field names and types as rclpy's `get_fields_and_field_types()` spells them."""
     return tuple((field.name, _spelled(field.type)) for field in message.fields)
 
 

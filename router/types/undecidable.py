@@ -1,4 +1,4 @@
-"""What of an envelope the router's parser in C cannot decide as protobuf does."""
+"""Findings about envelopes that the router's C parser cannot judge as protobuf does."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from router.types.wire import delimited, parses
 MOST_TYPES = 65536
 
 Place = Callable[[str], SourceSpan]
-"""Of a message by its full name, or of a field."""
+"""Returns the span of a message or a field, by full name."""
 
 _Found = tuple[str, str, str]
 """The full name of a declaration, what is wrong with it, and what to do."""
 
 
 def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> list[Diagnostic]:
-    """Findings about an envelope and all types that it leads to. `cases` are the numbers of the payload cases."""
+    """Return findings about an envelope and all types in it. `cases` are the numbers of the payload cases."""
     types = all_types(envelope)
     found = [*_of_envelope(envelope, cases), *(each for descriptor in types for each in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
@@ -46,7 +46,7 @@ def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
 
 
 def all_types(envelope: Descriptor) -> dict[Descriptor, int]:
-    """The envelope and all types that its fields lead to, each with a number; the envelope's is 0."""
+    """Return the envelope and all types of its fields, at any depth, each with an index; the envelope's is 0."""
     indexes, pending = {envelope: 0}, [envelope]
     while pending:
         for field in all_fields(pending.pop()):
@@ -57,7 +57,7 @@ def all_types(envelope: Descriptor) -> dict[Descriptor, int]:
 
 
 def all_fields(descriptor: Descriptor) -> Iterator[FieldDescriptor]:
-    """The fields of a message and the extensions that its pool knows: protobuf parses both alike."""
+    """Yield the fields of a message and the extensions in its pool: protobuf parses both in the same way."""
     yield from descriptor.fields
     if descriptor.is_extendable:
         yield from descriptor.file.pool.FindAllExtensions(descriptor)

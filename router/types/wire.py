@@ -1,4 +1,4 @@
-"""The wire format of protobuf, as far as it has to be written by hand, and what protobuf thinks of it."""
+"""The wire format of protobuf, as far as we encode it by hand, and checks of what protobuf parses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.types.descriptors import container
 from router.types.model import Bool, Float, Int, Type
 
 VARINT, I64, LEN, GROUP, GROUP_END, I32 = range(6)
-"""The wire types. LEN is that of what has a size in front: strings, bytes, messages, packed scalars."""
+"""The wire types. LEN is for values with a length prefix: strings, bytes, messages, packed scalars."""
 
 I64_SIZE, I32_SIZE = 8, 4
 _LONGEST_VARINT = 10
@@ -22,10 +22,10 @@ _ALL_BITS = (1 << 64) - 1
 
 
 class Encoding(NamedTuple):
-    """How a field of one of protobuf's types is encoded.
+    """The encoding of one of protobuf's types.
 
-    `read` and `write` are the carrier's. `size` is the largest encoding of a number in bytes, `type` its type in the
-    model.
+    `read` and `write` are those of the carrier. `size` is the largest encoding of a number in bytes, `type` its type in
+    the model.
     """
 
     wire_type: int
@@ -61,12 +61,12 @@ _ENCODINGS: Mapping[int, Encoding] = {
 
 
 def encoding_of(field: FieldDescriptor) -> Encoding:
-    """How a field is encoded, of a repeated one an element by itself."""
+    """Return the encoding of a field, or of a single element of a repeated one."""
     return _ENCODINGS[field.type]
 
 
 def varint(value: int) -> bytes:
-    """Encode an integer as protobuf encodes tags and lengths, a negative one as its 64 bits."""
+    """Encode an integer as a varint, a negative one as its 64 bits."""
     encoded = bytearray()
     value &= _ALL_BITS
     while value > 0x7F:
@@ -76,7 +76,7 @@ def varint(value: int) -> bytes:
 
 
 def read_varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return a varint and the position behind it. Raises IndexError for one that is cut or too long."""
+    """Return a varint and the position after it. Raises IndexError if it is truncated or too long."""
     value = 0
     for index in range(_LONGEST_VARINT):
         byte = data[position + index]
@@ -87,12 +87,12 @@ def read_varint(data: bytes, position: int) -> tuple[int, int]:
 
 
 def delimited(number: int, value: bytes) -> bytes:
-    """A field with a size in front."""
+    """Encode a field with a length prefix."""
     return varint(number << 3 | LEN) + varint(len(value)) + value
 
 
 def parses(message: Descriptor, data: bytes) -> bool:
-    """Whether protobuf parses a message. Versions and features differ in details; so it is asked."""
+    """Return whether protobuf parses a message. Tries it, because versions and features differ in details."""
     try:
         GetMessageClass(message).FromString(data)
     except DecodeError:
@@ -101,5 +101,5 @@ def parses(message: Descriptor, data: bytes) -> bool:
 
 
 def validates_text(field: FieldDescriptor) -> bool:
-    """Whether protobuf refuses a message with something else than UTF-8 in this string: by its syntax and features."""
+    """Return whether protobuf rejects a message if this string is not UTF-8, which depends on syntax and features."""
     return not parses(container(field), delimited(field.number, b"\xff"))

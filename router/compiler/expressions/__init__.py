@@ -1,7 +1,7 @@
 """The expressions of a table, in the syntax of Python: checked and typed.
 
-`checker` walks an expression and applies the rules of the modules beside it. What comes out is a `tree`. Whether the
-value fits the field that it fills is checked in `conversion`.
+`checker` walks an expression, applies the rules of the modules beside it, and returns a `tree`. `conversion` checks
+whether the value fits the field that it fills.
 """
 
 from __future__ import annotations

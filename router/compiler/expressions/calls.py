@@ -17,7 +17,7 @@ from router.types.model import Int, List, Type
 
 
 def called_name(node: ast.Call, text: Parsed) -> str:
-    """The name in front of the brackets. Raises ExpressionError for calls of another shape than `name(a, b)`."""
+    """Return the name of the function. Raises ExpressionError unless the call has the form `name(a, b)`."""
     if not isinstance(node.func, ast.Name):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
         known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
@@ -44,7 +44,7 @@ def function_named(name: str, span: SourceSpan) -> Function:
 def call_of(
     function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope, expected: Type | None
 ) -> Node:
-    """The call as a checked expression. Bounds that it leaves out are taken from the field `expected`."""
+    """Return the call as a checked expression. Omitted bounds are those of the field `expected`."""
     if function.of_list is not None and len(arguments) == 1 and is_list(arguments[0].kind):
         return _whole_list(function, arguments[0], span, scope)
     if function.optional and len(arguments) == len(function.parameters) - function.optional:
@@ -77,7 +77,7 @@ def _call_of_scalars(function: Function, arguments: Sequence[Node], span: Source
 
 
 def _parameters(function: Function, count: int) -> list[Parameter]:
-    """The parameters of a call with so many arguments."""
+    """Return the parameters of a call with `count` arguments."""
     return [*function.parameters, *[function.parameters[-1]] * (count - len(function.parameters))]
 
 

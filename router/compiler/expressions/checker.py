@@ -1,6 +1,6 @@
-"""Check an expression, innermost node first, and make a typed tree of it.
+"""Check of an expression, innermost node first, which returns a typed tree.
 
-`names`, `operators`, `lists` and `calls` have the rules.
+The rules are in `names`, `operators`, `lists` and `calls`.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from router.table.nodes import TextPlace
 from router.types.model import List, Type
 
 DEEPEST = 60
-"""How deep an expression may nest, since Python's and our functions on syntax trees are recursive."""
+"""Maximum nesting of an expression, since functions on syntax trees are recursive, ours and Python's."""
 
 
 MOST_CHOICES = 100
-"""Values of a map, which nests as deep."""
+"""Maximum number of values of a map, which nests as deep."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Node:
-    """The typed tree of an expression. Raises ExpressionError.
+    """Return the typed tree of an expression. Raises ExpressionError.
 
-    `expected` is the type of the field to be filled: clamp() and wrap() take their bounds from it, bare names are
-    looked up among the values of an enum.
+    `expected` is the type of the field to be filled: clamp() and wrap() take their bounds from it, and bare names may
+    be values of an enum.
     """
     if expression.literal:
         return constant(expression.text, expression.span)
@@ -61,9 +61,9 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
 
 
 def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
-    """A chain of comparisons with the value of the subject.
+    """Return a chain of comparisons with the value of the subject.
 
-    Without `else`, the last value is for itself alone: any other one is refused at run time.
+    Without `else`, values that are not in the map are rejected at run time.
     """
     if len(choices.values) > MOST_CHOICES:
         raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
@@ -84,7 +84,7 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
 
 
 def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> Node:
-    """The value that a key of a map stands for: a name of the subject's enum, or a constant."""
+    """Return the value of a key of a map: a name of the subject's enum, or a constant."""
     if isinstance(subject.kind, EnumKind):
         values = dict(subject.kind.enum.values)
         if name.value in values:
@@ -107,7 +107,7 @@ def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> N
 
 
 def _key_hint(name: str, values: Mapping[str, int]) -> str:
-    """What to write for a key that is no name of an enum of which the map lacks these values."""
+    """Return a hint for a key that is not a value of the enum. `values` are those that the map lacks."""
     short = name.replace("::", ".").rpartition(".")[2]
     named = [short] if short in values else [value for value, number in values.items() if str(number) == name]
     if named:
@@ -116,7 +116,7 @@ def _key_hint(name: str, values: Mapping[str, int]) -> str:
 
 
 def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
-    """Refuse a map in which two keys are one value, such as two names of an enum's number."""
+    """Reject a map in which two keys have the same value, such as two names of an enum's number."""
     names: dict[object, str] = {}
     for (name, _), key in zip(choices.values, keys, strict=True):
         first = names.setdefault(constant_of(key), name.value)
@@ -126,7 +126,7 @@ def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
 
 
 def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
-    """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
+    """Reject a map without `else` that does not cover all values, or whose subject has no list of values."""
     hint = "list them, or add `else: VALUE`"
     covered = {constant_of(key) for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
@@ -148,7 +148,7 @@ def _element(expected: Type | None) -> Type | None:
 
 @dataclass(slots=True)
 class _Checker:
-    """Checks one expression. Each method takes a syntax node of the user and returns it checked and resolved."""
+    """Checks one expression. Each method takes a syntax node and returns it checked and resolved."""
 
     text: Parsed
     scope: Scope
@@ -204,7 +204,7 @@ class _Checker:
                 raise forbidden(node, span)
 
     def _beside_null(self, node: ast.Compare) -> ast.expr | None:
-        """The `x` of `x == null`, `None != x` and `x is None`; None for other comparisons."""
+        """Return the `x` of `x == null`, `None != x` and `x is None`; None for other comparisons."""
         if len(node.ops) > 1 or not isinstance(node.ops[0], (ast.Eq, ast.NotEq, ast.Is, ast.IsNot)):
             return None
         left, right = node.left, node.comparators[0]
@@ -231,7 +231,7 @@ class _Checker:
         return call_of(function, arguments, span, self.scope, expected)
 
     def _has(self, node: ast.Call, span: SourceSpan) -> Node:
-        """`has(field)` takes the path of its argument instead of the value; the argument is checked as well."""
+        """Check `has(field)`, which takes the path of its argument instead of the value."""
         path = field_path(node.args[0], self.scope) if len(node.args) == 1 else None
         if not path:
             raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes one field")

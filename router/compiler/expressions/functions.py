@@ -1,9 +1,9 @@
 """The functions of the expression language: each declared once, with documentation, examples and implementation.
 
-The examples are tests (tests/compiler/test_expressions.py) and the reference page is generated from them. Each function
-has a rule that gives the kind of a call from its arguments, in order, once their number and kinds are checked; it
-raises ValueError with a sentence when no call with such arguments works. An implementation raises MappingError for a
-value without a result.
+The examples are tests (tests/compiler/test_expressions.py), and the reference page is generated from them. Each
+function has a rule that returns the kind of a call from its arguments, once their number and kinds are checked; it
+raises ValueError with a message if such a call can never succeed. An implementation raises MappingError for a value
+without a result.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ FLOAT32_END = 3.4028235677973366e38
 """The smallest magnitude that does not round to a finite float32."""
 
 INT64_END = 1 << 63
-"""The first integer that does not fit 64 bits with a sign."""
+"""The first integer that does not fit 64 signed bits."""
 
 MOST_DIGITS = 17
-"""Decimals of text(): more do not tell doubles apart."""
+"""Maximum decimals of text(): more do not distinguish doubles."""
 
 # implementations
 
@@ -96,7 +96,7 @@ def hypot(x: float, y: float) -> float:
 
 
 def _with_one_nan(x: float) -> float:
-    """Python 3.10 makes a NaN of its own from any, with the sign that the processor gives it."""
+    """Replace any NaN by one NaN: in Python 3.10, its sign depends on the processor."""
     return math.nan if x != x else x  # noqa: PLR0124 - NaN alone differs from itself
 
 
@@ -137,7 +137,7 @@ def _always(kind: Kind) -> Rule:
 
 
 def _integers(nodes: Sequence[Node]) -> list[IntKind] | None:
-    """The arguments as integers; None if one is a float."""
+    """Return the arguments as integers; None if one is a float."""
     found = [kind for node in nodes if (kind := as_int(node.kind))]
     return found if len(found) == len(nodes) else None
 
@@ -147,7 +147,7 @@ def _double(nodes: Sequence[Node]) -> FloatKind:
 
 
 def _rounded(compute: Callable[[float], int]) -> Rule:
-    """The same integer, or for a float one of 64 bits, within the range that clamp() has given the float."""
+    """Return the same integer, or for a float a 64-bit integer within the range that clamp() has set."""
 
     def result(nodes: Sequence[Node]) -> Kind:
         kind = nodes[0].kind
@@ -183,7 +183,7 @@ def _absolute(nodes: Sequence[Node]) -> Kind:
 
 
 def _extreme(pick: Callable[[list[int]], int]) -> Rule:
-    """For min() and max(): from the picked low bound to the picked high bound."""
+    """Return the rule of min() or max(): the range from the picked low bound to the picked high bound."""
 
     def result(nodes: Sequence[Node]) -> Kind:
         integers = _integers(nodes)
@@ -235,7 +235,7 @@ def _wrapped(nodes: Sequence[Node]) -> Kind:
 
 
 def _between(bounds: Sequence[IntKind]) -> IntKind:
-    """From the lowest to the highest of these."""
+    """Return the range from the lowest to the highest of these bounds."""
     low, high = min(bound.low for bound in bounds), max(bound.high for bound in bounds)
     if low < 0 and high > INT64.high:
         raise ValueError(f"the bounds {low} to {high} do not fit 64 bits")
@@ -259,9 +259,9 @@ def _written(nodes: Sequence[Node]) -> Kind:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """`accepts` are the kinds that may be passed, and `wanted` names them in findings.
+    """A parameter: `accepts` are the kinds that may be passed, and `wanted` describes them in findings.
 
-    An integer is converted where the parameter `becomes` a float.
+    An integer is converted if the parameter `becomes` a float.
     """
 
     name: str
@@ -272,12 +272,12 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One function of scalars. `result` returns the kind of a call with these arguments.
+    """A function of scalars. `result` returns the kind of a call with these arguments.
 
-    The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
-    A function with optional bounds takes them from the integer field that it fills (see expressions). If it
-    `gives_an_argument` and one of them is a float, all are converted to floats. `of_list` returns the kind of a call
-    with one whole list, or None for a list that the function does not take.
+    If `variadic`, the last parameter may be repeated; the last `optional` ones may be omitted. A function with optional
+    bounds takes them from the integer field that it fills (see expressions). If it `gives_an_argument` and one of them
+    is a float, all are converted to floats. `of_list` returns the kind of a call with one whole list, or None for a
+    list that the function does not take.
     """
 
     name: str
@@ -293,7 +293,7 @@ class Function:
 
     @property
     def signature(self) -> str:
-        """A call with all arguments: `clamp(x, low, high)`."""
+        """A call with all parameters: `clamp(x, low, high)`."""
         names = [parameter.name for parameter in self.parameters] + ["..."] * self.variadic
         return f"{self.name}({', '.join(names)})"
 
@@ -379,10 +379,10 @@ _DECLARED = (
 )  # fmt: skip
 
 FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DECLARED}
-"""By name, without `has`."""
+"""All functions by name, except `has`."""
 
 NOT_FINITE: Mapping[str, float] = {"nan": math.nan, "inf": math.inf}
-"""Values without literals, by name; a field of that name wins."""
+"""Values that are not literals, by name; a field of that name takes precedence."""
 
 HAS = "has"
 """`has(field)` takes a field instead of its value, so it is part of the syntax."""

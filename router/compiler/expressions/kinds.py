@@ -1,7 +1,7 @@
-"""What an expression can be: the static types of the expression language, with integer ranges.
+"""The static types of the expression language, with integer ranges.
 
-A kind says more than a field's type (the range of an integer, the length of a list) and less (a `uint8` and an `int32`
-are both integers).
+A kind has more information than a field's type (the range of an integer, the length of a list) and less (a `uint8` and
+an `int32` are both integers).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Union
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 
 TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"})
-"""ROS messages that expressions see as one value: a time or a duration, in nanoseconds."""
+"""ROS messages that are one value in expressions: a time or a duration, in nanoseconds."""
 
 STAMP_TYPES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
-"""Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
+"""Messages that a time can fill: whole seconds, and nanoseconds that are never negative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class BoolKind:
 class IntKind:
     """An integer between `low` and `high`.
 
-    With `is_rounded` a rounded float was part of it. It may fill a narrower field, which is checked at run time.
+    With `is_rounded`, it was computed from a rounded float. It may fill a narrower field, which is checked at run time.
     """
 
     low: int
@@ -38,7 +38,7 @@ class IntKind:
     is_rounded: bool = False
 
     def holds(self, other: IntKind) -> bool:
-        """Whether this kind contains all integers of another one."""
+        """Return whether this kind contains all integers of another one."""
         return self.low <= other.low and other.high <= self.high
 
     def __str__(self) -> str:
@@ -49,18 +49,18 @@ class IntKind:
 
 
 OCTET, UINT32 = IntKind(0, 0xFF), IntKind(0, 0xFFFF_FFFF)
-"""An element of bytes; and a number of elements, or the index of one."""
+"""An element of bytes; and a number of elements, or an index."""
 
 INT32 = IntKind(-(1 << 31), (1 << 31) - 1)
 """The values of an enum."""
 
 INT64, UINT64 = IntKind(-(1 << 63), (1 << 63) - 1), IntKind(0, (1 << 64) - 1)
-"""The integers that a value can be: signed ones if its range begins below zero."""
+"""The largest ranges of a value: the signed one if its range begins below zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class FloatKind:
-    """`bits` is 64 if a double was part of it, so that a float32 would lose digits. A value is in the range, or NaN."""
+    """A float. `bits` is 64 if it was computed from a double: a float32 would lose digits. It is in range, or NaN."""
 
     bits: int
     low: float = -math.inf
@@ -112,7 +112,7 @@ class MessageKind:
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """`length` is None if it is known at run time only. An empty literal has no `element`."""
+    """A list; `length` is None if it is only known at run time. An empty literal has no `element`."""
 
     element: Kind | None
     length: int | None = None
@@ -127,7 +127,7 @@ Number = (IntKind, FloatKind, EnumKind)
 
 
 def kind_of(declared: Type) -> Kind:
-    """The kind of a field of this type."""
+    """Return the kind of a field of this type."""
     match declared:
         case Bool():
             return BoolKind()
@@ -148,14 +148,14 @@ def kind_of(declared: Type) -> Kind:
 
 
 def as_int(kind: Kind) -> IntKind | None:
-    """The integer that a number of this kind is, an enum being any int32; None for other kinds."""
+    """Return the integer kind of a number; an enum can be any int32. Return None for other kinds."""
     if isinstance(kind, EnumKind):
         return INT32
     return kind if isinstance(kind, IntKind) else None
 
 
 def element_of(kind: Kind) -> Kind | None:
-    """The kind of a list's elements, bytes being a list of uint8; None for other kinds, and for an empty literal."""
+    """Return the kind of a list's elements; bytes are a list of uint8. None for other kinds and an empty literal."""
     if isinstance(kind, BytesKind):
         return OCTET
     return kind.element if isinstance(kind, ListKind) else None
@@ -165,7 +165,7 @@ _MOST_FIELDS = 4
 
 
 def fields_hint(kind: Kind) -> str:
-    """A hint for a message where a scalar is needed; empty for other kinds."""
+    """Return a hint for a message where a scalar is needed; empty for other kinds."""
     if not isinstance(kind, MessageKind):
         return ""
     names = [member.name for member in kind.type.fields]
@@ -173,17 +173,17 @@ def fields_hint(kind: Kind) -> str:
 
 
 def is_list(kind: Kind) -> bool:
-    """Whether a value of this kind has elements; text has none."""
+    """Return whether a value of this kind has elements; text has none."""
     return isinstance(kind, (ListKind, BytesKind))
 
 
 def length_of(kind: Kind) -> int | None:
-    """The length of a list, None where it is known at run time only."""
+    """Return the length of a list, None if it is only known at run time."""
     return kind.length if isinstance(kind, ListKind) else None
 
 
 def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind | None, bool]:
-    """Return the kind of the integers between these that fit 64 bits, and whether there are others.
+    """Return the kind of the integers between these that fit 64 bits, and whether some do not.
 
     The kind is None if no integer fits.
     """
@@ -195,14 +195,14 @@ def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind |
 
 
 def float_bits(kind: Kind) -> int:
-    """The width that this number requires of a float result; integers require 32."""
+    """Return the width that this number requires of a float result; integers require 32."""
     return kind.bits if isinstance(kind, FloatKind) else 32
 
 
 def join(left: Kind, right: Kind) -> Kind | None:
-    """The kind of a value that is one or the other, None when no kind holds both.
+    """Return the kind of a value that is one or the other, None if no kind holds both.
 
-    A joined integer kind may be narrower than both together. Values outside of it are refused at run time.
+    A joined integer kind may be narrower than both together. Values outside its range are rejected at run time.
     """
     if left == right:
         return left

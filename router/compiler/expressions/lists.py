@@ -21,11 +21,11 @@ from router.compiler.expressions.tree import Call, Constant, Each, Element, List
 from router.errors import Code, SourceSpan
 
 Make = Callable[[Sequence[Node]], Node]
-"""Makes a node of scalar operands. Raises ExpressionError."""
+"""Makes a node from scalar operands. Raises ExpressionError."""
 
 
 def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
-    """A list literal. Its elements have a common kind; each keeps its own."""
+    """Return a list literal. Its elements have a common kind, but each keeps its own."""
     element: Kind | None = items[0].kind if items else None
     for item in items[1:]:
         element = join(element, item.kind) if element else None
@@ -35,7 +35,7 @@ def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
 
 
 def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
-    """`holder[index]`."""
+    """Return `holder[index]`."""
     element, length, position = element_of(holder.kind), length_of(holder.kind), constant_of(index)
     if element is None:
         raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {holder.kind} has no elements", "only lists can be indexed")
@@ -52,7 +52,7 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
 
 
 def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
-    """Apply `make` to scalars, or to the elements of lists side by side."""
+    """Apply `make` to scalars, or to the elements of parallel lists."""
     lists = [operand for operand in operands if is_list(operand.kind)]
     if not lists:
         return make(operands)
@@ -78,7 +78,7 @@ def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: S
 
 
 def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
-    """The length of all these lists, None if none is known."""
+    """Return the common length of these lists, None if it is not known."""
     lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
     if len(lengths) > 1:
         message = f"lists of {' and '.join(map(str, lengths))} elements cannot be combined"
@@ -88,7 +88,7 @@ def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
 
 
 def _want_known_lengths(lists: Sequence[Node]) -> None:
-    """Refuse a list of any length beside a literal."""
+    """Reject a list of unknown length beside a literal."""
     for each in lists:
         if length_of(each.kind) is None:
             message = "only a list of known length can be combined with a list literal"
@@ -97,7 +97,7 @@ def _want_known_lengths(lists: Sequence[Node]) -> None:
 
 
 def _pick(operand: Node, index: int) -> Node:
-    """An element of a list of known length. A scalar is the same for every element."""
+    """Return an element of a list of known length, or a scalar, which is the same for every element."""
     if isinstance(operand, Listed):
         return operand.items[index]
     kind = element_of(operand.kind)
@@ -142,10 +142,10 @@ def _has_to_be_converted(given: Kind | None, wanted: Kind) -> bool:
 
 
 def fitted(value: Node, kind: IntKind) -> Call:
-    """An integer, refused at run time if it is outside of a range."""
+    """Return an integer that is rejected at run time if it is out of range."""
     return limited("fit", value, kind, kind.low, kind.high)
 
 
 def limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
-    """A value within limits, which the function checks at run time."""
+    """Return a value with limits, which the function checks at run time."""
     return Call(kind, value.span, function, (value, *(whole(limit, value.span) for limit in limits)))

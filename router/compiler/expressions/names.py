@@ -1,4 +1,4 @@
-"""The meaning of names: variables, fields, constants of enums and ROS types; and has()."""
+"""Resolution of names: variables, fields, constants of enums and ROS types; and has()."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from router.types.paths import leads, ways
 
 
 def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
-    """A name that stands alone. `expected` is the type of the field that it fills."""
+    """Resolve a single name. `expected` is the type of the field that it fills."""
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
@@ -85,11 +85,11 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
 
 
 _MISSPELT = 0.9
-"""How near a name is to one of the message's own fields if it can only be that."""
+"""Similarity from which a name can only be a misspelt field of the message."""
 
 
 def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
-    """Where `names` can be read that are no path from the message itself."""
+    """Return the paths to `names`, if they are not a path from the message itself."""
     own = [prefix + ".".join(names) for prefix, message in scope.messages() if prefix and leads(message, names)]
     return own or [
         prefix + way for prefix, message in scope.messages() for way in ways(message, names, with_lists=True)
@@ -97,13 +97,13 @@ def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
 
 
 def _presence(text: str, scope: Scope) -> str:
-    """A hint for `has_air`, as protobuf in C and C++ names it."""
+    """Return a hint for `has_air`, the name in protobuf for C and C++."""
     member = scope.message.field(text.removeprefix("has_"))
     return f"did you mean 'has({member.name})'?" if member and member.has_presence else ""
 
 
 def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) -> ExpressionError:
-    """For a name in a message of constants."""
+    """Return the error for a name in a message of constants."""
     example = f"{expected}.{expected.values[0][0]}" if isinstance(expected, Enum) else "0"
     message = f"'{text}' is not a constant"
     return ExpressionError(
@@ -115,7 +115,7 @@ def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) 
 
 
 def _of_an_enum(text: str, scope: Scope, expected: Type | None = None) -> str:
-    """A hint for a value without its enum or ROS type; enums of the message's own fields come first."""
+    """Return a hint for a value without its enum or ROS type; enums of the message's own fields come first."""
     if isinstance(expected, Enum) and text.isupper() and (near := nearest(text, dict(expected.values))):
         return f"did you mean '{near}'?"
     homes = [enum for enum in scope.enums if text in dict(enum.values)]
@@ -136,12 +136,12 @@ def _given(text: str, span: SourceSpan, scope: Scope) -> Node:
 
 
 def is_source(operand: Node) -> bool:
-    """Whether an operand is the name of the endpoint that sent the message."""
+    """Return whether an operand is the name of the endpoint that sent the message."""
     return isinstance(operand, Variable) and operand.name == SOURCE
 
 
 def want_senders(operands: Sequence[Node], scope: Scope) -> None:
-    """Refuse a comparison of the sender's name with a text that is the name of no possible sender."""
+    """Reject a comparison of the sender's name with a text that is not the name of a possible sender."""
     if not scope.sources or not any(map(is_source, operands)):
         return
     for each in (
@@ -154,7 +154,7 @@ def want_senders(operands: Sequence[Node], scope: Scope) -> None:
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
-    """The parts of `a.b.C` when it is to be looked up among enums and ROS types: no field or variable is `a`."""
+    """Return the parts of `a.b.C` if it refers to an enum or ROS type: `a` is neither a field nor a variable."""
     path = dotted(node)
     if path is None or path[0] in (*scope.given, *scope.field_names()):
         return None
@@ -162,7 +162,7 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
 
 
 def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
-    """The message for the `message` of `message.name`, unless it has a submessage of that name; None for all else."""
+    """Return the message for `message` in `message.name`, unless it has such a submessage; None for anything else."""
     member = scope.message.field(MESSAGE)
     is_meant = (
         isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)
@@ -171,14 +171,14 @@ def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
 
 
 def is_null(node: ast.expr, scope: Scope) -> bool:
-    """Whether it is `None`, or `null` or the like and no field of that name."""
+    """Return whether a node is `None`, or `null` and the like without a field of that name."""
     if isinstance(node, ast.Constant):
         return node.value is None
     return isinstance(node, ast.Name) and node.id.lower() in spellings.NULLS and node.id not in scope.field_names()
 
 
 def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -> ExpressionError:
-    """For a comparison of `written` with null."""
+    """Return the error for a comparison of `written` with null."""
     hint = f"'{written}' is always present"
     if isinstance(compared, Read) and compared.field.has_presence:
         hint = f"write `{'not ' * is_equal}has({written})`"
@@ -194,7 +194,7 @@ _OF_OTHERS = {
 
 
 def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
-    """`holder.name`."""
+    """Resolve `holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
         hint = _of_elements(holder.kind, node) or _OF_OTHERS.get(type(holder.kind), "only messages have fields")
@@ -210,7 +210,7 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
 
 
 def _of_elements(kind: Kind, node: ast.Attribute) -> str:
-    """A hint for `list.name` where the list's elements have a field of that name."""
+    """Return a hint for `list.name` if the list's elements have a field of that name."""
     element = kind.element if isinstance(kind, ListKind) else None
     if not isinstance(element, MessageKind) or element.type.field(node.attr) is None:
         return ""
@@ -218,7 +218,7 @@ def _of_elements(kind: Kind, node: ast.Attribute) -> str:
 
 
 def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str]:
-    """What `a.b.c` may mean where the message `a` has no `b`: `a.x.b.c`, or `a.c`."""
+    """Return what `a.b.c` may mean if the message `a` has no `b`: `a.x.b.c`, or `a.c`."""
     before = ast.unparse(node.value)
     *_, names = ast.unparse(text.outermost(node)).partition(f"{before}.")
     wanted = names.split(".")
@@ -236,7 +236,7 @@ def _readable(field: Read) -> Read:
 
 
 def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
-    """`SensorState.SENSOR_ERROR`: an enum's value or a ROS type's constant, at `path`."""
+    """Resolve an enum's value or a ROS type's constant at `path`: `SensorState.SENSOR_ERROR`."""
     holder_name = ".".join(path[:-1])
     holders = scope.holders(holder_name)
     if not holders:
@@ -258,7 +258,7 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
 
 
 def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> ExpressionError:
-    """For `a.b.c` if nothing is named `a`."""
+    """Return the error for `a.b.c` if nothing is named `a`."""
     whole, holder_name = text.span(node), ".".join(path[:-1])
     if path[0] in scope.absent:
         return ExpressionError(whole, Code.UNKNOWN_FIELD, *scope.absent[path[0]])
@@ -280,7 +280,7 @@ def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scop
 
 
 def _without_root(path: tuple[str, ...], scope: Scope) -> list[str]:
-    """What `msg.accel_x` may mean, which is written here without the first name."""
+    """Return what `msg.accel_x` may mean without the first name."""
     for rest in (path[start:] for start in range(1, len(path))):
         if found := [".".join(rest)] if leads(scope.message, rest) else _ways(scope, rest):
             return found
@@ -292,7 +292,7 @@ def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
 
 
 def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
-    """The path from the source message that `node` stands for; None if it is no chain of names."""
+    """Return the path of `node` from the source message; None if it is not a chain of names."""
     path = dotted(node)
     if path is None or path[0] in scope.names:
         return None
@@ -300,7 +300,7 @@ def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
 
 
 def presence(argument: Node, path: tuple[str, ...], span: SourceSpan) -> Present:
-    """`has(path)`. Raises ExpressionError for what is no field that can be missing."""
+    """Return `has(path)`. Raises ExpressionError unless it is a field that can be missing."""
     if not isinstance(argument, Read) and len(path) > 1:
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
     if not isinstance(argument, Read) or not argument.field.has_presence:

@@ -1,6 +1,6 @@
-"""Literals and operators: what they take, the kind of the result, and the range of an integer result.
+"""Literals and operators: the operands that they take, the kind of the result, and the range of an integer result.
 
-Operands are checked before.
+The operands themselves are already checked.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from router.errors import Code, SourceSpan
 
 
 def constant(value: object, span: SourceSpan) -> Constant:
-    """A literal. Raises ExpressionError for one that the language does not have, or that is too large."""
+    """Return a literal. Raises ExpressionError if the language does not have it, or if it is too large."""
     match value:
         case bool():
             return Constant(BoolKind(), span, value)
@@ -71,7 +71,7 @@ def constant(value: object, span: SourceSpan) -> Constant:
 
 
 def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False) -> tuple[IntKind, bool]:
-    """The kind of an integer between these, and whether a result has to be checked at run time.
+    """Return the kind of an integer between these, and whether a result must be checked at run time.
 
     Raises ExpressionError if it never fits.
     """
@@ -142,7 +142,7 @@ def unary(op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
 
 
 def want_binary(op: ast.operator, span: SourceSpan) -> Operator:
-    """Raises ExpressionError for an operator that the language does not have."""
+    """Return an operator. Raises ExpressionError if the language does not have it."""
     if type(op) not in _OPERATORS:
         raise forbidden(op, span)
     return _OPERATORS[type(op)]
@@ -177,7 +177,7 @@ def _literal_as_float(operand: Node) -> Node:
 
 
 def folded(made: Binary) -> Binary | Constant:
-    """Replace arithmetic of two literals by its result, so that the result is checked against the target."""
+    """Evaluate arithmetic of two literals, so that the result is checked against the target."""
     left, right = constant_of(made.left), constant_of(made.right)
     if left is None or right is None:
         return made
@@ -193,7 +193,7 @@ def folded(made: Binary) -> Binary | Constant:
 
 
 def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:
-    """Integers that include the smallest and the largest value of `left op right`."""
+    """Return integers that include the smallest and the largest value of `left op right`."""
     bounds, (low, high) = (left.low, left.high), (right.low, right.high)
     if op in _MONOTONE:
         return [COMPUTED[op](x, y) for x in bounds for y in (low, high)]
@@ -206,7 +206,7 @@ def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:
 
 
 def _exponent(node: Node) -> IntKind:
-    """The range of an exponent, which is a literal."""
+    """Return the range of an exponent, which must be a literal."""
     value = constant_of(node)
     if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
         message = f"an exponent must be a literal integer from 0 to {LARGEST_EXPONENT}"
@@ -239,7 +239,7 @@ def boolean(op: ast.boolop, operands: Sequence[Node], span: SourceSpan) -> Logic
 
 
 def comparison(ops: Sequence[ast.cmpop], operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
-    """`a < b < c` has two operators and three operands."""
+    """Return a comparison: `a < b < c` has two operators and three operands."""
     for op, (left, right) in zip(ops, pairwise(operands), strict=True):
         _want_comparable(op, left, right, span)
     if not any(isinstance(op, (ast.In, ast.NotIn)) for op in ops):
@@ -255,7 +255,7 @@ def _test(op: ast.cmpop, left: Node, right: Node, span: SourceSpan, scope: Scope
 
 
 def equality(left: Node, right: Node, span: SourceSpan) -> Node:
-    """`left == right`."""
+    """Return `left == right`."""
     _want_comparable(ast.Eq(), left, right, span)
     return Compare(BoolKind(), span, (Relation.EQUAL,), (left, right))
 
@@ -272,7 +272,7 @@ def _comparison_hint(left: Node, right: Node) -> str:
 
 
 def _comparable_value(held: Node, written: Node) -> str:
-    """A hint if an enum is compared with the quoted name of one of its values, else an empty string."""
+    """Return a hint if an enum is compared with the quoted name of one of its values, else an empty string."""
     value = constant_of(written)
     if not isinstance(held.kind, EnumKind) or value is None:
         return ""
@@ -301,7 +301,7 @@ def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -
 
 
 def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope) -> Choice:
-    """`body if test else orelse`, where `test` is a bool."""
+    """Return `body if test else orelse`, where `test` is a bool."""
     kind = join(body.kind, orelse.kind)
     if kind is None:
         message = f"no field can hold both {body.kind} and {orelse.kind}"
@@ -316,7 +316,7 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
 
 
 def presence_hint(operand: Node) -> str:
-    """A hint for a message in place of a bool; empty for anything else, or if it is always there."""
+    """Return a hint for a message in place of a bool; empty for anything else, or if it is always present."""
     if not isinstance(operand, Read) or not isinstance(operand.kind, MessageKind) or not operand.field.has_presence:
         return ""
     names, holder = [operand.field.name], operand.holder

@@ -1,4 +1,4 @@
-"""What the names of an expression mean: the fields of the source message, the variables and the constants in sight."""
+"""Names that are visible in an expression: fields of the source message, variables and constants."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from router.types.model import Enum, Field, List, MessageType, String
 
 
 class ExpressionError(FindingError):
-    """The first thing that is wrong in an expression."""
+    """The first mistake in an expression."""
 
 
 @dataclass(slots=True)
 class Scope:
-    """What names mean in the expressions of one target.
+    """The names in the expressions of one target.
 
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
-    variables beside the message's fields; they win over fields of the same name. `given` are those of
-    MESSAGE, SOURCE and RECEIVED_AT that can be named. `sources` are the values that SOURCE can have, empty if they are
-    not known. `absent` are names that a missing key of the route would define, each with what is wrong and what to do.
+    additional variables, which take precedence over fields. `given` are those of MESSAGE, SOURCE and RECEIVED_AT that
+    are available. `sources` are the possible values of SOURCE, empty if they are not known. `absent` are names that a
+    missing key of the route would define, each with message and hint.
     """
 
     message: MessageType
@@ -36,31 +36,31 @@ class Scope:
     _elements: Iterator[int] = field(default_factory=lambda: count(1))
 
     def element_variable(self) -> str:
-        """A new variable for the elements of a list."""
+        """Return a new variable for the elements of a list."""
         return f"item_{next(self._elements)}"
 
     def field_names(self) -> list[str]:
-        """The fields of the message and the names beside them."""
+        """Return the fields of the message and the additional variables."""
         return [*self.names, *(member.name for member in self.message.fields)]
 
     def variable(self, name: str, span: SourceSpan) -> Node:
-        """One of `names`, positioned at `span`."""
+        """Return one of `names`, positioned at `span`."""
         return replace(self.names[name], span=span)
 
     def holder_names(self) -> set[str]:
-        """The names of everything that has constants: enums by full and short name, ROS types by short name."""
+        """Return the names of all types with constants: enums by full and short name, ROS types by short name."""
         enums = {known for enum in self.enums for known in (enum.name, enum.name.rpartition(".")[2])}
         return enums | {ros.short_name for ros in self.ros_types if ros.constants}
 
     def holders(self, text: str) -> list[Enum | MessageType]:
-        """The enums, else ROS types, that `text` may mean; an enum of the message itself comes first."""
+        """Return the enums and ROS types that `text` may mean; an enum of the message itself comes first."""
         named = [enum for enum in self.enums if enum.name == text or enum.name.endswith(f".{text}")]
         own = [enum for enum in named if enum.name == f"{self.message.name}.{text}"]
         exact = [enum for enum in named if enum.name == text]
         return list(own or exact or named) + [ros for ros in self.ros_types if ros.short_name == text]
 
     def messages(self) -> list[tuple[str, MessageType]]:
-        """The messages whose fields can be read, each with what stands before a field's name."""
+        """Return the messages whose fields can be read, each with the prefix of a field's name."""
         kinds = [(f"{name}.", node.kind) for name, node in self.names.items()]
         return [("", self.message), *((prefix, kind.type) for prefix, kind in kinds if isinstance(kind, MessageKind))]
 
@@ -69,7 +69,7 @@ class Scope:
 
 
 def field_of(holder: Node, member: Field, span: SourceSpan) -> Read:
-    """A field of the message that `holder` is."""
+    """Return a field of the message `holder`."""
     return Read(kind_of(member.type), span, holder, member)
 
 
@@ -86,7 +86,7 @@ def want_readable(node: Node) -> None:
 
 
 def _unreadable(member: Field) -> tuple[str, str] | None:
-    """For a field that expressions cannot read, its kind and what to do instead; None for all others."""
+    """Return the kind of a field that expressions cannot read, and a hint; None for all others."""
     declared = member.type.element if isinstance(member.type, List) else member.type
     if isinstance(declared, MessageType) and declared.is_map_entry:
         return "map", "destinations receive it unchanged; for a topic, declare a list of messages with key and value"

@@ -1,4 +1,4 @@
-"""What to write here for what other languages spell otherwise: hints of findings."""
+"""Hints for expressions in the syntax of other languages."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _SYNTAX = (
     (r"^[^(]*\)", "remove the closing bracket, or open it"),
     (r"\w\s+\w", "add the missing operator, or the brackets of a function: abs(x)"),
 )
-"""What to search in an expression that Python cannot parse, in this order."""
+"""Patterns to search, in this order, in an expression that Python cannot parse."""
 
 _UNIT = re.compile(
     r"(?<=[\w)\]])\s*(?P<unit>%|\u2030|\u00b0[CF]?|(?<![A-Za-z_])(?:k?m/h|m/s(?:\^?2|\u00b2)?|rad/s|deg/s|[kMG]?Hz|rpm|[mcdk]?m|[mu\u00b5n]?s|min|h"
@@ -62,7 +62,7 @@ _WITHOUT_VALUE = re.compile(
 
 
 class Slip(NamedTuple):
-    """What makes an expression none, from where to where, and what to do."""
+    """A mistake that makes an expression invalid: its place (start, end), message and hint."""
 
     place: tuple[int, int]
     what: str
@@ -70,7 +70,7 @@ class Slip(NamedTuple):
 
 
 def slip(text: str, names: Collection[str]) -> Slip | None:
-    """A unit, or an operator that lacks an operand, in what cannot be parsed; else None. `names` are no units."""
+    """Return a unit, or an operator without an operand, in invalid text; else None. `names` do not count as units."""
     bare = _QUOTED.sub(lambda quoted: "_" * len(quoted[0]), text)
     for found in _UNIT.finditer(bare):
         unit = found["unit"]
@@ -86,7 +86,7 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
 
 
 def _word_before(text: str) -> str:
-    """The name or number at the end of a text; read backwards, so that the time is linear."""
+    """Return the name or number at the end of a text; searched backwards, so that the time is linear."""
     word = re.match(r"[\w.]*", text[::-1])
     return word[0][::-1] if word else ""
 
@@ -130,11 +130,11 @@ FUNCTIONS = {
     "now": ARRIVAL,
     "time": ARRIVAL,
 }
-"""Functions by their names elsewhere, in lower case, after the module's name where there is one."""
+"""Functions by their names in other languages, in lower case, without a module's name."""
 
 
 def of_syntax(text: str) -> str:
-    """The hint for an expression that cannot be parsed; empty where it looks like nothing known."""
+    """Return a hint for an expression that cannot be parsed; empty if there is none."""
     bare = _QUOTED.sub("", text)
     if bare.count("(") > bare.count(")"):
         return "close every bracket; inside {} and [] quote the expression, because a comma ends it"

@@ -1,6 +1,6 @@
-"""Parse the text of an expression into Python's syntax tree, with positions in the table.
+"""Parsing of an expression to Python's syntax tree, with positions in the table.
 
-Anything that Python can parse passes here; `forbidden` words the finding for what the language does not have.
+Accepts anything that Python can parse; `forbidden` makes the finding for syntax that the language does not have.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from router.table.model import Expression
 
 
 class Parsed:
-    """A parsed expression with its syntax `tree`. Raises ExpressionError if it is no Python expression.
+    """A parsed expression with its syntax `tree`. Raises ExpressionError if it is not a Python expression.
 
-    `names` are those of fields and variables, some of which may be words of Python.
+    `names` are those of fields and variables, some of which may be Python keywords.
     """
 
     def __init__(self, expression: Expression, names: Collection[str] = ()) -> None:
@@ -58,43 +58,43 @@ class Parsed:
             ) from None
 
     def _of_word(self, text: str) -> str:
-        """A hint if a field's name, which has a meaning of its own here, stands alone."""
+        """Return a hint if the name of a field that is also a keyword of expressions is used alone."""
         words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"] and not found["dot"]}
         named = sorted(_MEANINGFUL & words & {*self._names})
         return f"write message.{named[0]} for the field '{named[0]}'" if named else ""
 
     def _blamed(self, error: SyntaxError) -> SourceSpan:
-        """The position of a syntax error, which counts characters from 1, may have none, or end on another line."""
+        """Return the span of a syntax error, which counts from 1 and may have no position, or end on another line."""
         start = max(error.offset or 1, 1) - 1
         end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
         return self._expression.place.part(self._indent + start, self._indent + end)
 
     def span(self, node: ast.expr) -> SourceSpan:
-        """The span of a node in the table."""
+        """Return the span of a node in the table."""
         end = node.end_col_offset if node.end_col_offset is not None else node.col_offset + 1
         return self._expression.place.part(self._characters(node.col_offset), self._characters(end))
 
     def last_span(self, node: ast.Attribute) -> SourceSpan:
-        """The span of the last name of `a.b.c`."""
+        """Return the span of the last name of `a.b.c`."""
         end = self._characters(node.end_col_offset or 0)
         return self._expression.place.part(end - len(node.attr), end)
 
     def outermost(self, node: ast.Attribute) -> ast.Attribute:
-        """`a.b.c.d` for the `a.b` in it."""
+        """Return `a.b.c.d` for the `a.b` in it."""
         holders = {id(each.value): each for each in ast.walk(self.tree) if isinstance(each, ast.Attribute)}
         while outer := holders.get(id(node)):
             node = outer
         return node
 
     def _characters(self, offset: int) -> int:
-        """The offset in characters for one in UTF-8 bytes, which ast counts."""
+        """Convert an offset in UTF-8 bytes, as ast counts, to characters."""
         return self._indent + len(self._encoded[:offset].decode(errors="replace"))
 
 
 _MEANINGFUL = frozenset(
     {"and", "or", "not", "in", "is", "if", "else", "True", "False", "None", "lambda", "for", "await", "yield"}
 )
-"""Words of Python that are names only behind a dot."""
+"""Keywords of Python that are names only after a dot."""
 
 _LEXEMES = re.compile(
     r"""
@@ -105,11 +105,11 @@ _LEXEMES = re.compile(
     re.VERBOSE,
 )
 _MARKED = 0xA000
-"""Letters from here on (Yi syllables) mark a word by its first letter, and are letters for Python."""
+"""Characters from here on (Yi syllables, letters for Python) replace and mark the first letter of a keyword."""
 
 
 def _with_words_as_names(text: str) -> str:
-    """Turn words of Python that may be fields into names that Python parses, of the same length."""
+    """Replace Python keywords that may be fields by names of the same length that Python parses."""
 
     def replaced(found: re.Match[str]) -> str:
         dot, name = found["dot"] or "", found["name"]
@@ -121,7 +121,7 @@ def _with_words_as_names(text: str) -> str:
 
 
 def _with_words(tree: ast.expr) -> ast.expr:
-    """Turn such names in the syntax tree into the words again."""
+    """Restore the keywords in the syntax tree."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Name):
             node.id = _word(node.id)
@@ -136,7 +136,7 @@ def _word(name: str) -> str:
 
 
 def _comment(text: str) -> int | None:
-    """Where a comment of Python begins in the text, outside of its quotes."""
+    """Return where a Python comment begins in the text, outside its quotes; None without."""
     with suppress(tokenize.TokenError, SyntaxError):
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT:
@@ -145,7 +145,7 @@ def _comment(text: str) -> int | None:
 
 
 def dotted(node: ast.expr) -> tuple[str, ...] | None:
-    """`a.b.c` as its parts, None for anything else."""
+    """Return the parts of `a.b.c`, None for anything else."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute):
         parts.append(node.attr)
@@ -157,7 +157,7 @@ ALLOWED = "allowed: fields, literals, arithmetic, comparison, and/or/not, if/els
 
 
 def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
-    """The finding for an expression, or an operator, that is not part of the language."""
+    """Return the error for an expression, or an operator, that is not part of the language."""
     hint = _HINTS.get(type(node), ALLOWED if isinstance(node, ast.expr) else "")
     word = _WORDS.get(type(node), type(node).__name__)
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{word} is not part of the language", hint)

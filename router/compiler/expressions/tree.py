@@ -16,14 +16,14 @@ from router.errors import SourceSpan
 from router.types.model import Field
 
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
-"""Variables that every expression can name beside the fields; a field of the same name wins."""
+"""Variables in every expression; a field of the same name takes precedence."""
 
 ITEM, INDEX, COUNT, ITEMS = "item", "index", "count", "items"
 """Variables of `for_each` (the first three) and of `collect` (the last two)."""
 
 
 class Operator(Enumeration):
-    """Operators of one and two operands; the value is how the table spells them."""
+    """Operators of one and two operands; the value is their spelling in a table."""
 
     NOT = "not"
     NEGATE = "-x"
@@ -47,7 +47,7 @@ class Relation(Enumeration):
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A literal, a value of an enum, a constant of a ROS type, or arithmetic of such. Times are integers (ns)."""
+    """A literal, a value of an enum, a constant of a ROS type, or arithmetic of these. Times are integers (ns)."""
 
     kind: Kind
     span: SourceSpan
@@ -56,7 +56,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """The source message (MESSAGE), what stands beside it, or an element of an Each (`item_1`, ...)."""
+    """The source message (MESSAGE), another variable, or an element of an Each (`item_1`, ...)."""
 
     kind: Kind
     span: SourceSpan
@@ -65,7 +65,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A field of the message that `holder` is: a Variable, another Read, or an Element."""
+    """A field of the message `holder`, which is a Variable, another Read, or an Element."""
 
     kind: Kind
     span: SourceSpan
@@ -75,7 +75,7 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """Whether a payload has a field that can be missing."""
+    """Whether a field of a payload that can be missing is set."""
 
     kind: Kind
     span: SourceSpan
@@ -85,7 +85,7 @@ class Present:
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """An element of a list, by a constant index. Refused at run time if there is none."""
+    """An element of a list, by a constant index. Rejected at run time if it does not exist."""
 
     kind: Kind
     span: SourceSpan
@@ -104,10 +104,10 @@ class Listed:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list computed element by element: `element`, for the elements of `lists` side by side.
+    """A list computed element by element: `element`, for each index of the parallel `lists`.
 
     `lists` are pairs of a variable and the list whose elements it takes; none is an Each itself. Lists of different
-    length are refused at run time.
+    length are rejected at run time.
     """
 
     kind: ListKind
@@ -118,7 +118,7 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Unary:
-    """NOT or NEGATE. `is_checked`: a result that does not fit its kind is refused."""
+    """NOT or NEGATE. With `is_checked`, a result that does not fit its kind is rejected."""
 
     kind: Kind
     span: SourceSpan
@@ -131,8 +131,8 @@ class Unary:
 class Binary:
     """Arithmetic of two numbers, or ADD of two texts.
 
-    Two integers give an integer (DIVIDE a float); otherwise both become doubles. `is_checked`: an integer result that
-    does not fit its kind is refused.
+    Two integers give an integer (DIVIDE a float); otherwise both become doubles. With `is_checked`, an integer result
+    that does not fit its kind is rejected.
     """
 
     kind: Kind
@@ -145,7 +145,7 @@ class Binary:
 
 @dataclass(frozen=True, slots=True)
 class Compare:
-    """`a < b <= c`. Each operand is evaluated at most once, and none after a comparison that is false."""
+    """`a < b <= c`. Each operand is evaluated at most once; evaluation stops at a comparison that is false."""
 
     kind: Kind
     span: SourceSpan
@@ -166,7 +166,7 @@ class Contains:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """`and` (`is_all`) or `or`. Evaluation stops at the operand that decides."""
+    """`and` (`is_all`) or `or`. Evaluation stops at the operand that determines the result."""
 
     kind: Kind
     span: SourceSpan
@@ -205,12 +205,12 @@ _NODES = get_args(Node)
 
 
 def constant_of(node: Node) -> bool | int | float | str | None:
-    """The value of a Constant, None for everything else (there is no None in the language)."""
+    """Return the value of a Constant, None for everything else (there is no None in the language)."""
     return node.value if isinstance(node, Constant) else None
 
 
 def constant_bytes(octets: Call) -> bytes | None:
-    """What a call of `octets` gives, if all its integers are Constants."""
+    """Return the result of a call of `octets`, if all its integers are Constants."""
     (values,) = octets.arguments
     if not isinstance(values, Listed) or not all(isinstance(item, Constant) for item in values.items):
         return None
@@ -218,12 +218,12 @@ def constant_bytes(octets: Call) -> bytes | None:
 
 
 def whole(number: int, span: SourceSpan) -> Constant:
-    """An integer."""
+    """Return an integer as a Constant."""
     return Constant(IntKind(number, number), span, number)
 
 
 def parts_of(node: Node) -> Iterator[Node]:
-    """The nodes directly in this one."""
+    """Yield the direct children of a node."""
     for each in fields(node):
         yield from _nodes_of(getattr(node, each.name))
 
@@ -237,11 +237,11 @@ def _nodes_of(value: object) -> Iterator[Node]:
 
 
 CHECKS = ("fit", "fit_text", "octets", "named", "member")
-"""Functions that `conversion` puts around a value, and that tables cannot call:
+"""Functions that `conversion` wraps around a value, and that tables cannot call:
 
-fit(x, low, high)   an integer, refused outside of two Constants
-fit_text(x, most)   text or bytes of at most so many bytes
-octets(list)        a list of integers as bytes, each refused outside of 0 to 255
-named(text)         the value of the enum in `kind` that has this name, refused if none has
-member(x)           a number as a value of the closed enum in `kind`, refused if it has no such value
+fit(x, low, high)   an integer, rejected outside two Constants
+fit_text(x, most)   text or bytes, rejected if longer than `most` bytes
+octets(list)        a list of integers as bytes, each rejected outside 0 to 255
+named(text)         the value of the enum in `kind` with this name, rejected if there is none
+member(x)           a number as a value of the closed enum in `kind`, rejected if there is no such value
 """

@@ -1,6 +1,6 @@
-"""From the routes of a table without errors to the routines that the carrier executes.
+"""Lowering of the routes of a table without errors to the routines that the carrier executes.
 
-Each target is lowered once. A routine that would be too large is a finding.
+Each target is lowered once. A routine that is too large is a finding.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnosti
 
 
 def lower_condition(condition: Node, case: PayloadCase) -> LoweredCondition:
-    """Lower a condition on a payload by itself. Raises TooLargeError."""
+    """Lower a single condition on a payload. Raises TooLargeError."""
     source = Datagram(case)
     routine, _ = source.condition(source.lowering(), [condition])
     return LoweredCondition(routine, source.layout(condition.span))

@@ -80,7 +80,7 @@ class _Writer:
 
 
 def _are_copied(made: Each, taken: list[Taken]) -> bool:
-    """Whether bytes become a list of the same bytes."""
+    """Return whether bytes are copied to a list of bytes unchanged."""
     element = made.element
     if len(taken) > 1 or not isinstance(element, Leaf) or element.type != Int(8, signed=False):
         return False
@@ -93,11 +93,11 @@ def _are_copied(made: Each, taken: list[Taken]) -> bool:
 
 _SIZES = {Op.PUT_FLOAT: 4, Op.PUT_DOUBLE: 8}
 _LOSE = frozenset({Op.PUT_TEXT, Op.PUT_BYTES, Op.REPEAT, Op.AGAIN})
-"""Behind these the offset is not known."""
+"""Operations after which the offset is not known."""
 
 
 def _padded(placed: Iterable[Placed], offset: Offset) -> Iterator[Placed]:
-    """Put padding that is known in front of known bytes, which need no alignment then. They begin at `offset`."""
+    """Prepend known padding to known bytes, which then need no alignment. They begin at `offset`."""
     for operation, place in placed:
         if operation.kind is not Op.KNOWN:
             yield operation, place

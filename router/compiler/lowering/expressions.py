@@ -1,7 +1,7 @@
 """From a checked expression to the operations that compute it.
 
-The tree has the kind of each value, the range of each integer, and which results have to be checked. A value on the
-stack is an integer, a real number, text, bytes or a list, according to its kind; a time is its nanoseconds. A message
+The tree has the kind of each value, the range of each integer, and the results that must be checked. A value on the
+stack is an integer, a real number, text, bytes or a list, depending on its kind; a time is its nanoseconds. A message
 is on the stack only as an element of a list: its fields are read from a Section.
 """
 
@@ -60,7 +60,7 @@ _INTEGERS: Mapping[tree.Operator, tuple[Op, Op]] = {
     tree.Operator.FLOOR_DIVIDE: (Op.DIVIDE, Op.DIVIDE),
     tree.Operator.MODULO: (Op.MODULO, Op.MODULO),
 }
-"""Without and with a check of the result."""
+"""Operations without and with a check of the result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +70,9 @@ class Lowering:
     names: Names
 
     def value(self, node: tree.Node) -> Routine:
-        """Return the operations that put the value of a node on the stack.
+        """Return the operations that push the value of a node.
 
-        A value that no turn of a loop changes is computed once, in the first turn that needs it.
+        A loop invariant is computed once, in the first iteration that needs it.
         """
         if (level := self._unchanged(node)) is None:
             return self._value(node)
@@ -82,7 +82,7 @@ class Lowering:
         return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
 
     def _unchanged(self, node: tree.Node) -> int | None:
-        """Return the outermost loop that leaves a node unchanged, as do all loops in it; None if there is none."""
+        """Return the outermost loop in which a node is invariant, with all loops inside it; None if there is none."""
         loops = self.names.loops
         if not loops or not _can_be_kept(node):
             return None
@@ -122,16 +122,16 @@ class Lowering:
             case tree.Call():
                 return functions.called(self, node)
             case _:
-                raise AssertionError(f"{node.kind} is no list")
+                raise AssertionError(f"{node.kind} is not a list")
 
     def real(self, node: tree.Node) -> Routine:
-        """Return those that put a number there as a real one."""
+        """Return the operations that push a number as a real number."""
         return to_real(self.value(node), node.kind)
 
     # messages and their fields
 
     def message(self, node: tree.Node) -> tuple[Routine, Section]:
-        """Return the section that has the fields of a message, and the operations that read them into it."""
+        """Return the operations that read a message into its section, and the section."""
         match node:
             case tree.Variable():
                 meaning = self.names.variables[node.name]
@@ -193,7 +193,7 @@ class Lowering:
         return routine(self.value(node.left), self.value(node.right), Operation(operator, flag=flag))
 
     def _power(self, node: tree.Binary) -> Routine:
-        """A power of an integer, by multiplication. A lower power fits wherever the result does."""
+        """Lower a power of an integer to multiplications. Lower powers fit whenever the result fits."""
         assert isinstance(node.right, tree.Constant)  # noqa: S101 - exponents are literals
         exponent = int(node.right.value)
         base = self.value(node.left)
@@ -209,7 +209,7 @@ class Lowering:
         return routine(base, keep(slot), again * (exponent - 2), last)
 
     def _compare(self, node: tree.Compare) -> Routine:
-        """Each operand is evaluated once, and none behind a comparison that is false."""
+        """Lower comparisons. Each operand is evaluated once; evaluation stops at a comparison that is false."""
         slots = [self.names.temporary() for _ in node.operands[1:-1]]
         values = list(map(self.value, node.operands))
         firsts = [values[0], *((load(slot),) for slot in slots)]
@@ -233,7 +233,7 @@ def _is_costly(made: Routine) -> bool:
 
 
 def _can_be_kept(node: tree.Node) -> bool:
-    """Whether a value can stay in a slot from turn to turn: no list, and no text that the routine puts together."""
+    """Return whether a value can stay in a slot between iterations: no list, and no text that the routine joins."""
     if isinstance(node.kind, StringKind):
         return isinstance(node, tree.Read) or (isinstance(node, tree.Element) and isinstance(node.values, tree.Read))
     return not isinstance(node, (tree.Constant, tree.Variable)) and not isinstance(
@@ -242,7 +242,7 @@ def _can_be_kept(node: tree.Node) -> bool:
 
 
 def _variables(node: tree.Node) -> Iterator[str]:
-    """The names of all variables that a node reads."""
+    """Yield the names of all variables that a node reads."""
     if isinstance(node, tree.Variable):
         yield node.name
     for part in tree.parts_of(node):

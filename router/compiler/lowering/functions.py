@@ -1,4 +1,4 @@
-"""The functions of the language, and the checks of `conversion`, as operations."""
+"""Lowering of the language's functions, and of the checks of `conversion`."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _FACTORS = {"radians": math.pi / 180, "degrees": 180 / math.pi}
 _TIMES = {"time_from_seconds": NS_PER_SECOND, "time_from_milliseconds": NS_PER_MILLISECOND}
 _OF_THREE = {"clamp": (Op.CLAMP, Op.REAL_CLAMP), "wrap": (Op.WRAP, None)}
 EXTREMES = {"min": (Op.LEAST, Op.REAL_LEAST), "max": (Op.GREATEST, Op.REAL_GREATEST)}
-"""Of integers and of real numbers."""
+"""Operations on integers and on real numbers."""
 
 _LONGEST_DECIMAL, _LONGEST_DIGITS = 20, 1 + 309 + 1 + 17
-"""Characters of an integer, and of a double with 17 decimals."""
+"""Maximum characters of an integer, and of a double with 17 decimals."""
 
 
 def called(lowering: Lowering, node: tree.Call) -> Routine:
-    """Return the operations that put the result of a call on the stack."""
+    """Return the operations that push the result of a call."""
     name, first = node.function, node.arguments[0]
     if name in EXTREMES:
         return _extreme(lowering, node)
@@ -80,7 +80,7 @@ def _extreme(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _between(lowering: Lowering, node: tree.Call) -> Routine:
-    """clamp() and wrap()."""
+    """Lower clamp() and wrap()."""
     of_integers, of_reals = _OF_THREE[node.function]
     if isinstance(node.kind, FloatKind):
         assert of_reals is not None  # noqa: S101 - wrap() takes integers
@@ -97,7 +97,7 @@ def _fit(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _time(lowering: Lowering, node: tree.Node, factor: int) -> Routine:
-    """A time in nanoseconds. It is refused if it does not fit 64 bits."""
+    """Lower a time in nanoseconds, which is rejected if it does not fit 64 bits."""
     if isinstance(node.kind, FloatKind):
         return routine(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
     flag = signs(TimeKind(), node.kind)
@@ -120,7 +120,7 @@ def _seconds(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _named(lowering: Lowering, node: tree.Call) -> Routine:
-    """The number of a name. Another text is refused."""
+    """Lower the number of an enum's name. Other text is rejected."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
     found: Routine = (load(slot), Operation(Op.NAMELESS))
@@ -133,7 +133,7 @@ def _named(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _member(lowering: Lowering, node: tree.Call) -> Routine:
-    """A number of a closed enum. Another one is refused."""
+    """Lower a number of a closed enum. Other numbers are rejected."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     numbers = sorted({number for _, number in node.kind.enum.values})
     data = struct.pack(f"<{len(numbers)}i", *numbers)
@@ -144,7 +144,7 @@ def _member(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def longest(node: tree.Node) -> int:
-    """Return the bytes that a text has at the most. One of a ROS message can be longer: the machine refuses it then."""
+    """Return the maximum bytes of a text. Text of a ROS message can be longer: the machine then rejects it."""
     match node:
         case tree.Constant(value=str(value)):
             return len(value.encode())

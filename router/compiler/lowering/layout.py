@@ -1,7 +1,7 @@
-"""Layouts: into which slots the fields that routines use are read.
+"""Layouts: the slots into which the fields that routines use are read.
 
-A layout numbers slots and sections. Of a datagram it has the wanted fields of each section, of a ROS message the steps
-through it up to the last wanted field (`steps`).
+A layout numbers slots and sections. For a datagram it has the wanted fields of each section, for a ROS message the
+steps through it up to the last wanted field (`steps`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from router.types.wire import encoding_of
 
 
 class WantedField(NamedTuple):
-    """`struct wanted_field`; NONE where there is no such slot, section or enum."""
+    """`struct wanted_field`; NONE for a missing slot, section or enum."""
 
     number: int
     type: FieldType
@@ -57,8 +57,8 @@ class PlacedSection(NamedTuple):
 class Layout:
     """`struct layout`. The first section is the source message.
 
-    `closed` are the numbers of closed enums, ascending. `names` say what each slot holds, `messages` what each section
-    is: for `explain`.
+    `closed` are the numbers of closed enums, ascending. `names` describe the slots and `messages` the sections, for
+    `explain`.
     """
 
     is_cdr: bool
@@ -70,7 +70,7 @@ class Layout:
 
 
 class Numbering:
-    """Numbers slots. Those of a section stand together."""
+    """Numbers slots. Those of a section are consecutive."""
 
     def __init__(self, slots: Sequence[Slot]) -> None:
         self.defaults: list[int | float | bytes | None] = []
@@ -118,7 +118,7 @@ def _all(section: Section) -> Iterator[Section]:
 
 
 class _ProtobufNumbering(Numbering):
-    """Slots of a oneof's members stand behind the number of the member that is there."""
+    """Numbers slots for a datagram. The members of a oneof follow the slot with the number of the current member."""
 
     def __init__(self, slots: Sequence[Slot]) -> None:
         super().__init__(slots)

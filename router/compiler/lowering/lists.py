@@ -1,7 +1,7 @@
 """Lists: loops over them, computation element by element, and functions of a whole list.
 
-A list on the stack is stored as scalars in a row, as in the message, or in cells. A loop copies its lists to slots of
-its own, and removes the elements from the copies one by one.
+A list on the stack is stored as contiguous scalars, as in the message, or in cells. A loop copies its lists to its own
+slots, and removes the elements from the copies one by one.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ if TYPE_CHECKING:
 
 
 _MOST_STACKED = 32
-"""Elements of a literal that are on the stack at a time."""
+"""Maximum elements of a literal that are on the stack at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A list that `routine` puts on the stack. `scalar` says how it is stored.
+    """A list that `routine` pushes, stored as `scalar` specifies.
 
-    `element` is the kind of its elements. Those that are messages, as times of ROS are, are read into sections like
-    `message`. With `is_unchecked` they are texts that may not be UTF-8.
+    `element` is the kind of its elements. Messages, which include ROS times, are read into sections like `message`.
+    With `is_unchecked`, the elements are texts that may not be UTF-8.
     """
 
     routine: Routine
@@ -87,7 +87,7 @@ def stored(lowering: Lowering, node: tree.Node) -> Stored:
 
 
 def are_messages(node: tree.Node) -> bool:
-    """Whether the elements of a list are messages that have to be read. Times in a field are, computed ones are not."""
+    """Return whether the elements of a list are messages that must be read: times in a field are, computed ones not."""
     match node:
         case tree.Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
@@ -108,7 +108,7 @@ def _read(lowering: Lowering, node: tree.Read) -> Stored:
 
 
 def _payloads(lowering: Lowering, node: tree.Variable) -> Stored:
-    """`items` of `collect`: the only variable with a list, of messages like the source message."""
+    """Lower `items` of `collect`, the only variable that is a list: its messages are like the source message."""
     items, payload = lowering.names.variables[node.name], lowering.names.variables[tree.MESSAGE]
     assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
     assert isinstance(payload, Section)  # noqa: S101
@@ -122,7 +122,7 @@ def _listed(lowering: Lowering, node: tree.Listed) -> Stored:
     items = [routine(lowering.value(item), *_as(item.kind, element)) for item in node.items]
     message: Section | None = None
     if isinstance(element, MessageKind):
-        message = Section(element.type, None, "[].")  # only those of ROS are values
+        message = Section(element.type, None, "[].")  # only ROS messages are values
     if len(items) <= _MOST_STACKED:
         return Stored(routine(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
     made = lowering.names.temporary()
@@ -131,7 +131,7 @@ def _listed(lowering: Lowering, node: tree.Listed) -> Stored:
 
 
 def _begun(made: Slot) -> Routine:
-    """An empty list in a slot."""
+    """Return the operations that put an empty list into a slot."""
     return Operation(Op.LIST, size=0), keep(made), DROP
 
 
@@ -152,7 +152,7 @@ def _computed(lowering: Lowering, node: tree.Each) -> Stored:
 
 
 def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
-    """Choose between two lists, which are made alike: stored in the same way, with elements of the same kind."""
+    """Choose between two lists, after converting both to the same storage and kind of elements."""
     body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
@@ -169,7 +169,7 @@ def _in_cells(values: Stored) -> Stored:
 
 
 def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
-    """Convert the elements of a list to the kind `element`, also where they are stored alike."""
+    """Convert the elements of a list to the kind `element`, even if the storage is the same."""
     kind = values.element
     is_moment = isinstance(element, TimeKind) and values.message is not None
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
@@ -188,9 +188,9 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
 def looped(
     lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Routine], *, keeps: bool = False
 ) -> Routine:
-    """Repeat `body`, which uses the variables of `lists`, for their elements side by side.
+    """Repeat `body`, which uses the variables of `lists`, for each index of these parallel lists.
 
-    On the stack, it changes the value on top at the most.
+    It may change the top of the stack, but nothing below.
     """
     counted, each = gone_through(lowering, lists)
     before, turn = routine_of_each(lowering, each, body)
@@ -198,11 +198,11 @@ def looped(
 
 
 Taken = tuple[str, Stored, Slot]
-"""A variable, its list, and the slot with the elements that are left."""
+"""A variable, its list, and the slot with the remaining elements."""
 
 
 def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[Taken]]:
-    """Copy lists to slots, and put their number of elements on the stack. Lists of different length are refused."""
+    """Copy lists to slots, and push their number of elements. Lists of different length are rejected."""
     made: Routine = ()
     taken: list[Taken] = []
     for variable, values in lists:
@@ -216,7 +216,7 @@ def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> 
 
 
 def routine_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Routine]) -> tuple[Routine, Routine]:
-    """Return what comes in front of a loop, and its body: what is done with the next element of each list."""
+    """Return the operations before a loop, and its body, which handles the next element of each list."""
     before: Routine = ()
     for variable, of, slot in taken:
         one, section = _taken(lowering, of, slot)
@@ -231,7 +231,7 @@ def routine_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[
 
 
 def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section | None]:
-    """Take an element off a list. It is on the stack then, or if it is a message, in a section."""
+    """Remove an element from a list. It is pushed, or read into a section if it is a message."""
     taken = Operation(Op.NEXT, slot, flag=of.scalar)
     if of.message is not None:
         section = lowering.names.element(of.message)
@@ -240,7 +240,7 @@ def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section
 
 
 def _without_a_detour(made: Routine) -> Routine:
-    """Leave an element on the stack, in place of storing, dropping and loading it, if it is used only there."""
+    """Leave an element on the stack instead of storing, dropping and loading it, if it is used only once."""
     for index, operation in enumerate(made[:-2]):
         if operation.kind is Op.KEEP:
             slot = operation.slot
@@ -285,7 +285,7 @@ def checked_list(lowering: Lowering, node: tree.Node) -> Stored:
 
 
 def length(lowering: Lowering, node: tree.Node) -> Routine:
-    """Lower len() of a list. A message of a literal is no value, but it has to be there."""
+    """Lower len() of a list. The messages of a literal are not values, but must exist."""
     if isinstance(node, tree.Listed) and are_messages(node):
         return routine(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
     return routine(checked_list(lowering, node).routine, SIZE)
@@ -322,7 +322,7 @@ def total(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Routine:
-    """Lower min() or max() of a list. It begins with the first element, and is refused if there is none."""
+    """Lower min() or max() of a list. It begins with the first element; an empty list is rejected."""
     of = stored(lowering, node.arguments[0])
     kind = of.element
     assert kind is not None  # noqa: S101 - a number
@@ -335,7 +335,7 @@ def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) 
 
 
 def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Routine, Kind], Routine]) -> Routine:
-    """Combine each element with the value on the stack. A computed list is not stored for that."""
+    """Combine each element with the top of the stack, without storing a computed list."""
     if isinstance(values, tree.Each):
         each = values
     else:

@@ -12,12 +12,12 @@ from router.declared import Scalar
 
 @dataclass(frozen=True, slots=True)
 class LoweredTarget:
-    """The routines of a target: `condition` for its `when`, and `message`, which writes what it gets.
+    """The routines of a target: `condition` for its `when`, and `message`, which writes its message.
 
-    Without a `when` the condition is empty. A destination from UDP gets the envelope as it was received: its `message`
-    is empty. `places` are the places of the table where a message may be refused, by `enum place` in `native/events.h`:
-    the topic whose message cannot be read ("" of datagrams, which are checked before), the condition, `for_each` or
-    `collect`, and what each operation of `message` fills.
+    Without a `when`, the condition is empty. A destination of a route from UDP gets the envelope as received, so its
+    `message` is empty. `places` are the places of the table where a message may be rejected, by `enum place` in
+    `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are already checked), the
+    condition, `for_each` or `collect`, and the field of each operation of `message`.
     """
 
     label: str
@@ -28,10 +28,10 @@ class LoweredTarget:
 
 @dataclass(frozen=True, slots=True)
 class LoweredCollect:
-    """`collect`: routines that name the frame of a datagram, its size, and the place of the datagram in it.
+    """`collect`: routines for the identity of a datagram's frame, its size, and the datagram's position in it.
 
-    All give integers, but `by` a text if `is_text`. `signs` says whether `count` and `order` are unsigned. A complete
-    frame goes to the slots `items` and `counted`, NONE for one that is not used.
+    All return integers, except `by` if `is_text`. `signs` tells whether `count` and `order` are unsigned. A complete
+    frame is put into the slots `items` and `counted`, which are NONE if unused.
     """
 
     by: Routine
@@ -45,7 +45,7 @@ class LoweredCollect:
 
 @dataclass(frozen=True, slots=True)
 class LoweredRoute:
-    """Targets of a route by name, and the fields that they read. Slots 0 and 1 are `received_at` and `source`."""
+    """The targets of a route by name, and the fields that they read. Slots 0 and 1 are `received_at` and `source`."""
 
     targets: Mapping[str, LoweredTarget]
     layout: Layout
@@ -54,9 +54,9 @@ class LoweredRoute:
 
 @dataclass(frozen=True, slots=True)
 class LoweredElements:
-    """`for_each`: `routine` leaves a list on the stack, which is stored as `scalar` says.
+    """`for_each`: `routine` pushes a list, stored as `scalar` specifies.
 
-    Each element is read into `section` if it is a message, else put into the slot `item`; NONE for what is not used.
+    Each element is read into `section` if it is a message, else put into the slot `item`. Unused ones are NONE.
     """
 
     routine: Routine
@@ -69,7 +69,7 @@ class LoweredElements:
 
 @dataclass(frozen=True, slots=True)
 class LoweredFeed:
-    """The routines of a route for the messages of one topic. They are urgent if they expire, feed or disarm a deadman.
+    """A route's routines for the messages of one topic, which are urgent if they expire, or feed or disarm a deadman.
 
     `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
     """
@@ -92,10 +92,10 @@ class LoweredCondition:
 
 @dataclass(frozen=True, slots=True)
 class Lowered:
-    """All that the carrier runs for a table.
+    """All routines of a table.
 
-    By route: `to_destinations` has those of datagrams that have a condition, `to_topics` its topics. `from_ros` by
-    topic, in the order of the table.
+    For datagrams, by route: `to_destinations` has the destinations with a condition, `to_topics` the topics. `from_ros`
+    is by topic, in the order of the table.
     """
 
     to_destinations: Mapping[str, LoweredRoute]

@@ -1,4 +1,4 @@
-"""What the writers of both kinds of messages share: operations with their places, and lists that fill fields."""
+"""Common parts of the writers of both kinds of messages: operations with their places, and lists that fill fields."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from router.types.model import List
 
 
 class Place(NamedTuple):
-    """The field that an operation is for, and where the table says what fills it."""
+    """The field that an operation fills, and the position of its mapping in the table."""
 
     span: SourceSpan
     field: str
@@ -33,7 +33,7 @@ def at(place: Place, *parts: Operation | Routine) -> list[Placed]:
 
 
 def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
-    """Join known bytes with those behind them that need no padding. The place of the first ones stays."""
+    """Join known bytes with following ones that need no padding. The place of the first ones remains."""
     last: Placed | None = None
     for operation, place in placed:
         if last is not None and operation.kind is Op.KNOWN and operation.slot == 1:
@@ -52,7 +52,7 @@ def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
 
 
 def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
-    """Copy the lists to slots, and put their number of elements on the stack, if the field takes so many."""
+    """Copy the lists to slots, and push their number of elements, which is rejected if the field cannot hold it."""
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
@@ -64,7 +64,7 @@ def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
 
 
 def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
-    """Repeat `body` as often as the number on the stack says. `place` is that of the loop itself."""
+    """Repeat `body`; the number of iterations is on the stack. `place` is that of the loop itself."""
     placed: list[Placed] = []
 
     def lowered() -> Routine:

@@ -1,4 +1,4 @@
-"""What names mean in the expressions of a target: messages, and values in slots."""
+"""The meaning of names in the expressions of a target: messages, and values in slots."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Meaning = Union[Slot, Section]
 
 
 class TooLargeError(FindingError):
-    """What the table asks for is more than a routine can do."""
+    """A part of the table exceeds the limits of a routine."""
 
     def __init__(self, span: SourceSpan, message: str, hint: str) -> None:
         super().__init__(span, Code.TOO_LARGE, message, hint)
@@ -24,7 +24,7 @@ class TooLargeError(FindingError):
 class Loop:
     """A loop whose body is being lowered, with the variables of its elements.
 
-    `flags` are cleared in front of the loop. Each of them tells whether a value that no turn changes has been computed.
+    `flags` are cleared before the loop. Each tells whether a loop invariant has been computed.
     """
 
     variables: frozenset[str]
@@ -33,10 +33,9 @@ class Loop:
 
 @dataclass(slots=True)
 class Names:
-    """`variables` by name. Temporaries and elements are numbered with them in one layout.
+    """The `variables` by name. Temporaries and elements are numbered with them in one layout.
 
-    `elements` are the sections that elements of lists are read into, `joined` the bytes of text that are put together
-    outside of loops.
+    `elements` are the sections that elements of lists are read into, `joined` is the number of bytes of joined text.
     """
 
     variables: dict[str, Meaning]
@@ -44,26 +43,26 @@ class Names:
     elements: list[Section] = field(default_factory=list)
     joined: int = 0
     loops: list[Loop] = field(default_factory=list)
-    """Those around what is being lowered, from the outermost one."""
+    """The loops around the current node, outermost first."""
 
     def temporary(self) -> Slot:
         self.temporaries.append(Slot(0))
         return self.temporaries[-1]
 
     def flag(self, loop: Loop) -> Flag:
-        """A flag that is cleared in front of a loop."""
+        """Return a new flag that is cleared before a loop."""
         made = Flag(0)
         self.temporaries.append(made)
         loop.flags.append(made)
         return made
 
     def element(self, like: Section) -> Section:
-        """A new section for an element of a list, of which another one is given."""
+        """Return a new section for an element of a list, like a given one."""
         self.elements.append(replace(like, wanted={}))
         return self.elements[-1]
 
     def count_text(self, most: int, span: SourceSpan) -> None:
-        """Raise TooLargeError if there is no room for so many bytes of text more."""
+        """Count bytes of joined text. Raises TooLargeError if there is no room for them."""
         self.joined += most
         if self.joined > MOST_TEXT:
             message = f"the text joined here can reach {self.joined} bytes; the limit is {MOST_TEXT}"

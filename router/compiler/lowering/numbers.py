@@ -1,4 +1,4 @@
-"""Numbers on the stack: signs, conversions, comparisons. The ranges of their kinds decide."""
+"""Numbers on the stack: signs, conversions and comparisons, which depend on the ranges of their kinds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from router.declared import Compared, Op, Relation, Sign
 
 
 def bounds(kind: Kind) -> tuple[int, int]:
-    """The range of an integer, which may stand for a bool, an enum's value or a time."""
+    """Return the range of an integer, which may represent a bool, an enum's value or a time."""
     if isinstance(kind, BoolKind):
         return 0, 1
     number = as_int(kind) or INT64
@@ -28,26 +28,26 @@ def bounds(kind: Kind) -> tuple[int, int]:
 
 
 def is_unsigned(kind: Kind) -> bool:
-    """Whether the 64 bits of an integer are unsigned: those of a kind that goes beyond int64."""
+    """Return whether the 64 bits of an integer are unsigned: its range exceeds int64."""
     return bounds(kind)[1] > INT64.high
 
 
 def signs(result: Kind, *operands: Kind) -> int:
-    """The flag of an operation with integers."""
+    """Return the flag of an operation with integers."""
     flags = (Sign.FIRST_UNSIGNED, Sign.SECOND_UNSIGNED, Sign.THIRD_UNSIGNED)
     unsigned = sum(int(flag) for flag, kind in zip(flags, operands, strict=False) if is_unsigned(kind))
     return unsigned + int(Sign.RESULT_UNSIGNED) * is_unsigned(result)
 
 
 def to_real(made: Routine, kind: Kind) -> Routine:
-    """Convert a number to a real one."""
+    """Convert a number to a real number."""
     if isinstance(kind, FloatKind):
         return made
     return routine(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 
 def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
-    """Convert a value to a kind that other values have as well."""
+    """Convert a value to a common kind."""
     if isinstance(to, FloatKind):
         return to_real(made, kind)
     if isinstance(to, IntKind) and not isinstance(kind, BoolKind):
@@ -56,7 +56,7 @@ def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
 
 
 def fitted(made: Routine, kind: Kind, to: Kind) -> Routine:
-    """Refuse an integer outside of the range of another kind."""
+    """Reject an integer outside the range of another kind."""
     (low, high), (least, most) = bounds(kind), bounds(to)
     if least <= low and high <= most:
         return made
@@ -70,12 +70,12 @@ _SWAPPED: Mapping[Relation, Relation] = {
     Relation.MORE: Relation.LESS,
     Relation.MORE_OR_EQUAL: Relation.LESS_OR_EQUAL,
 }
-"""Relations of the same two values in the other order, where that is another one."""
+"""Relations that change if the two values are swapped, with the swapped relation."""
 
 
 def compare(relation: tree.Relation, left: Routine, right: Routine, left_kind: Kind, right_kind: Kind) -> Routine:
-    """Whether a relation holds, exactly. The operation wants an integer in front of a real number, and a signed one
-    in front of an unsigned one: so the right operand may be evaluated first.
+    """Lower an exact comparison. The right operand may be evaluated first: the operation requires an integer before a
+    real number, and a signed integer before an unsigned one.
     """
     straight = Relation[relation.name]
     how = _compared(left_kind, right_kind)
@@ -87,7 +87,7 @@ def compare(relation: tree.Relation, left: Routine, right: Routine, left_kind: K
 
 
 def _compared(left: Kind, right: Kind) -> Compared | None:
-    """How two values are compared in this order; None if they are compared in the other one."""
+    """Return how two values are compared in this order; None if they must be swapped."""
     if isinstance(left, (StringKind, BytesKind)):
         return Compared.TEXTS
     if isinstance(left, FloatKind):

@@ -1,4 +1,4 @@
-"""Routines of the operations that `native/operations.h` declares, and what is known before they run."""
+"""Routines of the operations that `native/operations.h` declares, and static analysis of them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False, slots=True)
 class Slot:
-    """A place for a value, numbered by a layout. `default` is what it holds where nothing was read: for a list, None.
+    """A place for a value, numbered by a layout. `default` is its value if nothing was read; None for a list.
 
-    `name` says what it holds in the words of the table; that of a temporary is empty.
+    `name` describes the value in the words of the table; it is empty for a temporary.
     """
 
     default: int | float | bytes | None = None
@@ -25,13 +25,13 @@ class Slot:
 
 
 class Flag(Slot):
-    """Tells whether a value has been computed in a loop: see `once`."""
+    """A slot that tells whether a value has been computed in a loop: see `once`."""
 
     __slots__ = ()
 
 
 class Operation(NamedTuple):
-    """`struct operation`; `slot` may be what has an index, `data` are bytes of the literals."""
+    """`struct operation`; `slot` may be an object with an index, `data` are bytes of the literals."""
 
     kind: Op
     slot: Union[int, Slot, Section] = 0
@@ -45,7 +45,7 @@ Routine = tuple[Operation, ...]
 
 
 def routine(*parts: Operation | Routine) -> Routine:
-    """One of operations and other routines, in order."""
+    """Concatenate operations and routines."""
     made: list[Operation] = []
     for part in parts:
         if isinstance(part, Operation):
@@ -83,12 +83,15 @@ DROP, SIZE = Operation(Op.DROP), Operation(Op.SIZE)
 
 
 def repeat(body: Routine, *, keeps: bool = False) -> Routine:
-    """`body`, as often as the integer on the stack says. `keeps`: lists and text that it makes are used behind it."""
+    """Return a loop over `body`; the number of iterations is on the stack.
+
+    `keeps`: lists and text that it makes are used after the loop.
+    """
     return (Operation(Op.REPEAT, flag=keeps, size=len(body) + 1), *body, Operation(Op.AGAIN))
 
 
 def chained(op: Op, routines: Sequence[Routine]) -> Routine:
-    """Several truths, of which those behind a decision are not evaluated."""
+    """Return a chain of conditions; evaluation stops once the result is known."""
     left, made = sum(map(len, routines)) + len(routines) - 1, list[Operation]()
     for each in routines[:-1]:
         left -= len(each) + 1
@@ -97,16 +100,16 @@ def chained(op: Op, routines: Sequence[Routine]) -> Routine:
 
 
 def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
-    """One of two values; the other one is not evaluated."""
+    """Return one of two values; the other one is not evaluated."""
     return routine(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
 
 
 def once(made: Routine, flag: Flag, kept: Slot) -> Routine:
-    """`made`, in a loop: it is computed when its value is first needed, and then kept. `flag` is 0 before the loop."""
+    """Return `made` for a loop: it is computed on first use and then kept. `flag` is 0 before the loop."""
     return choice((load(flag),), (load(kept),), routine(made, keep(kept), integer(1), keep(flag), DROP))
 
 
-# ---- what is known of a routine
+# ---- static analysis
 
 _GIVE = frozenset({Op.INTEGER, Op.REAL, Op.TEXT, Op.LOAD, Op.NEXT})
 _TAKE_ONE = frozenset({
@@ -123,7 +126,7 @@ _TAKE_THREE_GIVE_ONE = frozenset({Op.CLAMP, Op.FIT, Op.WRAP, Op.REAL_CLAMP})
 
 
 def _effect(operation: Operation) -> int:
-    """By how many values the stack grows."""
+    """Return the number of values by which the stack grows."""
     kind = operation.kind
     if kind is Op.LIST:
         return 1 - operation.size
@@ -131,9 +134,9 @@ def _effect(operation: Operation) -> int:
 
 
 def depths(operations: Sequence[Operation]) -> Iterator[int]:
-    """How many values are stacked behind each operation."""
+    """Yield the depth of the stack after each operation."""
     depth = 0
-    joins: dict[int, int] = {}  # the depth where a jump leads
+    joins: dict[int, int] = {}  # the depth at the target of a jump
     for index, operation in enumerate(operations):
         depth = joins.pop(index, depth)
         kind, target = operation.kind, index + 1 + operation.size
@@ -147,7 +150,7 @@ def depths(operations: Sequence[Operation]) -> Iterator[int]:
 
 
 def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> Iterator[int]:
-    """How many loops, or messages that are written, are open behind each operation."""
+    """Yield the number of open loops, or of messages being written, after each operation."""
     depth = 0
     for operation in operations:
         depth += (operation.kind is opens) - (operation.kind is closes)
@@ -155,21 +158,21 @@ def nesting(operations: Iterable[Operation], opens: Op, closes: Op) -> Iterator[
 
 
 _BYTEWISE = frozenset({Op.JOIN, Op.CHARACTERS, Op.STRIP, Op.UTF8, Op.OCTETS, Op.UNPACK, Op.DIGITS})
-"""Operations that take as long as their text or list, at the most that of a datagram."""
+"""Operations whose time is proportional to a text or list, which is at most as long as a datagram."""
 
 _BYTES_AT_A_TIME = 16
 
 
 def _flag(operation: Operation) -> Flag | None:
-    """The flag that an operation loads: it is the first one of those that `once` makes."""
+    """Return the flag that an operation loads, if it is the first operation of `once`."""
     return operation.slot if operation.kind is Op.LOAD and isinstance(operation.slot, Flag) else None
 
 
 def most_executed(operations: Sequence[Operation]) -> int:
-    """How many operations a datagram can have executed, at the most: a loop has as many elements as that has bytes."""
+    """Return the maximum number of operations for a datagram: a loop has as many elements as a datagram has bytes."""
     total, times = 0, [1]
     flags: dict[int, int] = {}  # how often a flag is cleared
-    ends: list[int] = []  # of what is computed once
+    ends: list[int] = []  # ends of code that is executed once
     previous: Op | None = None
     for index, operation in enumerate(operations):
         while ends and ends[-1] == index:
@@ -179,7 +182,7 @@ def most_executed(operations: Sequence[Operation]) -> int:
         if operation.kind in _BYTEWISE or (operation.kind is Op.ENTER and previous is not Op.NEXT):
             cost += MAX_DATAGRAM // _BYTES_AT_A_TIME
         elif operation.kind is Op.ELEMENT:
-            cost += int(operation.number)  # cells are gone through
+            cost += int(operation.number)  # cells are traversed
         total += cost * times[-1]
         if operation.kind is Op.REPEAT:
             times.append(times[-1] * MAX_DATAGRAM)

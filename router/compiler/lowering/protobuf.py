@@ -1,6 +1,6 @@
 """From the plan of a payload to the operations that write the envelope around it.
 
-The bytes are those of the protobuf library: fields by ascending number, what has no presence only if it is not zero.
+The bytes equal those of the protobuf library: fields by ascending number; fields without presence only if not zero.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class _Writer:
         yield from _packed(to, elements, place) if to.is_packed else elements
 
     def _element(self, made: Plan, to: FieldDescriptor, path: str) -> Iterable[Placed]:
-        """An element of a repeated field: zero is written as well."""
+        """Write an element of a repeated field, even if it is zero."""
         place = Place(made.span, path)
         if isinstance(made, Leaf):
             return self._leaf(made, to, place, is_always=True)
@@ -107,7 +107,7 @@ def _tag(to: FieldDescriptor) -> int:
 
 
 def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
-    """A constant without its tag."""
+    """Encode a constant without its tag."""
     write = encoding_of(to).write
     if write is Op.WRITE_FLOAT:
         return struct.pack("<f", value)
@@ -125,23 +125,23 @@ def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
 
 
 def _is_set(value: bool | float | str | bytes, to: FieldDescriptor) -> bool:
-    """Whether a constant is not zero, which has no presence. Minus zero is not."""
+    """Return whether a constant differs from zero, so that it is written without presence. Minus zero does."""
     is_real = encoding_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
 
 
 def _delimited(tag: int, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
-    """A message, with its tag and its length in front."""
+    """Write a message, preceded by its tag and length."""
     yield from _lengthened(tag, list(merged(inside)), place, is_always=True)
 
 
 def _packed(to: FieldDescriptor, inside: Iterable[Placed], place: Place) -> Iterator[Placed]:
-    """Packed elements, if there are any."""
+    """Write packed elements, if there are any."""
     yield from _lengthened(to.number << 3 | LEN, list(merged(inside)), place, is_always=False)
 
 
 def _lengthened(tag: int, inside: list[Placed], place: Place, *, is_always: bool) -> Iterator[Placed]:
-    """Write tag and length in front. If all bytes behind them are known, these are known as well."""
+    """Prepend tag and length, which are known if all bytes are known."""
     data = b"".join(operation.data for operation, _ in inside)
     if any(operation.kind is not Op.KNOWN for operation, _ in inside):
         yield Operation(Op.OPEN, flag=is_always, size=tag), place

@@ -1,6 +1,6 @@
-"""Sections: which fields of a message routines use, and the slots that hold them.
+"""Sections: the fields of a message that routines use, and their slots.
 
-Expressions ask the section of a message for its fields. What nothing asks for is not read.
+Expressions get fields from the section of a message. Other fields are not read.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from router.types.model import Field as Member
 
 @dataclass(slots=True)
 class Wanted:
-    """A field of which something is wanted: its value or list, whether it is there, or fields of the message in it.
+    """A field that is used: its value or list, its presence, or fields of the message in it.
 
-    The value of a message of ROS is a list of one element, the message.
+    The value of a ROS message is a list with the message as its only element.
     """
 
     member: Member
@@ -33,7 +33,7 @@ class Wanted:
 class Section:
     """A message at one place: the source message, a message in it, or an element of a list.
 
-    `descriptor` is None for a ROS message. `path` is what stands in front of the names of its fields: `motors[].`.
+    `descriptor` is None for a ROS message. `path` is the prefix of its fields' names: `motors[].`.
     """
 
     type: MessageType
@@ -50,12 +50,12 @@ class Section:
         return self.wanted.setdefault(member.name, Wanted(member))
 
     def declared(self, member: Member) -> FieldDescriptor:
-        """The field of a protobuf message."""
+        """Return the descriptor of a field of a protobuf message."""
         assert self.descriptor is not None  # noqa: S101 - said by the caller
         return self.descriptor.fields_by_name[member.name]
 
     def inner(self, member: Member) -> Section:
-        """A new section for the message in a field, or for the elements of a list."""
+        """Return a new section for the message in a field, or for the elements of a list."""
         is_list = isinstance(member.type, List)
         declared = member.type.element if isinstance(member.type, List) else member.type
         assert isinstance(declared, MessageType)  # noqa: S101 - said by the caller
@@ -63,14 +63,14 @@ class Section:
         return Section(declared, descriptor, f"{self.path}{member.name}{'[]' * is_list}.")
 
     def message(self, member: Member) -> Section:
-        """The message in a field that is no list."""
+        """Return the section of the message in a field that is not a list."""
         wanted = self._field(member)
         if wanted.section is None:
             wanted.section = self.inner(member)
         return wanted.section
 
     def value(self, member: Member) -> Slot:
-        """A scalar, text or bytes, or a list."""
+        """Return the slot of a scalar, text, bytes or list."""
         wanted = self._field(member)
         if wanted.value is None:
             wanted.value = Slot(self._default(member), self.path + member.name)
@@ -83,13 +83,13 @@ class Section:
         return wanted.presence
 
     def stored(self, member: Member) -> Scalar:
-        """How a list is stored."""
+        """Return how a list is stored."""
         assert isinstance(member.type, List)  # noqa: S101 - said by the caller
         is_scalar = not isinstance(member.type.element, (MessageType, String))
         return scalar_of(member.type.element) if self.is_cdr and is_scalar else Scalar.IN_CELLS
 
     def is_unchecked(self, member: Member) -> bool:
-        """Whether a text may be something else than UTF-8."""
+        """Return whether a text may not be UTF-8."""
         return self.is_cdr or member.is_unchecked
 
     def depth(self) -> int:
@@ -111,7 +111,7 @@ _INTEGERS = {
 
 
 def scalar_of(declared: Type) -> Scalar:
-    """A primitive type of ROS other than a string."""
+    """Return the scalar of a primitive ROS type other than a string."""
     match declared:
         case Bool():
             return Scalar.BOOL
@@ -120,9 +120,9 @@ def scalar_of(declared: Type) -> Scalar:
         case Float(bits):
             return Scalar.FLOAT32 if bits == 32 else Scalar.FLOAT64
         case _:
-            raise AssertionError(f"{declared} is no scalar of a ROS message")
+            raise AssertionError(f"{declared} is not a scalar of a ROS message")
 
 
 def size_of(declared: Type) -> int:
-    """Bytes of a primitive type of ROS other than a string, which are its alignment as well."""
+    """Return the size in bytes, which is also the alignment, of a primitive ROS type other than a string."""
     return 1 if isinstance(declared, Bool) else declared.bits // 8  # type: ignore[union-attr]  # an Int or a Float

@@ -1,4 +1,4 @@
-"""The routines that read one message: its slots and sections, which they share, and how large they may be."""
+"""The routines that read one message, their common slots and sections, and their limits."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
-"""Operations that a destination's `when` may execute for a datagram, about a millisecond of the receive thread."""
+"""Maximum operations of a destination's `when` per datagram, about a millisecond of the receive thread."""
 
 _MOST_SLOTS = NONE
 
 
 @dataclass
 class _Source:
-    """A message that routines read into `root`. `topic` is where it comes from, empty if it is from UDP."""
+    """A message that routines read into `root`. `topic` is its source, empty for UDP."""
 
     root: Section
     topic: str = ""
@@ -57,18 +57,18 @@ class _Source:
         self.add(received_at, source)
 
     def add(self, *slots: Slot) -> None:
-        """Let expressions read these slots by their names."""
+        """Make these slots available to expressions by name."""
         self.temporaries += slots
         self.variables |= {slot.name: slot for slot in slots}
 
     def lowering(self) -> Lowering:
-        """Return the lowering of one target, which can have variables of its own."""
+        """Return the lowering of one target, which can have its own variables."""
         return Lowering(Names(dict(self.variables), self.temporaries, self.elements))
 
     def condition(
         self, lowering: Lowering, conditions: Sequence[tree.Node | None], *, is_bounded: bool = False
     ) -> tuple[Routine, str]:
-        """Lower the conjunction of conditions, with its place. One that the receive thread evaluates `is_bounded`."""
+        """Lower the conjunction of conditions, with its place. `is_bounded`: the receive thread evaluates it."""
         given = [each for each in conditions if each is not None]
         if not given:
             return (), ""
@@ -83,7 +83,7 @@ class _Source:
 
 
 class Datagram(_Source):
-    """A payload, from UDP."""
+    """A payload from UDP."""
 
     def __init__(self, case: PayloadCase) -> None:
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
@@ -106,7 +106,7 @@ class Datagram(_Source):
         return LoweredRoute(made, layout, lowered)
 
     def _target(self, target: CheckedTarget, place: str) -> LoweredTarget:
-        """A topic, or a destination, which gets the datagram as it was received."""
+        """Lower a topic, or a destination, which gets the datagram as received."""
         lowering = self.lowering()
         condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
         message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
@@ -122,7 +122,7 @@ class Datagram(_Source):
         return _with_places(cdr_message(lowering, plan))
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Return the layout of all routines that have been made. Raises TooLargeError."""
+        """Return the layout of all routines made so far. Raises TooLargeError."""
         for section in (self.root, *self.elements):
             if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
                 message = f"this reads a field {depth} messages deep; the limit is {MOST_SECTIONS_DEEP - 1}"
@@ -131,13 +131,13 @@ class Datagram(_Source):
 
 
 class RosMessage(_Source):
-    """A message from a topic of ROS."""
+    """A message from a ROS topic."""
 
     def __init__(self, declared: MessageType, topic: str) -> None:
         super().__init__(Section(declared, None), topic)
 
     def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
-        """Lower what a route makes of the messages. Raises TooLargeError."""
+        """Lower the routines of a route for the messages. Raises TooLargeError."""
         elements = self._for_each(feed.for_each) if feed.for_each is not None else None
         stamp = self._stamp(feed.stamp) if feed.stamp is not None else None
         place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""
@@ -171,7 +171,7 @@ class RosMessage(_Source):
         return moment.value(seconds), moment.value(nanoseconds)
 
     def _for_each(self, node: tree.Node) -> lists.Stored:
-        """Lower the list of `for_each`. Expressions can use `item`, `index` and `count` from now on."""
+        """Lower the list of `for_each`, and make `item`, `index` and `count` available to expressions."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
         _want_small([(operation, node.span) for operation in of.routine])
@@ -190,17 +190,17 @@ class RosMessage(_Source):
         return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
 
     def layout(self, span: SourceSpan) -> Layout:
-        """Return the layout of all routines that have been made. Raises TooLargeError."""
+        """Return the layout of all routines made so far. Raises TooLargeError."""
         return _small(cdr_layout(self.temporaries, self.root, self.elements, span), span)
 
 
 def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
-    """Whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
+    """Return whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
     return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
 def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Iterator[int]:
-    """The numbers of variables in slots that operations of the targets use, NONE for all others."""
+    """Yield the slot of each variable that operations of the targets use, NONE for all others."""
     slots = [operation.slot for each in targets for operation in (*each.condition, *each.message)]
     for variable in variables:
         is_used = isinstance(variable, Slot) and any(variable is slot for slot in slots)
@@ -217,7 +217,7 @@ def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
 
 
 def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
-    """Raise TooLargeError for what nests deeper than a routine can."""
+    """Raise TooLargeError if a routine is nested too deeply."""
     operations = [operation for operation, _ in placed]
     kinds = [operation.kind for operation in operations]
     if len(kinds) < MOST_STACKED and kinds.count(Op.REPEAT) <= MOST_LOOPS and kinds.count(Op.OPEN) <= MOST_OPEN:
@@ -235,7 +235,7 @@ def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
 
 
 def _small(layout: Layout, span: SourceSpan) -> Layout:
-    """The layout. Raises TooLargeError if its slots or sections cannot be numbered."""
+    """Return the layout. Raises TooLargeError if it has too many slots or sections."""
     most = max(len(layout.defaults), len(layout.sections))
     if most > _MOST_SLOTS:
         message = f"these mappings use {most} values; the limit is {_MOST_SLOTS}"

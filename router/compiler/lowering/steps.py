@@ -1,4 +1,4 @@
-"""Steps: how a message in CDR is gone through up to the last wanted field, and the layout of that."""
+"""Steps through a CDR message up to the last wanted field, and their layout."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def cdr_layout(slots: Sequence[Slot], message: Section, elements: Sequence[Secti
 
 
 _MOST_UNROLLED = 64
-"""Elements of an array of messages that are skipped without a loop."""
+"""Maximum length of an array of messages that is skipped without a loop."""
 
 
 class _Steps:
-    """Collects the steps through a message. What is skipped becomes one stretch of bytes where its padding is known."""
+    """Collects the steps through a message. Consecutive skips with known padding are merged."""
 
     def __init__(self, layout: Numbering, span: SourceSpan, offset: Offset, loops: int = 0) -> None:
         self.layout = layout
@@ -42,7 +42,7 @@ class _Steps:
         self.made: list[ReadOperation] = []
         self.offset = offset
         self.loops = loops
-        self._skipped: tuple[int, int] | None = None  # an alignment, and so many bytes
+        self._skipped: tuple[int, int] | None = None  # an alignment, and a number of bytes
         self._wanted = 0  # steps up to the last wanted one
 
     def up_to_the_last_wanted(self) -> tuple[ReadOperation, ...]:
@@ -76,7 +76,7 @@ class _Steps:
                 self._scalars(size_of(declared), 1)
 
     def _inner(self, declared: MessageType, section: Section | None, slot: Slot | None) -> None:
-        """A message in the message. If the whole of it is wanted, it is the only element of a list."""
+        """Add steps for a nested message. If all of it is wanted, it is the only element of a list."""
         if slot is None:
             self.message(declared, section)
             return
@@ -91,7 +91,7 @@ class _Steps:
         if length is None:
             self._flush()
             self._add(ReadOperation(ReadKind.SEQUENCE, size, scalar_of(element)), slot)
-            self.offset.lose(min(size, 4))  # none may be there, behind their number
+            self.offset.lose(min(size, 4))  # there may be none after the length
         elif slot is None:
             self._scalars(size, length)
         else:
@@ -133,7 +133,7 @@ class _Steps:
             self._wanted = len(self.made)
 
     def _scalars(self, size: int, count: int) -> None:
-        """Skip scalars: with what is skipped in front of them, if it is known how far they are from there."""
+        """Skip scalars, merged with the bytes skipped before them if the padding is known."""
         if not count:
             return
         padding = self.offset.padding(size)
