@@ -228,7 +228,7 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     namesakes = sorted(full for full in known if full.rpartition("/")[2] == short)
     siblings = [full for full in known if full.partition("/")[0] == package]
     source = Path("schemas", package, "msg", f"{short}.msg")
-    if inputs.is_file(source):  # in an installation, what is built and sourced counts
+    if inputs.is_file(source):  # an installation only uses built and sourced packages
         return f"it is in {source.parent}, but not built: build and source {package}"
     if siblings or len(parts) == 1:
         general = "neither schemas/ nor an installed package defines it; write types like sensor_msgs/msg/Imu"

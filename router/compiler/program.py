@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from router.compiler.lowering import Lowered
 
 STRANGER = None
-"""The source of a datagram whose sender is no endpoint of the table."""
+"""The source of a datagram whose sender is not an endpoint of the table."""
 
 
 def source_label(source: str | None) -> str:

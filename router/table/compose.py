@@ -21,7 +21,7 @@ from router.table.source import Source, fill, foreign_blank, has_variables, unus
 MAX_DEPTH = 32
 MAX_NODES = 20_000
 
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's where this PyYAML was built with it
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's if this PyYAML was built with it
 
 
 @dataclass(slots=True)

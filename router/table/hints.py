@@ -1,4 +1,4 @@
-"""Hints for keys and values that do not fit the schema: common mistakes, and what is meant by them."""
+"""Hints for keys and values that do not fit the schema: common mistakes and their meaning."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ _NOT_CLOSED = {
     "did not find expected ',' or '}'": ("{", "}"),
 }
 _BETWEEN_KEYS = (_NO_KEY, _NO_DASH, _NO_DOCUMENT)
-_ITEM_AMONG_KEYS = "a list item stands among the keys of a mapping"
+_ITEM_AMONG_KEYS = "this list item is among the keys of a mapping"
 _QUOTE_COLONS = "quote text that contains ': '"
 _ADVICE = {
     **{

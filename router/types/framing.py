@@ -36,7 +36,7 @@ def restored(data: bytes, limit: int = MAX_DATAGRAM) -> bytes:
             elif wire_type != VARINT:
                 return data
             elif position == size:
-                position += 1  # the value was zero
+                position += 1  # the removed value was zero
             else:
                 _, position = read_varint(data, position)
     except IndexError:

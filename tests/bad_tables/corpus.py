@@ -1,13 +1,12 @@
-"""The corpus of bad tables: `CODE.md` has tables with one kind of finding, and what `router validate` says of each.
+"""The corpus of bad tables: `CODE.md` has tables with one kind of finding, with the output of `router validate`.
 
-A page begins with what to write in place of its first table: a table that has no findings, an envelope.proto, or the
+A page begins with a correct version of its first table: a table without findings, an envelope.proto, or the
 envelope.options of `protos/options`. Each section is named after its table, `bad_tables/NAME.yaml`, and has two
 blocks: the table, with its encoding if that is not UTF-8, and the exact text. Most tables extend `base/base.yaml`,
-which has nothing wrong in it.
-docs/reference/findings.md has the first section and what to write in its place.
+which is valid. docs/reference/findings.md shows the first section and its correct version.
 
-To write the texts of new or changed sections: `python -m tests.bad_tables.corpus`; then read them as if you had made
-the mistake.
+`python -m tests.bad_tables.corpus` writes the texts of new or changed sections. Read them as if you had made the
+mistake.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _GOOD = re.compile(r"^```(?P<kind>yaml|proto|options) good\n(?P<text>.*?)^```\n"
 
 @dataclass(frozen=True)
 class BadTable:
-    """A section of the corpus: a table with its file name, and the text that is expected of it."""
+    """A section of the corpus: a table with its file name and expected text."""
 
     code: str
     name: str
@@ -54,13 +53,13 @@ def sections(page: Path) -> Iterator[BadTable]:
 
 
 def good(page: Path) -> tuple[str, str]:
-    """What to write in place of a page's first table: `yaml`, `proto` or `options`, and the text."""
+    """Return the correct version of a page's first table: `yaml`, `proto` or `options`, and the text."""
     [(kind, text)] = _GOOD.findall(page.read_text(encoding="utf-8"))
     return kind, text
 
 
 def unpack(folder: Path, tables: list[BadTable]) -> None:
-    """Write the tables, and what they extend, to `folder/bad_tables`."""
+    """Write the tables, and the files that they extend, to `folder/bad_tables`."""
     target = folder / "bad_tables"
     target.mkdir()
     for shared in ("base", "protos"):

@@ -1,4 +1,4 @@
-"""Each table of the corpus gets exactly the findings that stand beside it."""
+"""Each table of the corpus gets exactly the findings beside it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|\b[abcx]\b|\.\.\.|\$\{|^\W+$")
 
 
 def _offers(table: BadTable, findings: Sequence[Diagnostic]) -> Iterator[tuple[Diagnostic, str, str]]:
-    """The findings of a table whose hint has what to write, with that text and, if that is said, what it replaces."""
+    """Yield the findings of a table whose hint has a text to write, with that text and the text that it replaces."""
     for finding in findings:
         found = _OFFERED.search(finding.hint)
         if found is None or finding.span.file != f"bad_tables/{table.name}.yaml":
@@ -62,7 +62,7 @@ def _offers(table: BadTable, findings: Sequence[Diagnostic]) -> Iterator[tuple[D
 
 
 def _applied(line: str, span: SourceSpan, text: str, instead: str) -> Iterator[str]:
-    """The line with the text in place of what is marked; or of a like text, the rest of the line, or all of it."""
+    """Yield the line with the text in place of the marked part, of similar text, of the rest of the line, or of all."""
     start, end = span.column - 1, span.end_column - 1
     before, marked, behind = line[:start], line[start:end], line[end:]
     alike = re.compile(r"[\s,:=]*".join(map(re.escape, re.findall(r"\w+|[^\w\s,:=]", text))))
@@ -77,7 +77,7 @@ def _applied(line: str, span: SourceSpan, text: str, instead: str) -> Iterator[s
 
 
 def _remains(finding: Diagnostic, table: Path) -> bool:
-    """Whether a finding of a table, or another one at the same place, is there."""
+    """Return whether a finding of a table, or another one at the same position, remains."""
     span = finding.span
     after = check_table(table).diagnostics
     same = [each for each in after if (each.code, each.message) == (finding.code, finding.message)]
