@@ -117,7 +117,7 @@ def _sources(lookup: Lookup, route: Route) -> None:
             lookup.report(source.span, Code.BAD_VALUE, message, hint)
     if route.sources and route.source_topics:
         message = "a route takes messages from endpoints or from topics, not from both"
-        lookup.report(route.source_topics[0].span, Code.BAD_VALUE, message, "make it a list of two routes")
+        lookup.report(route.source_topics[0].span, Code.BAD_VALUE, message, "write a list of two routes")
 
 
 def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:

@@ -78,7 +78,7 @@ class OnLimit(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
-    """`protos` is an absolute path, by default the router's own protos; `message` and `oneof` name the envelope.
+    """The envelope: `message` and `oneof` in `protos`, an absolute path, by default that of the router's own protos.
 
     `lock` is the absolute path of the lock file, None if it is beside the protos. `exclude` are files and folders
     relative to `protos`.
@@ -93,7 +93,7 @@ class EnvelopeSettings:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """`diagnostics` is the span of the key that enables /diagnostics, or None; `span` is the key `node`."""
+    """The ROS node; `span` is the key `node`. `diagnostics` is the span of the key for /diagnostics, None if off."""
 
     name: str = "rover_router"
     namespace: str = "/"
@@ -103,7 +103,7 @@ class NodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """`span` is the listener's name in the table. `receive_buffer` is in bytes.
+    """A listener; `span` is its name in the table. `receive_buffer` is in bytes.
 
     With an `interface`, only datagrams that arrive on that network interface are received.
     """
@@ -126,7 +126,7 @@ EPHEMERAL = "ephemeral"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
+    """An endpoint; `span` is its name in the table. `bandwidth` is in bytes per second, None for no limit.
 
     An endpoint that is silent for longer than `stale_after` (ns) is stale; None means never. With a `listener`, only
     datagrams that this listener receives are attributed to it. `send_from` is a listener's name, EPHEMERAL, or None if

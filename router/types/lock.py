@@ -134,7 +134,7 @@ class LockComparison:
             more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
             self._add(span, f"the lock still has {names[old]} as {old}{more}", "the wire format is the same; ")
         if lock.max_size != envelope.max_size and not self.conflicts:
-            but = ", fields without a bound not counted" if self._schema.unbounded(envelope.name) else ""
+            but = ", not counting fields without a bound" if self._schema.unbounded(envelope.name) else ""
             message = f"{envelope.name} takes up to {envelope.max_size} bytes{but}; the lock says {lock.max_size}"
             self._add(span, message, "flash the boards, then ")
 

@@ -241,7 +241,7 @@ def _parse_list(type_: List, text: str) -> tuple[object, ...]:
         items.append(item.strip() if isinstance(item, str) else item)  # even inside quotes, like rosidl_adapter
         at = element.end()
     if type_.length is not None and len(items) != type_.length:
-        raise ValueError(f"the array has {type_.length} elements, its default {len(items)}")
+        raise ValueError(f"the array has {type_.length} elements, but its default has {len(items)}")
     if type_.bound is not None and len(items) > type_.bound:
-        raise ValueError(f"the list has at most {type_.bound} elements, its default {len(items)}")
+        raise ValueError(f"the list has at most {type_.bound} elements, but its default has {len(items)}")
     return tuple(items)

@@ -24,7 +24,7 @@ def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> li
     types = all_types(envelope)
     found = [*_of_envelope(envelope, cases), *(each for descriptor in types for each in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
-        what = f"{envelope.full_name} leads to {len(types)} message types; the limit is {MOST_TYPES}"
+        what = f"{envelope.full_name} contains {len(types)} message types; the limit is {MOST_TYPES}"
         found.append((envelope.full_name, what, ""))
     return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in found]
 

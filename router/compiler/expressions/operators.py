@@ -153,7 +153,10 @@ def binary(op: Operator, left: Node, right: Node, span: SourceSpan) -> Node:
         return folded(Binary(StringKind(), span, op, left, right))
     if isinstance(left.kind, TimeKind) or isinstance(right.kind, TimeKind):
         raise ExpressionError(
-            span, Code.TYPE_MISMATCH, "arithmetic does not take times", "convert with seconds(x), and back"
+            span,
+            Code.TYPE_MISMATCH,
+            "arithmetic does not take times",
+            "convert with seconds(x) and time_from_seconds(x)",
         )
     _want_number(left)
     _want_number(right)
