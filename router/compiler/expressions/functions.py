@@ -329,7 +329,7 @@ _DECLARED = (
     Function("round", (_number(),), _rounded(round), round_half_even,
              "The nearest integer; of two, the even one. NaN, infinities and results beyond 64 bits drop the message.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
-    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The next integer towards zero.",
+    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The integer part: rounds towards zero.",
              (("trunc(-2.7)", -2),)),
     Function("floor", (_number(),), _rounded(math.floor), floor, "The largest integer <= x.", (("floor(-2.5)", -3),)),
     Function("ceil", (_number(),), _rounded(math.ceil), ceil, "The smallest integer >= x.", (("ceil(2.1)", 3),)),
@@ -374,7 +374,7 @@ _DECLARED = (
              "Seconds since 1970 as a time, in 64-bit nanoseconds.",
              (("time_from_seconds(2)", 2_000_000_000),)),
     Function("time_from_milliseconds", (_number(),), _always(TimeKind()), time_from_milliseconds,
-             "Milliseconds since 1970 as a time, likewise.",
+             "Milliseconds since 1970 as a time, in 64-bit nanoseconds.",
              (("time_from_milliseconds(1500)", 1_500_000_000),)),
 )  # fmt: skip
 
