@@ -1,4 +1,4 @@
-"""A rover: the real router on `tests/rover/routes/rover.yaml`, one for each module that asks."""
+"""A rover: the real router with `tests/rover/routes/rover.yaml`, one per test module."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.acceptance.site import RouterProcess, Site, site, total, wait_until
 
 @dataclass(frozen=True)
 class Rover:
-    """A site and the router that runs in it."""
+    """A site and its running router."""
 
     site: Site
     router: RouterProcess
@@ -32,7 +32,7 @@ def rover_on_two_networks(tmp_path: Path) -> Iterator[two_networks.Rover]:
 
 @pytest.fixture(scope="module")
 def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rover]:
-    """Nobody subscribes to its topics unless a test does."""
+    """A rover whose topics have no subscriptions except those of tests."""
     folder = tmp_path_factory.mktemp("rover")
     with site(folder) as place:
         table = place.table()
@@ -42,14 +42,14 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rover]:
 
 @pytest.fixture(scope="module")
 def peer(rover: Rover) -> Iterator[RosPeer]:
-    """Subscribes to all topics of the rover. What has not been sent yet will reach it."""
+    """A peer that subscribes to all topics of the rover. It receives everything that is published from now on."""
     with RosPeer(TOPICS) as subscribed:
         yield subscribed
 
 
 @pytest.fixture(scope="module")
 def watched(rover: Rover, peer: RosPeer) -> Rover:
-    """The router has learned of the peer's subscriptions, and what it took to find out has been received."""
+    """The rover, once it has discovered the peer's subscriptions. The probe messages have been received."""
     at_start, sent = rover.site.scrape(), 0
 
     def all_published() -> bool:

@@ -1,4 +1,4 @@
-"""What has to arrive for a payload or a ROS message: computed here from units and directions, not by the router."""
+"""The expected messages for a payload or a ROS message, computed from units and directions without the router."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Values = dict[str, Any]
 
 
 def expected_messages(case: str, payload: Any) -> dict[str, Values]:
-    """By topic. Messages with a stamp have it at `None`, because it is the time of arrival."""
+    """The expected messages by topic. A stamp is `None`, because it is the time of arrival."""
     standard = _STANDARD.get(case, lambda _: {})
     return {FLOWS[case].topic: in_board_units(payload), **standard(payload)}
 
@@ -44,7 +44,7 @@ def _in_board_units(field: FieldDescriptor, value: Any) -> Any:
 
 
 def from_board_units(case: str, values: Values) -> Sample:
-    """The inverse: what has to be sent for a `comms` message. It has no way to leave a nested message out."""
+    """The inverse: the payload expected for a `comms` message. A ROS message cannot leave a nested message out."""
     payload = WIRE.envelope.cases[case].message_class()
     _fill(payload, values)
     return sample(case, payload)
@@ -65,7 +65,7 @@ def _fill(message: Any, values: Values) -> None:
 
 
 def same_datagram(one: bytes, other: bytes) -> bool:
-    """Byte for byte, but that a NaN is a NaN."""
+    """Whether two datagrams have the same bytes, except that all NaNs are equal."""
     return one == other or _decoded(one) == _decoded(other)
 
 
@@ -75,7 +75,7 @@ def _decoded(datagram: bytes) -> tuple[str, Any]:
 
 
 def spelled(value: Any) -> Any:
-    """Comparable to the last bit: -0.0 is not 0.0, and NaN is itself. An integer is no float."""
+    """A form that compares exactly: -0.0 differs from 0.0, NaN equals NaN, and an integer differs from a float."""
     if isinstance(value, dict):
         return {name: spelled(member) for name, member in value.items()}
     if isinstance(value, list):

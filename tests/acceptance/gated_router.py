@@ -1,6 +1,6 @@
 """`python -m router`, which stops before it imports the verbs for as long as the file $GATE exists.
 
-A head start is over by then, and its threads run. The file $GATE.reached says that it has stopped there.
+By then the head start is done and its threads run. The file $GATE.reached appears when the process waits.
 """
 
 from __future__ import annotations

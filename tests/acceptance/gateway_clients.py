@@ -1,4 +1,4 @@
-"""Clients of gateways, and a router with gateways beside ROS software that publishes."""
+"""Clients of gateways, and a router with gateways and a ROS process that publishes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HEAD = ROVER + "gateways:\n"
 
 
 def packet(data: bytes) -> tuple[float, int, str, str, bytes]:
-    """As the existing clients take it apart."""
+    """Parse a packet as the existing clients do."""
     stamp, kind = struct.unpack_from("<dB", data)
     topic, type_name, payload = data[9:].split(b"\0", 2)
     return stamp, kind, topic.decode(), type_name.decode(), payload
@@ -41,7 +41,7 @@ def twist(x: float) -> dict[str, Any]:
 
 
 class Headset:
-    """The existing VR client, in what it expects: it drops data before the schema of its type."""
+    """A client with the expectations of the existing VR client: it drops data that arrives before its type's schema."""
 
     def __init__(self, opened: socket.socket) -> None:
         self._opened = opened
@@ -65,7 +65,7 @@ class Headset:
         return topic, value
 
     def wait_for(self, topic: str, meanwhile: Callable[[], None] = lambda: None, value: Any = None) -> Any:
-        """The next value of a topic, or this one. What is done `meanwhile` is done again and again."""
+        """Wait for the next value of a topic, or for this value, and call `meanwhile` repeatedly."""
         deadline = time.monotonic() + PATIENCE
         self._opened.settimeout(0.1)
         while time.monotonic() < deadline:
@@ -77,7 +77,7 @@ class Headset:
         raise AssertionError("it never came")
 
     def wait_for_silence(self, topic: str, seconds: float) -> None:
-        """Until nothing of `topic` has come for so long."""
+        """Wait until no value of `topic` has arrived for this time."""
         deadline = time.monotonic() + PATIENCE
         quiet_since = time.monotonic()
         self._opened.settimeout(seconds)
@@ -109,7 +109,7 @@ class Dashboard:
             yield from map(json.loads, text.split("\n"))
 
     def next(self, op: str, **others: object) -> dict[str, Any]:
-        """The next document of that kind, with these members."""
+        """Wait for the next document of this kind with these members."""
         wanted = {"op": op, **others}.items()
         return next(document for document in self._documents if all(document.get(k) == v for k, v in wanted))
 
@@ -118,14 +118,14 @@ class Dashboard:
 
 
 def lines(opened: socket.socket) -> Generator[dict[str, Any], None, None]:
-    """What a gateway with the format `json_lines` sends."""
+    """The lines that a gateway with the format `json_lines` sends."""
     with opened.makefile("r", encoding="utf-8") as text:
         yield from map(json.loads, text)
 
 
 @contextmanager
 def repeating(action: Callable[[], object]) -> Iterator[None]:
-    """What is published before both sides of a topic know of each other is lost."""
+    """Publish repeatedly, because messages are lost until both sides of a topic have discovered each other."""
     done = threading.Event()
 
     def repeat() -> None:
@@ -143,7 +143,7 @@ def repeating(action: Callable[[], object]) -> Iterator[None]:
 
 @dataclass
 class Scene:
-    """A router with gateways, and ROS software in another process. `ports` are those of the table's words."""
+    """A router with gateways, and a ROS process. `ports` are the ports in the table, by placeholder."""
 
     site: Site
     router: RouterProcess
@@ -161,7 +161,7 @@ class Scene:
         wait_until(lambda: self.site.samples()[series] == number, f"{number} clients")
 
     def keep(self, topic: str, type_name: str, **fields: Any) -> None:
-        """A topic with one message, which who subscribes later gets as well."""
+        """A topic with one message, which late subscribers also receive."""
         self.peer.open(topic, type_name, keeps=True)
         self.peer.say(topic, fields)
 
@@ -173,7 +173,7 @@ class Scene:
 def scene(
     folder: Path, gateways: str, tcp: str = "PORT", udp: str = "RECEIVE", heard: Mapping[str, str] | None = None
 ) -> Iterator[Scene]:
-    """The words `tcp` and `udp` in `gateways` become free ports; the ROS software listens to the topics `heard`."""
+    """Replace the words `tcp` and `udp` in `gateways` by free ports. The ROS process subscribes to `heard`."""
     ports = {word: free_port("127.0.0.5", kind=socket.SOCK_STREAM) for word in tcp.split()}
     ports |= {word: free_port("127.0.0.5") for word in udp.split()}
     for word, port in ports.items():

@@ -1,4 +1,4 @@
-"""Envelopes to send: the golden ones, and generated ones of every payload case with ordinary and extreme values."""
+"""Envelopes to send: golden ones, and generated ones for every payload case with ordinary and extreme values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Sample(NamedTuple):
 
     @property
     def variants(self) -> dict[bytes, bool]:
-        """As sent, zero-trimmed, and padded to a fixed size: whether the router has to repair it, by datagram."""
+        """The datagram as sent, zero-trimmed, and padded; each with whether the router has to repair it."""
         trimmed, padded = self.datagram.rstrip(b"\0"), self.datagram.ljust(FRAME, b"\0")
         return {self.datagram: False} | {form: form != self.datagram for form in (trimmed, padded)}
 
@@ -59,7 +59,7 @@ def golden(datagram: bytes) -> Sample:
 
 
 def generated(case: str) -> Iterator[Sample]:
-    """Of one payload case: ordinary values, sparse ones, and those at the ends of each field's range."""
+    """Samples of one payload case: ordinary values, few fields, and the limits of each field's range."""
     values = [partial(_ordinary, random.Random(f"{case} {seed}")) for seed in range(3)]
     values += [partial(_sparse, random.Random(f"{case} sparse {seed}")) for seed in range(2)]
     values += [partial(_limit, turn) for turn in range(max(map(len, _LIMITS.values())))]
@@ -70,9 +70,9 @@ def generated(case: str) -> Iterator[Sample]:
 
 
 def for_boards(case: str) -> Iterator[Sample]:
-    """What boards can take of one payload case: as `generated`, but enums have declared values; all zero, in two forms.
+    """Samples that boards accept: as `generated`, but with declared enum values; and all zeros, in two forms.
 
-    Encoders leave out zeros; decoders have to take them as well.
+    Encoders leave zeros out, but decoders must also accept explicit zeros.
     """
     payload_class = WIRE.envelope.cases[case].message_class
     yield sample(case, payload_class())
@@ -96,7 +96,7 @@ def _zeros(message: Any) -> bytes:
 
 
 def _declare(message: Any) -> None:
-    """Replace numbers that an enum does not declare by its largest."""
+    """Replace undeclared enum numbers by the largest declared one."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             _declare(value)
@@ -105,7 +105,7 @@ def _declare(message: Any) -> None:
 
 
 def arbitrary(case: str, seed: int = 0) -> Iterator[Sample]:
-    """Of one payload case, without end: any value that a field can have, NaN, infinities and absence included."""
+    """Endless samples of one payload case: any value of each field, including NaN, infinities and absence."""
     value = partial(_any, random.Random(f"{case} arbitrary {seed}"))
     while True:
         payload = WIRE.envelope.cases[case].message_class()
@@ -114,7 +114,7 @@ def arbitrary(case: str, seed: int = 0) -> Iterator[Sample]:
 
 
 Value = Callable[[FieldDescriptor], Any]
-"""What a field gets: a scalar, True for a message that is to be filled, or None to leave it out."""
+"""The value for a field: a scalar, True for a message that will be filled, or None to leave the field out."""
 
 
 def _fill(message: Any, value: Value) -> None:

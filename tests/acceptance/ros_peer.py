@@ -1,7 +1,7 @@
-"""ROS software in a process of its own: `RosPeer` starts it, and this file run as a script is it.
+"""A ROS node in a separate process: `RosPeer` starts this file as a script.
 
 Commands come on standard input and lines go to standard output, each a JSON object: {"matched": topic} when a topic has
-a publisher, {"topic": ..., "message": {...}} for a message, {"result": ...} for a command. It ends with its input.
+a publisher, {"topic": ..., "message": {...}} for a message, {"result": ...} for a command. It exits when stdin ends.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # sys.path of a script lacks the repository's root
 
 from tests.compiler.ros_objects import message_class, to_object, to_value
 from tests.ros_child import ForkedProcess, own_stdout, spin_until_stdin_ends
 
 PATIENCE = 60
-"""Seconds that something may take on a busy machine."""
+"""Timeout in seconds, for a busy computer."""
 
 Arrival = tuple[str, dict[str, Any]]
 """A topic, and the message as nested dictionaries and lists."""
@@ -76,11 +76,11 @@ class RosPeer:
                     self._arrivals.put((line["topic"], line["message"]))
 
     def receive(self) -> Arrival:
-        """The next message, whatever its topic; waits for it."""
+        """Wait for the next message of any topic."""
         return self._arrivals.get(timeout=PATIENCE)
 
     def receive_on(self, topic: str) -> dict[str, Any]:
-        """The next message of a topic. Those of others that came before it are dropped."""
+        """Wait for the next message of a topic, and drop earlier messages of other topics."""
         deadline = monotonic() + PATIENCE
         while (arrival := self.receive())[0] != topic:
             assert monotonic() < deadline, f"nothing on {topic}"
@@ -102,7 +102,7 @@ class RosPeer:
         self._ask("open", name or topic, topic=topic, type=type_name, reliable=reliable, keeps=keeps, depth=depth)
 
     def open_heard(self, topics: Mapping[str, str]) -> None:
-        """Opens reliable publishers, and waits until each has a subscriber."""
+        """Open reliable publishers, and wait until each has a subscriber."""
         for topic, type_name in topics.items():
             self.open(topic, type_name)
         deadline = monotonic() + PATIENCE
@@ -111,14 +111,14 @@ class RosPeer:
             sleep(0.01)
 
     def say(self, name: str, *messages: Mapping[str, Any], times: int = 1) -> None:
-        """Publishes messages in this order, `times` times. A field that is left out has its default."""
+        """Publish messages in this order, `times` times. Omitted fields have their defaults."""
         self._ask("say", name, messages=messages * times)
 
     def close(self, name: str) -> None:
         self._ask("close", name)
 
     def heard_by(self, name: str) -> int:
-        """How many subscriptions it has."""
+        """The number of subscriptions of a topic."""
         return int(self._ask("heard_by", name))
 
     def _ask(self, command: str, name: str, **details: object) -> Any:
@@ -135,7 +135,7 @@ def _alone(arguments: tuple[str, str], environment: Mapping[str, str]) -> Forked
         text=True,
         env={**os.environ, **environment},
     )
-    return cast("ForkedProcess", process)  # as far as it is used
+    return cast("ForkedProcess", process)  # for the methods used here
 
 
 def main() -> None:
@@ -166,7 +166,7 @@ def main() -> None:
         tell(result=result)
 
     for topic, type_name in json.loads(sys.argv[1]).items():
-        # Those topics of the rover that are of sensor_msgs or TwistStamped are offered best effort.
+        # The rover publishes sensor_msgs and TwistStamped best effort.
         reliable = not type_name.startswith("sensor_msgs/") and type_name != "geometry_msgs/msg/TwistStamped"
         node.create_subscription(
             message_class(type_name),

@@ -1,6 +1,6 @@
-"""Two routers back to back: what one takes from UDP it publishes, and the other sends it on to UDP.
+"""Two routers back to back: one publishes what it receives by UDP, and the other sends it to UDP again.
 
-Their tables are made of the envelope's cases alone, each with a route in both directions.
+Their tables are derived from the envelope's payload cases, each with a route in both directions.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from tests.tables import PROTOS
 from tests.wire.test_comms import OTHER_FIELDS, OTHER_NAMES
 
 AT_ONCE = 50
-"""Datagrams that may be on their way, so that nothing is lost."""
+"""Datagrams in flight at most, so that none is lost."""
 
 DEPTH = 1000
 NEAR = "near"
-"""What each router calls the one endpoint that it knows."""
+"""The name of each router's only endpoint."""
 
 
 def table(place: Site, publishes: str, listens: str) -> dict[str, Any]:
-    """Of a router that publishes what it gets below one namespace, and sends what comes below the other."""
+    """The table of a router that publishes to one namespace and sends what it receives from the other."""
     host, port = place.endpoints[NEAR].getsockname()
     return {
         "version": 1,
@@ -58,7 +58,7 @@ def _routes(case: PayloadCase, publishes: str, listens: str) -> list[dict[str, A
 
 @contextmanager
 def back_to_back(folder: Path) -> Iterator[tuple[Site, Site]]:
-    """What is sent to the router of one site comes out at the endpoint of the other."""
+    """Two sites: datagrams sent to the router of one arrive at the endpoint of the other."""
     with ExitStack() as stack:
         sites = []
         for name, host, topics in (("left", "127.0.0.11", "ab"), ("right", "127.0.0.12", "ba")):
@@ -74,12 +74,12 @@ def back_to_back(folder: Path) -> Iterator[tuple[Site, Site]]:
 
 
 def turned(sent: Sample) -> bytes:
-    """What comes out at the far end: all that the ROS message has a place for."""
+    """The expected payload at the far end: the fields that the ROS message also has."""
     return from_board_units(sent.case, in_board_units(sent.payload)).datagram
 
 
 def carried(start: Site, end: Site, samples: Iterable[Sample]) -> Iterator[tuple[Sample, bytes]]:
-    """Each sample, and what came out for it."""
+    """Each sample with the datagram that arrived for it."""
     waiting = iter(samples)
     while turn := list(islice(waiting, AT_ONCE)):
         start.send(NEAR, *(sent.datagram for sent in turn))
@@ -88,7 +88,7 @@ def carried(start: Site, end: Site, samples: Iterable[Sample]) -> Iterator[tuple
 
 
 def _connected(start: Site, end: Site) -> None:
-    """Publishers and subscriptions have found each other, and nothing is on its way any more."""
+    """Wait until publishers and subscriptions have matched and no message is in flight."""
     empty = {case: sample(case, WIRE.envelope.cases[case].message_class()) for case in WIRE.envelope.cases}
     seen: set[str] = set()
 
@@ -99,7 +99,7 @@ def _connected(start: Site, end: Site) -> None:
         return seen == set(empty)
 
     wait_until(all_seen, "the last match")
-    # What was sent above comes before what is sent from here on, topic by topic.
+    # On each topic, the messages sent above arrive before those sent from here on.
     start.send(NEAR, *(nothing.datagram for nothing in empty.values()))
     last = {turned(nothing) for nothing in empty.values()}
     while last:

@@ -1,4 +1,4 @@
-"""What the rover's table has to do, written from the list of directions and not from the table."""
+"""The expected behaviour of the rover's table, written from the list of directions and not from the table."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ OUTFLOWS = {
     "rock_measure_result": Outflow("rock_measure_result", "basestation", "BasestationRockMeasureResult"),
     "rover_localization": Outflow("rover_localization", "basestation", "BasestationRoverLocalization"),
 }
-"""From ROS to UDP, by case, which is the topic as well: not taken from UDP."""
+"""Routes from ROS to UDP only, by payload case, which is also the topic."""
 
 ARRAYS = "detected_objects"
-"""The topic of `comms/msg/DetectedObjectArray`, whose elements go to the basestation one by one."""
+"""The topic of `comms/msg/DetectedObjectArray`, whose elements are sent to the basestation one by one."""
 
 ARRAY_ROUTE = "detected_object_from_ros_2"
 
@@ -78,7 +78,7 @@ STANDARD = {
         "pressure/temperature": "sensor_msgs/msg/Temperature",
     },
 }
-"""Topics of standard types that a case is published on as well."""
+"""Additional topics of a payload case, with standard types."""
 
 HOSTS = {
     "sensor_board": "127.0.0.30",

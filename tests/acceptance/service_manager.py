@@ -1,4 +1,4 @@
-"""What systemd is to a router: keeps its sockets, starts it with them, hears that it is ready, and starts it again."""
+"""A stand-in for systemd: holds sockets, starts the router with them, waits for READY, and restarts it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ ROOT = Path(__file__).parent.parent.parent
 SO_TIMESTAMPNS = 35
 SO_RCVBUFFORCE = 33
 ABOVE = 20
-"""Descriptors from here on are in nobody's way."""
+"""First descriptor that nothing else uses."""
 
 LAUNCH = 'n=3; for fd in $FDS; do eval "exec $n<&$fd $fd<&-"; n=$((n + 1)); done; LISTEN_PID=$$ exec "$@"'
 
 
 class ServiceManager:
-    """`told` are the lines that the routers have sent it, all of them. Its sockets are as rover-router.socket says."""
+    """`told` has all notifications of the routers. The sockets have the options of rover-router.socket."""
 
     module = "router"
 
@@ -33,7 +33,7 @@ class ServiceManager:
         self._environment = environment
         self._log = folder / "router.log"
         self.sockets = [_held(address) for address in addresses]
-        sleep(0.2)  # the kernel begins to stamp datagrams a moment after the first socket has asked for it
+        sleep(0.2)  # the kernel starts to timestamp datagrams a moment after the first socket requests it
         self.told: list[str] = []
         self.process: subprocess.Popen[bytes] | None = None
         self._hearing = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -41,7 +41,7 @@ class ServiceManager:
         self._hearing.settimeout(PATIENCE)
 
     def start(self) -> subprocess.Popen[bytes]:
-        """Returns at once."""
+        """Start the router without waiting."""
         descriptors = [fcntl.fcntl(held, fcntl.F_DUPFD, ABOVE) for held in self.sockets]
         environment = {
             **os.environ,
@@ -66,7 +66,7 @@ class ServiceManager:
         return self.process
 
     def hear(self, line: str) -> None:
-        """Waits until the router tells this."""
+        """Wait for this notification of the router."""
         deadline = monotonic() + PATIENCE
         while True:
             lines = self._hearing.recv(4096).decode().splitlines()
@@ -92,7 +92,7 @@ class ServiceManager:
 
 
 def make_room(opened: socket.socket) -> None:
-    """For 16 MiB, as systemd does; where this user may not have so much, for what he may."""
+    """Set a receive buffer of 16 MiB, as systemd does, or the largest that this user may set."""
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 16 << 20)
     except PermissionError:
@@ -100,7 +100,7 @@ def make_room(opened: socket.socket) -> None:
 
 
 def room_of(opened: socket.socket) -> int:
-    """Bytes, as they were asked for; the kernel has twice as many, for its own needs as well."""
+    """The requested size of the receive buffer in bytes; the kernel reports twice that, with its overhead."""
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 

@@ -1,4 +1,4 @@
-"""A router in a process of its own, with everything around it: boards and basestation as sockets, scraper, log."""
+"""A router in a separate process and its surroundings: sockets of boards and basestation, scraper, log."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ listen:
     address: 127.0.0.5:{listen}
 endpoints:
 {endpoints}"""
-"""The rover's table with loopback addresses, to be filled in by `Site.table`."""
+"""The rover's table with loopback addresses; `Site.table` fills in the placeholders."""
 
 BARE = """\
 version: 1
@@ -45,29 +45,29 @@ listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
 endpoints:
 {endpoints}
 """
-"""A table without routes, to be filled in likewise."""
+"""A table without routes, with the same placeholders."""
 
 IMPATIENT_ROVER = ROVER.replace("patient.yaml", "quiet.yaml")
-"""With the rover's own times for what is stale, and for its deadmen."""
+"""With the rover's own times for staleness and deadmen."""
 
 
 SO_MEMINFO = 55
-"""Of Linux; word 8 of what it tells are the datagrams dropped."""
+"""Socket option of Linux; word 8 of the result is the number of dropped datagrams."""
 
 SERVED = "route_duration_seconds_count"
-"""Counts the messages whose targets have all been served."""
+"""The metric that counts messages whose targets have all been served."""
 
 
 _COMMAND = re.compile(r'command="\w+",?')
 
 
 def key(metric: str, **labels: str) -> str:
-    """A counter as Prometheus writes it, without the prefix."""
+    """The name of a counter in Prometheus' text format, without the prefix."""
     return f"{metric}{{{','.join(f'{name}={json.dumps(labels[name])}' for name in sorted(labels))}}}"
 
 
 def samples_in(text: str) -> dict[str, float]:
-    """The samples of /metrics, without the prefix `router_` and the label `command`, which follows from others."""
+    """The samples of /metrics, without the prefix `router_` and the label `command`, which the other labels imply."""
     lines = (_COMMAND.sub("", line).rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
     return {name[len("router_") :]: float(value) for name, _, value in lines}
 
@@ -80,14 +80,14 @@ def wait_until(condition: Callable[[], bool], what: str = "it") -> None:
 
 
 class RouterProcess:
-    """`router run ARGUMENT...` as a child process, whose log goes to a file. `within` is a command that runs it."""
+    """`router run ARGUMENT...` as a child process that logs to a file. `within` is a command to run it with."""
 
     module = "tests.acceptance.uncached_router"
 
     def __init__(self, folder: Path, *arguments: object, within: Sequence[str] = (), **environment: str) -> None:
         self._log = folder / "router.log"
         folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
-        environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover's has one
+        environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover has one
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
                 [*within, sys.executable, "-m", self.module, "run", *map(str, arguments)],
@@ -109,7 +109,7 @@ class RouterProcess:
 
     @contextmanager
     def _or_killed(self) -> Iterator[None]:
-        """A router that is left running would subscribe to the topics of other tests."""
+        """Kill the router on failure: left running, it would subscribe to the topics of other tests."""
         try:
             yield
         except BaseException:
@@ -117,7 +117,7 @@ class RouterProcess:
             raise
 
     def stop(self, number: signal.Signals) -> int:
-        """Sends the signal, waits, and gives the exit code."""
+        """Send the signal, wait, and return the exit code."""
         self.process.send_signal(number)
         return self.wait()
 
@@ -126,7 +126,7 @@ class RouterProcess:
 
     @contextmanager
     def standing_still(self) -> Iterator[None]:
-        """Stops all of its threads meanwhile."""
+        """Stop all threads of the router meanwhile."""
         self.process.send_signal(signal.SIGSTOP)
         try:
             wait_until(self._is_stopped, "the stop")
@@ -139,11 +139,11 @@ class RouterProcess:
         return all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads)
 
     def text(self) -> str:
-        """What it has written to stderr so far."""
+        """The router's stderr so far."""
         return self._log.read_text()
 
     def log(self) -> list[dict[str, Any]]:
-        """Its lines of JSON; the last one may still be in the making."""
+        """The router's log entries; the last line may be incomplete."""
         return [json.loads(line) for line in self.text().splitlines() if line.startswith("{") and line.endswith("}")]
 
     def events(self, event: str) -> list[dict[str, Any]]:
@@ -152,7 +152,7 @@ class RouterProcess:
 
 @dataclass
 class Site:
-    """Sockets of all endpoints, each on an address of its own, and free ports for a router that is to be started."""
+    """Sockets of all endpoints, each at a different address, and free ports for a router."""
 
     folder: Path
     endpoints: Mapping[str, socket.socket]
@@ -160,7 +160,7 @@ class Site:
     metrics: int
 
     def table(self, text: str = ROVER) -> Path:
-        """Writes a table whose placeholders are filled in."""
+        """Write a table with the placeholders filled in."""
         lines = (
             f"  {name}: {{address: {host}:{port}, kind: {_kind(name)}}}\n"
             for name, (host, port) in ((name, opened.getsockname()) for name, opened in self.endpoints.items())
@@ -177,12 +177,12 @@ class Site:
         return self.endpoints[endpoint].recv(65536)
 
     def waiting(self) -> dict[str, list[bytes]]:
-        """Everything that has arrived anywhere and was not received, by endpoint."""
+        """The datagrams that have arrived and were not read, by endpoint."""
         found = {name: list(_drained(opened)) for name, opened in self.endpoints.items()}
         return {name: datagrams for name, datagrams in found.items() if datagrams}
 
     def scrape(self) -> Counter[str]:
-        """All counters of the router and what waits, without the prefix `router_` and the suffix `_total`."""
+        """All counters and queue lengths of the router, without the prefix `router_` and the suffix `_total`."""
         return Counter(
             {
                 name.replace("_total{", "{"): int(value)
@@ -192,19 +192,19 @@ class Site:
         )
 
     def samples(self) -> dict[str, float]:
-        """Everything that the router tells of itself."""
+        """All metrics of the router."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics}/metrics", timeout=PATIENCE) as answer:
             text = answer.read().decode()
         return samples_in(text)
 
     def changes(self, before: Counter[str]) -> Counter[str]:
-        """What was counted since `before`, without what stayed as it was."""
+        """The counters that changed since `before`, as differences."""
         return self.scrape() - before
 
     def settle(self, before: Counter[str], datagrams: int, messages: int = 0) -> Counter[str]:
-        """Waits until the router is done with so much since `before`; what was counted meanwhile.
+        """Wait until the router has processed this much since `before`, and return the changed counters.
 
-        `messages` are those from ROS.
+        `messages` are messages from ROS.
         """
 
         now = Counter[str]()
@@ -222,7 +222,7 @@ class Site:
 
 
 def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:
-    """The sum of a metric's series, or of those that have these labels."""
+    """The sum of a metric's series, or of its series with these labels."""
     wanted = [f'{name}="{value}"' for name, value in labels.items()]
     return sum(
         count
@@ -232,7 +232,7 @@ def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:
 
 
 def balance(counts: Mapping[str, int], topics: Iterable[str] = TOPICS_FROM_ROS) -> None:
-    """The identities of the counters: nothing that was received is unaccounted for. From `topics` messages come."""
+    """Check that the counters account for every received message. `topics` are the sources of routes from ROS."""
     accepted = total(counts, "messages_received")
     from_ros = sum(total(counts, "messages_received", source=topic) for topic in topics)
     assert total(counts, "datagrams_received") == total(counts, "datagrams_rejected") + accepted - from_ros
@@ -246,7 +246,7 @@ def balance(counts: Mapping[str, int], topics: Iterable[str] = TOPICS_FROM_ROS) 
 
 
 def labels_of(counts: Mapping[str, int], metric: str, label: str, **labels: str) -> set[str]:
-    """Which values a label has among a metric's series."""
+    """The values of a label among a metric's series."""
     wanted = [f'{name}="{value}"' for name, value in labels.items()]
     names = (name for name in counts if name.startswith(f"{metric}{{") and all(text in name for text in wanted))
     return {match[1] for name in names if (match := re.search(rf'[{{,]{label}="([^"]*)"', name))}
@@ -266,9 +266,9 @@ def _drained(opened: socket.socket) -> Iterator[bytes]:
 
 
 def arrived(opened: socket.socket, before: int = 0) -> int:
-    """How many datagrams came to a socket and were not received yet, those included that its buffer had no room for.
+    """The number of datagrams that arrived at a socket and were not read, including those dropped by a full buffer.
 
-    `before` is how many had found no room earlier (`no_room`).
+    `before` is the number of earlier drops (`no_room`).
     """
     return len(list(_drained(opened))) + no_room(opened) - before
 

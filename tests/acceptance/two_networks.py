@@ -1,4 +1,4 @@
-"""A rover with a LAN and a radio, each a network namespace with interfaces as real computers have, and attackers."""
+"""A rover with a LAN and a radio, each in a network namespace with real interfaces, and attackers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tests.namespaces import Computer, cable, computers
 
 BASESTATION, BOARD = ("10.78.2.10", 9000), ("10.78.1.222", 8)
 LAN, RADIO = ("10.78.1.1", 5000), ("10.78.2.1", 5000)
-"""Where the rover is in each."""
+"""The rover's address in each network."""
 DRIVE = WIRE.encode(WIRE.case("manual_drive"), WIRE.case("manual_drive").message_class())
 BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
 @dataclass
 class Rover:
-    """The rover and its two networks; `board` and `basestation` are sockets there."""
+    """The rover and its two networks, with sockets of `board` and `basestation`."""
 
     folder: Path
     rover: Computer
@@ -51,7 +51,7 @@ class Rover:
         return samples_in(self.rover.inside(ask))
 
     def board_gets(self) -> list[bytes]:
-        """What reached the board and was not looked at yet, but for what deadmen say to it."""
+        """The unread datagrams at the board, without those of deadmen."""
         found = []
         self.board.settimeout(0.2)
         with suppress(TimeoutError):
@@ -89,8 +89,8 @@ def rover_with_networks(folder: Path) -> Iterator[Rover]:
 
 
 def attacker(site: Rover, stack: ExitStack, computer: Computer, address: tuple[str, int]) -> socket.socket:
-    """A socket with somebody else's address, in a network where that one is not."""
+    """A socket with another host's address, in the network to which that host is not connected."""
     computer.ip("address", "add", f"{address[0]}/32", "dev", "eth0")
     computer.ip("route", "replace", "10.78.0.0/16", "dev", "eth0")
-    # Or the router's answers, and its own ARP, would tell the two apart.
+    # Otherwise the router's answers and its ARP would tell the two apart.
     return stack.enter_context(udp(computer, (address[0], 0)))

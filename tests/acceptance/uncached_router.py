@@ -1,4 +1,4 @@
-"""`python -m router`, but each scrape collects anew: tests compare counters at shorter distances than KEPT_SECONDS."""
+"""`python -m router` without the cache of scrapes, because tests compare counters within KEPT_SECONDS."""
 
 from __future__ import annotations
 

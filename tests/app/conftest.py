@@ -1,4 +1,4 @@
-"""A router in this process, or one that is started, between a board that sends and a basestation that receives."""
+"""A router, in this process or in another, between a board that sends and a basestation that receives."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
 
 
 def numbered(number: int) -> bytes:
-    """A `ph_info` with a number in it."""
+    """A `ph_info` with this number as its value."""
     return bytes.fromhex("0a050d") + struct.pack("<f", number)
 
 
 def let_rest(path: Path) -> None:
-    """As if it had been written a minute ago: a reload waits for what is being written."""
+    """Make the file look a minute old, because a reload waits for files that are still changing."""
     os.utime(path, (time() - 60,) * 2)
 
 
@@ -61,10 +61,10 @@ class Site:
     listen: int
     sent: list[int] = field(default_factory=list)
     received: list[int] = field(default_factory=list)
-    """The numbers of what has arrived at the basestation, by `take`."""
+    """The numbers that `take` has received at the basestation."""
 
     def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
-        """A table; behind its routes there may be other keys."""
+        """Write a table; `routes` may be followed by other keys."""
         path = self.folder / "table.yaml"
         listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
         destination = self.basestation.getsockname()[1]
@@ -90,7 +90,7 @@ class Site:
 
     @contextmanager
     def under_load(self) -> Iterator[None]:
-        """Numbered datagrams come all the time, 2,000 per second."""
+        """Meanwhile send 2,000 numbered datagrams per second."""
         ended = threading.Event()
 
         def load() -> None:
@@ -108,7 +108,7 @@ class Site:
             thread.join()
 
     def take(self) -> None:
-        """What has arrived by now."""
+        """Receive the datagrams that have arrived."""
         self.basestation.setblocking(False)
         with suppress(BlockingIOError):
             while datagram := self.basestation.recv(1000):
@@ -123,7 +123,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
-    """Publishing natively blocks, which sets the first event, until the second one is set."""
+    """Native publishing sets the first event and blocks until the second one is set."""
     rcl = pytest.importorskip("router.ros.rcl", reason="needs ROS 2")
     is_in, goes_on = threading.Event(), threading.Event()
 

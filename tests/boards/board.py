@@ -1,4 +1,4 @@
-"""A board in C, with nanopb and a dispatcher as upstream's firmware has: what it obeys is what a real board would.
+"""A board in C with nanopb and the dispatcher of the real firmware, so it obeys what a real board would.
 
 Every bound of the `.options` beside the protos is compiled into it.
 """
@@ -18,10 +18,10 @@ from router.carrier.build import compile_c
 from tests.acceptance.ros_peer import PATIENCE
 
 PARTS = Path(__file__).parent / "protos"
-"""Protos with bounded strings, bytes and lists, which the rover's do not have."""
+"""Protos with bounded strings, bytes and lists, unlike the rover's."""
 
 _HEADERS = (Path("/usr/include"), Path("/usr/include/nanopb"))
-"""Where Debian's packages have nanopb's, by version."""
+"""nanopb's folder in Debian's packages, by version."""
 
 
 def skip_without_nanopb() -> None:
@@ -30,7 +30,7 @@ def skip_without_nanopb() -> None:
 
 
 def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
-    """The board for a message `envelope` of the `.proto` file `header`, as a program in `folder`."""
+    """Compile a board for the message `envelope` of the `.proto` file `header` in `folder`."""
     skip_without_nanopb()
     names = [path.relative_to(protos).as_posix() for path in sorted(protos.rglob("*.proto"))]
     generator = [sys.executable, "-m", "nanopb.generator.nanopb_generator", "-q", "-I", ".", "-D", str(folder)]
@@ -44,7 +44,7 @@ def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
 
 
 class Verdict(NamedTuple):
-    """What became of one datagram: the envelope as nanopb encodes it again, or why it was refused."""
+    """The result for one datagram: the envelope re-encoded by nanopb, or the reason of the refusal."""
 
     case: int = 0
     envelope: bytes = b""
@@ -53,7 +53,7 @@ class Verdict(NamedTuple):
 
 
 class Board:
-    """A running board at `address`, which sends to the router's."""
+    """A running board at `address`, which sends to the router's address."""
 
     def __init__(self, program: Path, address: tuple[str, int], router: tuple[str, int]) -> None:
         self.address = address
@@ -92,11 +92,11 @@ class Board:
                 self._verdicts.put(Verdict(refused=rest, datagram=bytes.fromhex(first)))
 
     def receive(self) -> Verdict:
-        """On the next datagram; waits for it."""
+        """Wait for the next datagram and return its verdict."""
         return self._verdicts.get(timeout=PATIENCE)
 
     def waiting(self) -> list[Verdict]:
-        """On all datagrams that have arrived and were not asked for."""
+        """The verdicts on all other datagrams that have arrived."""
         found = []
         try:
             while True:
@@ -105,6 +105,6 @@ class Board:
             return found
 
     def send(self, form: str, *envelopes: bytes) -> None:
-        """Has them decoded and encoded by nanopb, and sent `exact`, `trimmed` or `padded`; or `raw`, as they are."""
+        """Send envelopes, re-encoded by nanopb as `exact`, `trimmed` or `padded`, or unchanged as `raw`."""
         for envelope in envelopes:
             self._commands.write(f"{form} {envelope.hex()}\n")

@@ -17,7 +17,7 @@ _FLOATS = (0.0, -0.0, 1.0, -1.5, 100.0, 1e-45)
 
 
 class Mutator:
-    """The same envelopes for the same seed."""
+    """Random envelopes; the same seed gives the same ones."""
 
     def __init__(self, wire: Wire, seed: int) -> None:
         self._cases = list(wire.envelope.cases.values())
@@ -54,7 +54,7 @@ class Mutator:
         return bytes(message.SerializeToString())
 
     def _fill(self, message: Any) -> None:
-        """Some of the fields, with values and lengths at both sides of what boards take."""
+        """Some of the fields, with values and lengths below and above the limits of boards."""
         for field in message.DESCRIPTOR.fields:
             if self._rng.random() < 0.4:
                 continue
@@ -86,7 +86,7 @@ class Mutator:
         return self._rng.choice(_NUMBERS)
 
     def _field(self) -> bytes:
-        """A field that may be known, with a wire type that may be wrong."""
+        """A known or unknown field, with a wire type that may be wrong."""
         number = self._rng.choice((*range(1, 12), 30, 999))
         match self._rng.randrange(5):
             case 0:
@@ -100,7 +100,7 @@ class Mutator:
         return self._delimited(number, self._rng.choice((b"", bytes(3), self._rng.randbytes(5), bytes(180))))
 
     def _delimited(self, number: int, value: bytes) -> bytes:
-        """With a size that may have more bytes than it needs."""
+        """A length-delimited value whose size may be encoded with redundant bytes."""
         size = varint(len(value))
         if self._rng.random() < 0.2:
             size = size[:-1] + bytes([size[-1] | 0x80]) + self._rng.choice((b"\0", b"\x80\0", b"\x80\x80\0"))

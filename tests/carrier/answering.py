@@ -1,4 +1,4 @@
-"""The carrier as a plane of the language's judge (tests/compiler/judging.py)."""
+"""The carrier as a plane for the judge of the language (tests/compiler/judging.py)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.compiler.language import language_wire
 
 _ROUTE = "route"
 _TIMEOUT = 10
-"""Of frames, in ns."""
+"""The timeout of frames, in ns."""
 
 
 def carrier_plane(functions: ctypes.CDLL) -> Plane:
-    """Answers by what delivers to targets (delivering.c)."""
+    """A plane that answers with the functions of delivering.c."""
 
     def plane(asked: Question) -> Callable[[bytes], list[Answer]]:
         carrier = Delivering(functions, _lowered(asked), RECEIVED_AT, SOURCE, timeout=_TIMEOUT)
@@ -50,7 +50,7 @@ def _collect(asked: Question) -> CheckedCollect:
 
 
 def _framed(carrier: Delivering, payloads: Sequence[bytes], now: int) -> list[Outcome]:
-    """The outcomes of the frame of these payloads, which come in any order. The one before has been forgotten."""
+    """The outcomes of a frame with these payloads, in any order. Earlier frames have been forgotten."""
     shuffled = random.Random(payloads[0]).sample(payloads, len(payloads))
     *earlier, last = (carrier.part(b"\0" + each, now, payload=Payload(1, len(each), True)) for each in shuffled)
     assert not any(earlier)
@@ -59,7 +59,7 @@ def _framed(carrier: Delivering, payloads: Sequence[bytes], now: int) -> list[Ou
 
 
 def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
-    """The programs of a question. One from ROS comes from a topic that is called SOURCE."""
+    """The programs of a question. A message from ROS comes from the topic SOURCE."""
     for_each, condition, plan = asked.checked()
     topic, span = Topic(Located(SOURCE, SPAN), SPAN), SPAN
     route, envelope = Route(name=_ROUTE, span=span, case=Located(_ROUTE, span)), language_wire()[1]

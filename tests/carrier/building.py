@@ -30,18 +30,18 @@ _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
 
 
 def sanitizing(sanitizers: str) -> list[str]:
-    """Compiler flags. The first thing that a sanitizer finds ends the process."""
+    """Compiler flags. The first error that a sanitizer finds ends the process."""
     return [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g", "-O1"]
 
 
 def sanitized_library(output: Path) -> Path:
     """The library with AddressSanitizer and UndefinedBehaviorSanitizer, for processes that preload libasan."""
-    # As of the library itself: those of tests that use it have functions of the same names.
+    # As in the library itself, because test libraries that use it have functions of the same names.
     return build(output, [*sanitizing(MEMORY), "-Wl,-Bsymbolic"], "gcc")
 
 
 def seams(output: Path) -> ctypes.CDLL:
-    """The functions of seams.c, in a library that is made as `output`."""
+    """The functions of seams.c, compiled to the library `output`."""
     compile_c(["-shared", "-fPIC", str(Path(__file__).parent / "seams.c"), f"-I{NATIVE}", "-o", str(output)])
     loaded = ctypes.CDLL(str(output))
     for name, (returned, taken) in _SEAMS.items():
@@ -51,7 +51,7 @@ def seams(output: Path) -> ctypes.CDLL:
 
 
 def clocked_library(output: Path) -> ctypes.CDLL:
-    """The library with clocks that are set: `seam_boottime` and `seam_wall`."""
+    """The library with simulated clocks, set by `seam_boottime` and `seam_wall`."""
     here = Path(__file__).parent
     clock = output.with_suffix(".c")
     clock.write_text("#include <stdint.h>\nint64_t seam_boottime, seam_wall;\n")
@@ -61,15 +61,15 @@ def clocked_library(output: Path) -> ctypes.CDLL:
 
 
 def program(output: Path, main: Path, flags: Sequence[str], compiler: str | None = None) -> Path:
-    """A program of `main` and all sources of the carrier. Raises BuildError."""
+    """Compile a program from `main` and all sources of the carrier. Raises BuildError."""
     compile_c([str(main), *map(str, sources()), f"-I{NATIVE}", *flags, "-o", str(output)], compiler)
     return output
 
 
 def run_program(name: str, folder: Path, *arguments: object, sanitizers: str = "") -> None:
-    """Make `programs/NAME.c` in `folder`, and run it. Fails if the program does, or a sanitizer finds something.
+    """Compile `programs/NAME.c` in `folder` and run it. Fails if the program fails or a sanitizer finds an error.
 
-    Without sanitizers it runs on the library that there is.
+    Without sanitizers the program uses the existing library.
     """
     if sanitizers and shutil.which("clang") is None:
         pytest.skip("needs clang")

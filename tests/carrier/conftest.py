@@ -1,4 +1,4 @@
-"""The carrier's library, the one that set-up has built or one of the present sources, and the interfaces of ROS."""
+"""The carrier's library, built from the current sources, and libraries with functions for tests."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tests.carrier import evaluating as of_machine
 from tests.carrier.building import sanitized_library
 
 SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
-"""An environment variable. `make test-all` sets it, with those that sanitizers need."""
+"""An environment variable. `make test-all` sets it together with those that the sanitizers need."""
 
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its file."""
+    """The path of the library."""
     made = tmp_path_factory.mktemp("carrier") / LIBRARY.name
     if SANITIZED in os.environ:
         return sanitized_library(made)
@@ -32,13 +32,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def library(built: Path) -> ctypes.CDLL:
-    """It, loaded."""
+    """The loaded library."""
     return load(built)
 
 
 @pytest.fixture(scope="session")
 def seams(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """What tests need beside it: see seams.c."""
+    """The functions of seams.c."""
     return building.seams(tmp_path_factory.mktemp("carrier") / "seams.so")
 
 
@@ -49,20 +49,20 @@ def definitions() -> Definitions:
 
 @pytest.fixture(scope="session")
 def delivering(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """What delivers messages: see delivering.c."""
+    """The functions of delivering.c, which deliver messages."""
     made = tmp_path_factory.mktemp("carrier") / "delivering.so"
     return of_delivery.delivering(made, built, is_sanitized=SANITIZED in os.environ)
 
 
 @pytest.fixture(scope="session")
 def deferring(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """What holds messages back: see deferring.c."""
+    """The functions of deferring.c, which hold messages back."""
     made = tmp_path_factory.mktemp("carrier") / "deferring.so"
     return of_deferrals.deferring(made, built, is_sanitized=SANITIZED in os.environ)
 
 
 @pytest.fixture(scope="session")
 def evaluating(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The machine's functions: see evaluating.c."""
+    """The functions of evaluating.c, which run the machine."""
     made = tmp_path_factory.mktemp("carrier") / "evaluating.so"
     return of_machine.evaluating(made, is_sanitized=SANITIZED in os.environ)

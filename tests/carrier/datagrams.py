@@ -1,4 +1,4 @@
-"""Datagrams made of pieces of the wire format, by a schema, mostly well formed; and damage to them."""
+"""Random datagrams from pieces of the wire format, mostly well formed according to a schema, and damaged ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _EDGES = (
 
 
 class Maker:
-    """Makes datagrams for an envelope, by what `noise` says."""
+    """Makes datagrams for an envelope with the random numbers of `noise`."""
 
     def __init__(self, envelope: Descriptor, noise: random.Random) -> None:
         self._envelope = envelope
@@ -33,7 +33,7 @@ class Maker:
         self._room = 0
 
     def datagram(self) -> bytes:
-        """An envelope, in most cases with one payload and nothing else; damaged at times."""
+        """An envelope, usually with exactly one payload, and sometimes damaged."""
         data = self.envelope()
         other = data
         for _ in range(self._noise.choice((0, 0, 0, 1, 1, 2))):
@@ -54,12 +54,12 @@ class Maker:
         return b"".join(parts)
 
     def message(self) -> bytes:
-        """A message like the envelope, but not with a payload in most cases."""
+        """A message of the envelope's type, usually without a payload."""
         self._room = self._noise.choice((5, 30, 120))
         return self._message(self._envelope)
 
     def _message(self, descriptor: Descriptor) -> bytes:
-        """Some of its fields, in any order, and now and then an unknown one."""
+        """Some of the message's fields, in any order, and sometimes an unknown one."""
         parts = []
         fields = [*descriptor.fields]
         if descriptor.is_extendable:
@@ -75,7 +75,7 @@ class Maker:
         return b"".join(parts)
 
     def _known(self, field: FieldDescriptor) -> bytes:
-        """A field as declared, or with another wire type."""
+        """A field with its declared wire type or another one."""
         if self._noise.random() < 0.02:
             return self._value(field.number, self._noise.choice((VARINT, I64, LEN, GROUP, I32)))
         if field.type == FieldDescriptor.TYPE_GROUP:
@@ -97,7 +97,7 @@ class Maker:
         return b"".join(parts)
 
     def _inner(self, field: FieldDescriptor) -> bytes:
-        """The fields of a message or group; now and then about as deep as protobuf takes it."""
+        """The fields of a message or group, sometimes nested about as deeply as protobuf allows."""
         assert field.message_type is not None
         content = self._message(field.message_type)
         if self._noise.random() > 0.02:
@@ -127,7 +127,7 @@ class Maker:
         return self._value(number, self._noise.choice((VARINT, I64, LEN, GROUP, I32, I32, LEN, VARINT, 4, 6, 7)))
 
     def _value(self, number: int, wire_type: int) -> bytes:
-        """Any value of a wire type; nothing behind the tag for those that have none."""
+        """Any value of a wire type; empty for wire types without a value."""
         if wire_type == GROUP:
             return self._group(number, lambda: b"".join(self._unknown() for _ in range(self._noise.randrange(3))))
         if wire_type == LEN:
@@ -155,7 +155,7 @@ class Maker:
         return self._stretched(tag(number, wire_type))
 
     def _stretched(self, encoded: bytes) -> bytes:
-        """A varint, now and then longer than it needs to be, up to one byte more than any may have."""
+        """A varint, sometimes longer than necessary, up to one byte more than the maximum."""
         if self._noise.random() > 0.02:
             return encoded
         longest: Sequence[int] = range(len(encoded) + 1, 12)

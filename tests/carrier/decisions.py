@@ -1,4 +1,4 @@
-"""What the carrier decides about a datagram, over schemas with fields of every kind."""
+"""The carrier's decisions about datagrams, for schemas with fields of every kind."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SCHEMAS = {
     "every_kind": (TESTS / "protos", ["every_kind"]),
     "hard": (TESTS / "carrier" / "protos", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
 }
-"""Folders of protos, and the payload cases that get a route."""
+"""Folders of protos, and the payload cases with a route."""
 
 
 def native_library() -> ctypes.CDLL:
@@ -46,7 +46,7 @@ def native_library() -> ctypes.CDLL:
 
 
 def table(schema: str, folder: Path) -> Program:
-    """A table for one of SCHEMAS, with its file in a folder of its own in `folder`: the oracle reads it again."""
+    """A table for one of SCHEMAS, written to a new folder in `folder`, because the oracle reads the file again."""
     protos, cases = SCHEMAS[schema]
     routes = "".join(f"  {case}: {{source: any, destinations: [tool]}}\n" for case in cases)
     own = folder / schema
@@ -67,16 +67,16 @@ class CarrierSide:
 
     def decide(self, data: bytes, repairs: bool) -> Decision:
         kept = data[:MAX_DATAGRAM]
-        # What an earlier datagram left behind this one must not count.
+        # Bytes of an earlier datagram behind this one must not count.
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
         schema, envelope = self._schema, self._envelope
         code = self._read(ctypes.byref(schema), self._buffer, len(data), repairs, ctypes.byref(envelope))
         return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
 
     def whole(self) -> bytes:
-        """The envelope that was read last, repaired."""
+        """The envelope read last, restored."""
         return self._buffer.raw[: self._envelope.size]
 
     def payload(self) -> Payload:
-        """Where the payload is that was read last."""
+        """The position of the payload read last."""
         return Payload(self._envelope.start, self._envelope.length, self._envelope.is_single)

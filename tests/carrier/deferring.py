@@ -1,4 +1,4 @@
-"""Deferrals and pacers on a clock that is told to go, without threads and sockets: see deferring.c."""
+"""Deferrals and pacers on a simulated clock, without threads and sockets: see deferring.c."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[type, ...]]] = {
 
 
 def deferring(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL:
-    """The functions of deferring.c, in a library that is made as `output` and uses that of the carrier."""
+    """The functions of deferring.c, compiled to the library `output`, which uses the carrier's library."""
     flags = [*(sanitizing(MEMORY) if is_sanitized else ["-O1"]), "-fPIC", "-shared", f"-I{NATIVE}"]
     files = [str(Path(__file__).parent / "deferring.c"), str(library)]
     compile_c([*flags, *files, "-o", str(output)], "gcc" if is_sanitized else None)
@@ -53,7 +53,7 @@ def deferring(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL
 
 
 class Left(NamedTuple):
-    """A message that has left: when, of which target, and its bytes."""
+    """A message that was sent or published: the time, its target, and its bytes."""
 
     at: int
     target: int
@@ -61,7 +61,7 @@ class Left(NamedTuple):
 
 
 class Deferring:
-    """A group of timers with one pacer, if `bandwidth` is given. Targets are numbers, as they are added."""
+    """A group of timers, with a pacer if `bandwidth` is given. Targets are numbered in the order of `target` calls."""
 
     def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, bandwidth: int | None = None) -> None:
         self.now = 0
@@ -76,7 +76,7 @@ class Deferring:
         self._functions.seam_close(self._address)
 
     def target(self, hertz: float | None, priority: Priority = Priority.COMMAND, *, is_topic: bool = False) -> int:
-        """Add a target with `on_limit: latest` if `hertz` is given, and with the bandwidth if there is one."""
+        """Add a target, with `on_limit: latest` if `hertz` is given, and with the bandwidth if there is one."""
         if self._pacer is not None and not self._deferrals:
             self._functions.seam_adopt(self._address, self._pacer.address, 0)
         pacer = None if is_topic else self._pacer
@@ -85,7 +85,7 @@ class Deferring:
         return self._add(self._deferrals[-1], hertz, priority, is_topic=is_topic)
 
     def change(self, target: int, hertz: float | None, priority: Priority = Priority.COMMAND) -> int:
-        """Have the deferral of a target deliver to another one, whose number is returned, as after a reload."""
+        """Replace a target, as a reload does, and return the number of the new one. The deferral stays."""
         self._deferrals.append(self._deferrals[target])
         return self._add(self._deferrals[target], hertz, priority, is_topic=self._are_topics[target])
 
@@ -96,27 +96,27 @@ class Deferring:
         return int(self._functions.seam_target(self._address, deferral.address, between, rank, is_topic))
 
     def offer(self, target: int, data: bytes, expires: int | None = None, *, is_written: bool = False) -> None:
-        """Deliver a datagram, or what a machine has written."""
+        """Deliver a datagram, or a message written by a machine."""
         offer = self._functions.seam_offer_written if is_written else self._functions.seam_offer
         offer(self._address, target, data, len(data), NEVER if expires is None else expires, self.now)
 
     def set(self, now: int) -> None:
-        """Move the clock, and serve nothing."""
+        """Set the clock without serving timers."""
         self.now = now
         self._functions.seam_set(self._address, now, self._error)
 
     def refuse(self, error: int) -> None:
-        """Have sending return this errno from now on, 0 for none."""
+        """Make sending fail with this errno from now on; 0 makes it succeed."""
         self._error = error
         self.set(self.now)
 
     def give_up(self) -> None:
-        """Have the thread be given up when it publishes next: its deferrals are freed then."""
+        """Abandon the thread when it publishes next, which frees its deferrals."""
         self._functions.seam_give_up(self._address)
 
     @property
     def is_untouched(self) -> bool:
-        """Whether deferrals that are freed so have not been used since. They are not closed any more."""
+        """Whether no freed deferral has been used since. They need no close."""
         for deferral in self._deferrals:
             deferral.address = 0
         return bool(self._functions.seam_is_untouched(self._address))
@@ -125,7 +125,7 @@ class Deferring:
         self._functions.seam_serve(self._address, self.now)
 
     def wait(self, until: int) -> None:
-        """Serve in time."""
+        """Advance the clock, and serve each timer when it is due."""
         while (due := self.next_due) is not None and due <= until:
             self.set(max(due, self.now))
             self.serve()
@@ -147,7 +147,7 @@ class Deferring:
         self._functions.seam_end_all(self._address)
 
     def taken(self) -> list[Left]:
-        """What has left since the last call."""
+        """The messages sent or published since the last call."""
         return list(self._taken())
 
     def _taken(self) -> Iterator[Left]:
@@ -161,6 +161,6 @@ class Deferring:
             position += length_of_record
 
     def counted(self, target: int) -> dict[str, int]:
-        """What is not zero: `sent`, `bytes`, and what was dropped by reason."""
+        """The nonzero counts: `sent`, `bytes`, and drops by reason."""
         counts = {fate: self._functions.seam_count(self._address, target, which) for which, fate in enumerate(_FATES)}
         return {fate: count for fate, count in counts.items() if count}

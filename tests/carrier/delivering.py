@@ -1,4 +1,4 @@
-"""What the carrier makes of messages, without threads, sockets, clocks and middleware: see delivering.c."""
+"""Delivering messages without threads, sockets, clocks and middleware: see delivering.c."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LOSS = Struct("@6Ii3I2I3q")
 
 
 def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL:
-    """The functions of delivering.c, in a library that is made as `output` and uses that of the carrier."""
+    """The functions of delivering.c, compiled to the library `output`, which uses the carrier's library."""
     flags = [*(sanitizing(MEMORY) if is_sanitized else ["-O1"]), "-fPIC", "-shared", f"-I{NATIVE}"]
     files = [str(Path(__file__).parent / "delivering.c"), str(library)]
     compile_c([*flags, *files, "-o", str(output)], "gcc" if is_sanitized else None)
@@ -59,7 +59,7 @@ def delivering(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDL
 
 
 class Outcome(NamedTuple):
-    """What a target gets: bytes, FILTERED, or why it gets nothing and which place of the table refused."""
+    """The result for a target: bytes, FILTERED, or the reason of the drop with its place in the table."""
 
     label: str
     got: Union[bytes, str]
@@ -67,7 +67,7 @@ class Outcome(NamedTuple):
 
 
 class Payload(NamedTuple):
-    """Where a payload is in its envelope: it if it `is_single`, else its pieces, from the tag of the first one."""
+    """The position of a payload in its envelope: the payload if it `is_single`, else its pieces with their tags."""
 
     start: int
     length: int
@@ -78,10 +78,10 @@ class Payload(NamedTuple):
 
 
 class Delivering:
-    """Delivers to all targets of a route that were lowered. Those of messages from ROS are destinations.
+    """Delivers to all lowered targets of a route. The targets of messages from ROS are destinations.
 
-    Without a message of its own, a target gets the datagram. `source` is the name of any sender. With `collect`, there
-    may be others, and frames end after `timeout` ns.
+    A target without a mapping gets the datagram. `source` is the name of a sender; with `collect` there may be
+    more. Frames end after `timeout` ns.
     """
 
     def __init__(
@@ -143,20 +143,20 @@ class Delivering:
 
     @property
     def received(self) -> int:
-        """How many messages were counted, of those from ROS."""
+        """The number of counted messages from ROS."""
         return self._counters[0]
 
     def datagram(self, data: bytes, payload: Payload | None = None) -> list[Outcome]:
-        """Deliver an envelope with this payload, or a payload by itself. Returns one outcome for each target."""
+        """Deliver an envelope with this payload, or a bare payload. Return one outcome per target."""
         notes, to = c_void_p(), byref(self._targets)
         about = *(payload or Payload(0, len(data), True)), 0, self._received_at
         size = self._functions.seam_datagram(self._address, to, data, len(data), *about, byref(notes))
         return [*self._outcomes(ctypes.string_at(notes.value or 0, size))]
 
     def part(self, data: bytes, now: int = 0, column: int = 0, payload: Payload | None = None) -> list[Outcome] | None:
-        """Deliver an envelope to targets with `collect`. Without a `payload`, it consists of its pieces.
+        """Deliver an envelope to targets with `collect`. Without `payload`, it consists of the payload's pieces.
 
-        Returns one outcome for each target if it completes a frame, else None.
+        Return one outcome per target if the datagram completes a frame, else None.
         """
         notes, to = c_void_p(), byref(self._targets)
         about = *(payload or Payload(0, len(data), False)), column, self._received_at, now
@@ -168,12 +168,12 @@ class Delivering:
         return int(self._functions.seam_serve(self._address, now))
 
     def end_frames(self) -> None:
-        """End all frames, and the collector."""
+        """End all frames and the collector."""
         ended = (c_void_p * 1)(ctypes.cast(self._adopted[0].timer, c_void_p))
         self._functions.seam_adopt(self._address, byref(c.TimerChange(ended=ended, ended_count=1)))
 
     def losses(self) -> list[tuple[str, str]]:
-        """What was lost before it was delivered, since the last call: label and details."""
+        """The losses before delivery since the last call: label and details."""
         events = c_void_p()
         length = self._functions.seam_losses(self._address, byref(events))
         records = ctypes.string_at(events.value or 0, length)
@@ -186,14 +186,14 @@ class Delivering:
         return made
 
     def counted(self, label: str) -> dict[str, int]:
-        """What a target has counted."""
+        """The nonzero counts of a target."""
         number = [each.label for each in self._lowered].index(label)
         of_target = self._counters[1 + number * _OF_TARGET :][:_OF_TARGET]
         names = (None, "delivered", "filtered", "collected", None, *LOSSES)
         return {name: count for name, count in zip(names, of_target, strict=True) if name and count}
 
     def from_ros(self, data: bytes) -> list[Outcome]:
-        """Serve a message from ROS. Returns one outcome for each target, for each element with `for_each`."""
+        """Serve a message from ROS. Return one outcome per target, and per element with `for_each`."""
         notes = c_void_p()
         assert self._route is not None
         size = self._functions.seam_from_ros(

@@ -1,4 +1,4 @@
-"""Programs for the machine in C (`operations.h`), put together by hand, and what becomes of them."""
+"""Hand-written programs for the machine in C (`operations.h`), and their results."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Operation:
     size: int = 0
     number: int | float = 0
     data: bytes | None = None
-    """Stands in the literals: `number` and, unless it is given, `size` follow from it."""
+    """Stored in the literals; sets `number` and, unless given, `size`."""
 
     def packed(self, literals: bytearray) -> bytes:
-        """With its data in the literals, which grow if they do not have them."""
+        """The bytes of the operation. Appends its data to the literals if they lack it."""
         size, number = self.size, self.number
         if self.data is not None:
             size, number = self.size or len(self.data), literals.find(self.data)
@@ -104,11 +104,11 @@ class Layout:
     closed: Sequence[Sequence[int]] = ()
     is_cdr: bool = False
     defaults: dict[int, int | float | bytes] = field(default_factory=dict)
-    """Of slots that do not begin with zero or an empty list."""
+    """Initial values of slots, other than zero and the empty list."""
 
 
 def evaluating(output: Path, *, is_sanitized: bool) -> ctypes.CDLL:
-    """The machine with the functions of evaluating.c, in a library that is made as `output`."""
+    """The machine and the functions of evaluating.c, compiled to the library `output`."""
     flags = [*(sanitizing(MEMORY) if is_sanitized else ["-O1"]), "-fPIC", "-shared", f"-I{NATIVE}"]
     files = [str(Path(__file__).parent / "evaluating.c"), *(str(NATIVE / name) for name in SOURCES)]
     compile_c([*flags, *files, "-o", str(output)], "gcc" if is_sanitized else None)
@@ -128,7 +128,7 @@ def evaluating(output: Path, *, is_sanitized: bool) -> ctypes.CDLL:
 
 
 class Machine:
-    """A machine with a layout, which programs are run on."""
+    """A machine with a layout, to run programs on."""
 
     def __init__(self, library: ctypes.CDLL, layout: Layout | None = None) -> None:
         self._library = library
@@ -141,8 +141,8 @@ class Machine:
         self._library.seam_machine_close(self._address)
 
     def read(self, data: bytes = CDR_HEADER) -> bool:
-        """Begin with a message: its section is the first one. Without a layout there is nothing to read."""
-        copy = (ctypes.c_char * len(data)).from_buffer_copy(data) if data else b""  # exactly, for sanitizers
+        """Start with a message, whose section is the first one. Without a layout nothing is read."""
+        copy = (ctypes.c_char * len(data)).from_buffer_copy(data) if data else b""  # exact size, for sanitizers
         self._message = copy
         return bool(self._library.seam_machine_read(self._address, byref(self._layout), copy, len(data)))
 
@@ -150,11 +150,11 @@ class Machine:
         return int(c.Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index).bits)
 
     def listed(self, index: int, of: str = INTEGER) -> list[object]:
-        """A slot's list in cells."""
+        """The list of a slot, as cells."""
         return self._elements(c.Value.from_address(self._library.seam_machine_slots(self._address) + 16 * index), of)
 
     def value(self, *routine: Operation, of: str = INTEGER) -> object:
-        """What a program leaves on the stack: an int64 for INTEGER, the elements of LISTs in cells as integers."""
+        """The result of a program on the stack: an int64 for INTEGER; for LISTs the elements' cells as integers."""
         value, at = c.Value(), c_uint32()
         made = self._routine(routine)
         outcome = self._library.seam_machine_value(self._address, byref(made), byref(value), byref(at))

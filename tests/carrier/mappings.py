@@ -1,4 +1,4 @@
-"""One mapping: what the carrier makes of a message, and what the oracle allows it to make."""
+"""One mapping, executed by the carrier and by the oracle."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ TOPIC = "topic"
 
 @dataclass(frozen=True)
 class Mapping:
-    """`carrier` and `oracle` take a message: an element of their lists for each message that it gives.
+    """`carrier` and `oracle` take a message and return a list with the resulting messages.
 
-    The oracle raises one of FAILURES for a message that cannot be read. The carrier reads no more than it needs.
+    The oracle raises one of FAILURES for a message that cannot be read. The carrier reads only the fields it needs.
     """
 
     carrier: Callable[[bytes], list[Answer]]
     oracle: Callable[[bytes], list[Verdict]]
 
     def check(self, message: bytes) -> list[Answer]:
-        """What the carrier makes of it, which the oracle allows."""
+        """The carrier's result, checked against the oracle."""
         made, verdicts = self.carrier(message), self.oracle(message)
         allowed = [judged.allows(each) for judged, each in zip(verdicts, made, strict=True)]
         assert all(allowed), f"{made}, not {[*map(str, verdicts)]}"
         return made
 
     def check_damaged(self, message: bytes) -> list[Answer]:
-        """The same of a message that the oracle may not be able to read."""
+        """The same for a message that the oracle may be unable to read."""
         return self.carrier(message) if outcome(lambda: self.oracle(message)) is FAILURES else self.check(message)
 
 
@@ -115,7 +115,7 @@ def from_ros(
 
 
 def _contexts(context: Context, for_each: str) -> list[Context]:
-    """Of the message, or of each element."""
+    """The context of the message, or of each element."""
     if not for_each:
         return [context]
     meaning = meaning_of(written(for_each), context)

@@ -1,4 +1,4 @@
-"""Messages at random, as protobuf parses them: with fields in any order, several times, or unknown."""
+"""Random messages that protobuf parses: with fields in any order, repeated, or unknown."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _STRINGS = [*(text.encode() for text in _TEXTS), b"x" * 300]
 
 
 def payloads(case: PayloadCase) -> st.SearchStrategy[list[bytes]]:
-    """Several at a time. They do not shrink, but there can be many of them."""
+    """Lists of payloads. They do not shrink, but are quick to generate."""
     return st.integers(0, (1 << 64) - 1).map(lambda seed: some_payloads(case, seed))
 
 
 def some_payloads(case: PayloadCase, seed: int) -> list[bytes]:
-    """At most ten, all of which protobuf parses."""
+    """At most ten payloads, all accepted by protobuf."""
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's
     noise = random.Random(seed)
     return [data for _ in range(10) if parses(descriptor, data := _message(noise, descriptor, _DEEPEST))]

@@ -1,4 +1,4 @@
-"""A program whose topics the carrier publishes on, between sockets and a middleware of tests."""
+"""A program whose topics the carrier publishes, between sockets and a simulated middleware."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CALLED = "middleware_publish", "middleware_error", "middleware_forget_error"
 
 
 class Publisher:
-    """As `ros.endpoints.Publication`."""
+    """Stands in for `ros.endpoints.Publication`."""
 
     def __init__(self, functions: ctypes.CDLL) -> None:
         self._functions = functions
@@ -39,17 +39,17 @@ class Publisher:
         self.wanted = (ctypes.c_uint8 * 1)(1)
 
     def impede(self, *, is_stuck: bool = False, delay_us: int = 0, refusal: str = "") -> None:
-        """Have whoever publishes wait, take its time, or be refused; without arguments, none of it."""
+        """Make publishing block, take this long, or fail; without arguments, make it succeed at once."""
         self._functions.middleware_impede(self.address, is_stuck, delay_us, refusal.encode())
 
     @property
     def is_called(self) -> bool:
-        """Whether a thread is in the middleware now."""
+        """Whether a thread is inside the middleware."""
         return bool(self._functions.middleware_callers(self.address))
 
     @property
     def count(self) -> int:
-        """How many messages were published."""
+        """The number of published messages."""
         return int(self._functions.middleware_count(self.address))
 
     def published(self) -> list[bytes]:
@@ -58,9 +58,9 @@ class Publisher:
 
 
 class Publishing:
-    """The receive thread and the one that publishes. All targets of `program` are topics.
+    """The threads `receive` and `publish`. All targets of `program` are topics.
 
-    `queue` is how many bytes may wait.
+    `queue` is the size of the ring in bytes.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Publishing:
         self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
         self._peer = stack.enter_context(_bound())
         self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
-        self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
+        self._programs = [self._made(program, 1)]  # all of them, because an abandoned thread may use any
         self._changes: list[c.PublishChange] = []
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
         self.thread = PublishThread(library, self._ring, self._published, self._events, self._names)
@@ -87,14 +87,14 @@ class Publishing:
         self.sent = 0
 
     def send(self, *datagrams: bytes, listener: str = "exact") -> None:
-        """Have the carrier receive these. It returns when they wait for the thread, or were dropped."""
+        """Make the carrier receive datagrams. Returns when they are queued for the thread or dropped."""
         for datagram in datagrams:
             self._peer.sendto(datagram, self._sockets[listener].getsockname())
             self.sent += 1
             wait_until(lambda: self.ledger().total("datagrams_received") == self.sent)
 
     def change(self, generation: int, program: Program | None = None) -> None:
-        """Receive with another program from now on; the thread goes on to it."""
+        """Receive with another program from now on; the publish thread follows."""
         self._state = State(self._library, self._state)
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
@@ -117,7 +117,7 @@ class Publishing:
         self.thread.stop()
 
     def ledger(self) -> Ledger:
-        """The counts of both threads; those of the thread that takes what waits first."""
+        """The counts of both threads, those of the consumer read first."""
         size = self.program.counters.size
         published, received = self.thread.counters(size), self._carrier.counters(size)
         return Ledger(self.program, [mine + other for mine, other in zip(published, received, strict=True)])
@@ -129,7 +129,7 @@ class Publishing:
         wait_until(lambda: self.count(metric) == count)
 
     def losses(self) -> list[tuple[str, str, int, str]]:
-        """The route, target, reason and text of each loss since the last call that the thread has reported."""
+        """The route, target, reason and text of each loss that the thread has reported since the last call."""
         records, found, at = bytes(self._events.take()), [], 0
         while at < len(records):
             size, _, route, _, target, reason, *_ = _LOST.unpack_from(records, at)
@@ -139,7 +139,7 @@ class Publishing:
         return found
 
     def stalled(self) -> tuple[str, float] | None:
-        """The topic in whose publisher the thread is now, and for how many seconds."""
+        """The topic whose publisher blocks the thread, and for how many seconds; else None."""
         return self.thread.stalled()
 
     def _made(self, program: Program, generation: int) -> NativeProgram:

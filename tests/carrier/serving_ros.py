@@ -1,4 +1,4 @@
-"""A program whose messages from ROS the carrier serves, between a middleware of tests and sockets in memory."""
+"""A program whose messages from ROS the carrier serves, between a simulated middleware and in-memory sockets."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _MIDDLEWARE: Mapping[str, tuple[Any, tuple[type, ...]]] = {
 
 
 def middleware(output: Path) -> ctypes.CDLL:
-    """The functions of middleware.c, in a library that is made as `output`."""
+    """The functions of middleware.c, compiled to the library `output`."""
     source = Path(__file__).with_name("middleware.c")
     compile_c(["-shared", "-fPIC", str(source), f"-I{NATIVE}", "-o", str(output)])
     loaded = ctypes.CDLL(str(output))
@@ -62,7 +62,7 @@ def middleware(output: Path) -> ctypes.CDLL:
 
 
 class Subscription:
-    """As `ros.receiving.RawSubscription`."""
+    """Stands in for `ros.receiving.RawSubscription`."""
 
     capacity = 1000
 
@@ -84,7 +84,7 @@ class Subscription:
 
     @property
     def is_taken_from(self) -> bool:
-        """Whether the thread is in the middleware now."""
+        """Whether the thread is inside the middleware."""
         return bool(self._functions.middleware_takers(self.address))
 
     def take_all(self) -> Sequence[object]:
@@ -95,7 +95,7 @@ class Subscription:
 
 
 class Board:
-    """What an endpoint gets. `address` is that of a `struct sender`."""
+    """Records the datagrams for an endpoint. `address` is the address of a `struct sender`."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -104,13 +104,13 @@ class Board:
         self.address: int = library.sender_open(self._near.fileno(), -1, 0, 0)
 
     def break_down(self) -> None:
-        """Sending fails from now on."""
+        """Make sending fail from now on."""
         broken = os.open(os.devnull, os.O_WRONLY)
         os.dup2(broken, self._near.fileno(), inheritable=False)
         os.close(broken)
 
     def received(self) -> list[bytes]:
-        """Return what has come since the last call."""
+        """Return the datagrams received since the last call."""
         return list(self._take())
 
     def _take(self) -> Iterator[bytes]:
@@ -124,7 +124,7 @@ class Board:
 
 
 class ServingRos:
-    """The thread for messages from ROS. It serves nothing before `serve`."""
+    """The thread for messages from ROS. It starts to serve at `serve`."""
 
     def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack) -> None:
         self.program = program
@@ -179,7 +179,7 @@ class ServingRos:
         return [(self.names.name(each[2]), self.names.name(each[4]), each[5], each[6]) for each in self._events()]
 
     def refusals(self) -> list[tuple[str, str, int, str, int]]:
-        """Of each event since the last call: route, target, reason, topic and place in the program."""
+        """The route, target, reason, topic and place in the program of each event since the last call."""
         name = self.names.name
         return [(name(each[2]), name(each[4]), each[5], name(each[3]), each[9]) for each in self._events()]
 

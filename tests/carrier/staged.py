@@ -1,4 +1,4 @@
-"""The stage, beside which threads are compared: what it sends, publishes, counts and loses."""
+"""Runs on the stage, to compare with threads: sent, published, counted and lost messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ START = 10**12
 
 
 class Staged:
-    """One run of a program. `left` is what it sent and published, `losses` the route and the target of each loss."""
+    """One run of a program. `left` has the sent and published messages, `losses` the route and target of each loss."""
 
     def __init__(self, program: Program) -> None:
         self.stage = Stage(library(), START)
@@ -22,11 +22,11 @@ class Staged:
         self.losses: list[tuple[str, str]] = []
 
     def ledger(self) -> Ledger:
-        """The counts by now."""
+        """The current counts."""
         return Ledger(self._program, self.stage.counters(len(self._program.counters.fresh_counts())))
 
     def to(self, target: str) -> list[bytes]:
-        """What was sent or published there."""
+        """The messages sent to this endpoint or published on this topic."""
         for record in self.stage.records():
             if isinstance(record, Left):
                 self.left.append(record)

@@ -1,4 +1,4 @@
-"""What it takes for two serializations of one message to be equal."""
+"""Equality of two serializations of one message."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from tests.oracles.reference import Value
 
 
 def assert_same_message(ours: bytes, theirs: bytes, declared: MessageType, value: dict[str, Value]) -> None:
-    """Equal in every byte that means something.
+    """Assert that all significant bytes are equal.
 
-    Fast CDR leaves what lies between values as it finds it, and rclpy hands out a buffer that may be longer
-    than the message: up to four bytes for one without fields, more for one with wide strings.
+    Fast CDR does not write padding bytes, and rclpy returns a buffer that may be longer than the message: up to four
+    bytes for a message without fields, more with wide strings.
     """
     meaningful = [a == b for a, b in zip(cdr(declared, value, 0x00), cdr(declared, value, 0xFF), strict=True)]
     assert len(ours) == len(meaningful)
@@ -24,7 +24,7 @@ def assert_same_message(ours: bytes, theirs: bytes, declared: MessageType, value
 
 
 def same(left: Any, right: Any) -> bool:
-    """Equal, where NaN equals NaN."""
+    """Whether two values are equal, with NaN equal to NaN."""
     if isinstance(left, dict):
         return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
     if isinstance(left, list):
@@ -33,7 +33,7 @@ def same(left: Any, right: Any) -> bool:
 
 
 def without_nul(value: Any) -> Any:
-    """rclpy cuts strings there."""
+    """The text up to the first NUL, where rclpy truncates strings."""
     match value:
         case dict():
             return {name: without_nul(member) for name, member in value.items()}

@@ -1,4 +1,4 @@
-"""The compiler's real path in small: one expression, one mapping, ready to be called."""
+"""The compiler's real path for one expression or one mapping, as a function."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SOURCE = "sensor_board"
 
 
 def written(text: str) -> Expression:
-    """An expression that stands in line 7 of a table, from column 3."""
+    """An expression at line 7, column 3 of a table."""
     span = SourceSpan("table.yaml", 7, 3, 3 + len(text))
     return Expression(text, TextPlace(span, ((0, span),)))
 
@@ -74,7 +74,7 @@ def context_of(
 def compiled(
     expression: str | Expression, scope: Scope, expected: Type | None = None
 ) -> tuple[Node, Callable[[Any], Any]]:
-    """A checked expression, and as a function of the message. Raises ExpressionError."""
+    """A checked expression, and a function that evaluates it for a message. Raises ExpressionError."""
     node = check(written(expression) if isinstance(expression, str) else expression, scope, expected)
     return node, lambda message: _evaluator(node, scope)(message)  # noqa: PLW0108 - most are not run
 
@@ -92,7 +92,7 @@ def _evaluator(node: Node, scope: Scope) -> Callable[[Any], Any]:
 
 
 def _planned(node: Node) -> Leaf | Items | Each:
-    """A field that an expression fills as it is."""
+    """A field that an expression fills without conversion."""
     element = element_of(node.kind)
     if element is None and not isinstance(node.kind, ListKind):
         return Leaf(_type_of(node.kind), node, SPAN)
@@ -123,7 +123,7 @@ def _type_of(kind: Kind) -> Type:
 
 
 def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[[Any], bytes]:
-    """A function from a message to the CDR bytes of the topic that `fields` fills."""
+    """A function from a message to the CDR bytes that `fields` gives."""
     mapping = build(fields, target, scope, SPAN)
     assert mapping.findings == []
     return machine(mapping.plan, scope.message, target, RECEIVED_AT, SOURCE)
@@ -138,7 +138,7 @@ def reference_bytes(fields: FieldMap, target: MessageType, context: Context, pad
 
 
 def outcome(make: Callable[[], Any]) -> Any:
-    """What `make` gives, or the class of the failure: every one that the engine counts is equal here."""
+    """The result of `make`, or the class of its failure. All failures that count as drops are equal here."""
     try:
         return make()
     except FAILURES:

@@ -1,4 +1,4 @@
-"""The rover's own tables, checked once, and small ones for a test."""
+"""The rover's tables, checked once, and small tables for single tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LISTEN = "{here: {address: 127.0.0.1:25000}}"
 ENDPOINTS = "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation}}"
 
 CheckText = Callable[..., Checked]
-"""Takes the text of a table from `routes:` on; `node`, `listen` and `endpoints` as YAML flow mappings."""
+"""Checks the text of a table from `routes:` on; `node`, `listen` and `endpoints` are YAML flow mappings."""
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +47,7 @@ def rover_program(rover: Checked) -> Program:
 
 @pytest.fixture
 def check_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definitions: Definitions) -> CheckText:
-    """Checks a small table, which becomes table.yaml in the working directory."""
+    """Write a small table to table.yaml in the working directory and check it."""
     monkeypatch.chdir(tmp_path)
     linecache.clearcache()
 

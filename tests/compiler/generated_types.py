@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 EACH_TYPE = settings(max_examples=settings().max_examples // 4, suppress_health_check=list(HealthCheck))
-"""For a test of many types, each of which it tries."""
+"""Settings for tests that try many types."""
 
 INTS = [Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)]
 STATE = Enum("State", (("IDLE", 0), ("BUSY", 1), ("BROKEN", 300)))
 
 Pair = tuple[Type, Type]
-"""A ROS type, and a type of which any value fills it, or is refused when it runs."""
+"""A ROS type, and a source type whose values fill it or are refused at run time."""
 
 _numbers = itertools.count()
 
@@ -34,7 +34,7 @@ def message(is_ros: bool, *fields: Field) -> MessageType:
 
 
 def mirror(declared: MessageType) -> MessageType:
-    """A source message with the fields of a ROS message, where a time is a message like others."""
+    """A source message with the fields of a ROS message; a time is an ordinary message."""
     return MessageType(
         declared.name.replace("/", "_"),
         tuple(Field(field.name, _mirrored(field.type)) for field in declared.fields),
@@ -87,12 +87,12 @@ def list_pairs(draw: st.DrawFn, elements: st.SearchStrategy[Pair]) -> Pair:
     length, bound = draw(st.sampled_from([(None, None), (None, 2), (None, 5), (1, None), (3, None)]))
     if target == Int(8, signed=False) and draw(st.booleans()):
         return List(target, length, bound), Bytes()
-    # A length that the source's type says is checked when it is compiled, otherwise when it runs.
+    # A length known from the source's type is checked at compile time, otherwise at run time.
     return List(target, length, bound), List(source, draw(st.sampled_from([None, length])))
 
 
 def _wrapped(pair: Pair) -> st.SearchStrategy[Pair]:
-    """A message of one field on either side is as good as what is in it."""
+    """The type, or a message with one field of this type: both are equivalent."""
     target, source = pair
     return st.sampled_from(
         [
@@ -103,12 +103,12 @@ def _wrapped(pair: Pair) -> st.SearchStrategy[Pair]:
 
 
 _WIDE: st.SearchStrategy[Pair] = st.builds(lambda bound: (String(bound, wide=True), String()), st.none() | st.just(6))
-"""Of a field that nothing fills: expressions do not fill wide strings."""
+"""Types of fields that nothing fills. Expressions do not fill wide strings."""
 
 
 @st.composite
 def message_pairs(draw: st.DrawFn, members: st.SearchStrategy[Pair], *, top: bool = False) -> Pair:
-    """Same-named fields in any order, fields of the target that nothing fills, none at all."""
+    """Two messages: fields of the same name in any order, unfilled fields of the target, or no fields."""
     shared = draw(st.lists(members, min_size=1, max_size=6))
     if not top and draw(st.integers(0, 9)) == 0:
         return message(True), message(False, Field("unused", Bool()))
@@ -123,7 +123,7 @@ def message_pairs(draw: st.DrawFn, members: st.SearchStrategy[Pair], *, top: boo
 
 
 def defaults(declared: Type) -> st.SearchStrategy[Any]:
-    """What a `.msg` file may give as the default value of a field; None for nothing."""
+    """A default value that a `.msg` file can give to a field; None for no default."""
     if isinstance(declared, MessageType) or (isinstance(declared, List) and isinstance(declared.element, MessageType)):
         return st.none()
     if isinstance(declared, String) and not declared.wide:
@@ -132,7 +132,7 @@ def defaults(declared: Type) -> st.SearchStrategy[Any]:
 
 
 def pairs(depth: int = 2) -> st.SearchStrategy[Pair]:
-    """Messages of messages, `depth` deep."""
+    """Nested messages up to this depth."""
     members: st.SearchStrategy[Pair] = scalar_pairs() | list_pairs(scalar_pairs()) | scalar_pairs().flatmap(_wrapped)
     for _ in range(depth):
         inner = message_pairs(members)
@@ -142,7 +142,7 @@ def pairs(depth: int = 2) -> st.SearchStrategy[Pair]:
 
 @st.composite
 def payload_sources(draw: st.DrawFn, payload: MessageType, depth: int = 2) -> MessageType:
-    """A message with some of the fields of a payload, one of each oneof, and all that it requires."""
+    """A message with some fields of a payload: all required ones, and one of each oneof."""
     fields = [field for field in payload.fields if depth or not isinstance(_innermost(field.type), MessageType)]
     chosen = draw(st.lists(st.sampled_from(fields), min_size=1, unique=True)) if fields else []
     one_each = {field.oneof or field.name: field for field in chosen}
@@ -158,7 +158,7 @@ def _innermost(declared: Type) -> Type:
 
 
 def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
-    """Types of which any value fills a field of a payload, or is refused when it runs."""
+    """Types whose values fill a field of a payload or are refused at run time."""
     match target:
         case Int():
             return st.sampled_from([*_wider(target), STATE])
@@ -179,7 +179,7 @@ def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
             return st.just(target)
 
 
-@cache  # Hypothesis checks each new strategy, which takes longer than to draw from it
+@cache  # Hypothesis checks each new strategy, which takes longer than drawing from it
 def values(declared: Type) -> st.SearchStrategy[Any]:
     """Python values of a type; messages are namespaces."""
     match declared:
@@ -188,7 +188,7 @@ def values(declared: Type) -> st.SearchStrategy[Any]:
         case Int():
             return st.integers(declared.low, declared.high) | st.sampled_from([declared.low, declared.high])
         case Float():
-            # One NaN: JSON, which carries values to another process, does not tell them apart.
+            # One NaN only: JSON, which carries values to another process, does not distinguish NaNs.
             return st.floats(width=declared.bits, allow_nan=False) | st.just(math.nan)  # type: ignore[arg-type]
         case String():
             return st.text(st.characters(exclude_categories=["Cs"]), max_size=declared.bound or 8)

@@ -1,6 +1,6 @@
-"""A ROS interface package made of nasty messages, built for the tests and kept beside the environment.
+"""A ROS interface package of unusual messages, built for the tests and cached beside the environment.
 
-It is loaded by another process only: this one's loader has read its search path already.
+Only another process can load it, because the loader of this one has already read its search path.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _ONLY_NEEDED = ROOT / "deploy" / "interfaces.cmake"
 
 
 class InterfacePackage:
-    """The built package, and a process that has loaded it."""
+    """The built package, and a process that has loaded its types."""
 
     def __init__(self, install: Path) -> None:
         self.share = install / "share"
@@ -82,7 +82,7 @@ class InterfacePackage:
         )  # fmt: skip
 
     def ask(self, name: str, value: object, data: bytes) -> tuple[bytes, dict[str, Any]]:
-        """What rclpy makes of a value, and what it reads in our bytes."""
+        """rclpy's serialization of a value, and the value that rclpy reads from our bytes."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([f"{NAME}/msg/{name}", value, data.hex()]) + "\n")
@@ -101,7 +101,7 @@ def is_buildable() -> bool:
 
 
 def built() -> Path:
-    """The installation; made when these messages have not been built here before, which takes about 15 s."""
+    """The installation. The first build of these messages takes about 15 s."""
     made_from = f"{sys.version}{MESSAGES}{_PACKAGE}{_CMAKE}{_ONLY_NEEDED.read_text()}"
     key = hashlib.sha256(made_from.encode()).hexdigest()[:12]
     folder = Path(sys.prefix, "build", f"{NAME}-{key}")
@@ -144,7 +144,7 @@ def _prefixes() -> list[Path]:
 
 
 def environment(*installs: Path) -> dict[str, str]:
-    """What a ROS set-up script would set, for wheels as for an installed ROS."""
+    """The variables that a ROS set-up script would set, for wheels and for an installed ROS."""
     prefixes = [*installs, *_prefixes()]
     site_packages = f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
     libraries = [prefix / "lib" for prefix in prefixes]

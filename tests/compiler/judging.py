@@ -1,8 +1,8 @@
-"""The judge of the language: random mappings, what the oracle makes of random messages, and what a plane makes of them.
+"""The judge of the language: random mappings and messages, with the results of the oracle and of a plane compared.
 
-A question is a mapping with a condition, from a payload to a ROS message or the other way, or a condition for a payload
-that is forwarded. A plane answers with bytes, FILTERED, or the reason of a refusal; with `for_each`, so for each
-element. The oracle gives what it may answer. A message is bytes, or the payloads of a frame.
+A question is a mapping with a condition, from a payload to a ROS message or in the other direction, or a condition for
+forwarding a payload. A plane answers with bytes, FILTERED, or the reason of a refusal; with `for_each`, once per
+element. The oracle gives the permitted answers. A message is bytes, or the payloads of a frame.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FILTERED = "filtered"
 Answer = Union[bytes, str]
 Sent = Union[bytes, tuple[bytes, ...]]
 Plane = Callable[["Question"], Callable[[Any], "list[Answer]"]]
-"""Makes a function of the messages of a question. Raises Misfit for one that the compiler refuses."""
+"""Makes a function of the messages of a question. Raises Misfit if the compiler refuses the question."""
 
 _ABOUT_VALUES = {
     Code.TOO_LARGE,
@@ -56,12 +56,12 @@ _ABOUT_LENGTHS = ("elements", "length", "nan equals nothing", "no field can hold
 
 
 def is_about_values(finding: Diagnostic) -> bool:
-    """Whether a well-typed question can have this finding: about ranges, lengths, sizes, NaN, names of an enum."""
+    """Whether a well-typed question can have this finding, about ranges, lengths, sizes, NaN or names of an enum."""
     return finding.code in _ABOUT_VALUES or any(word in finding.message for word in _ABOUT_LENGTHS)
 
 
 class Misfit(Exception):
-    """What the compiler finds wrong with a question."""
+    """The compiler's findings about a question."""
 
     def __init__(self, findings: Collection[Diagnostic]) -> None:
         super().__init__(*findings)
@@ -93,7 +93,7 @@ class Question:
     fields: FieldMap
     when: Expression | None
     target: MessageType | None
-    """None: the payload is forwarded."""
+    """None if the payload is forwarded."""
 
     @property
     def for_each(self) -> Expression | None:
@@ -105,7 +105,7 @@ class Question:
 
     @property
     def case(self) -> PayloadCase:
-        """That a message from ROS fills."""
+        """The payload case that a message from ROS fills."""
         return language_wire()[1].cases["target"]
 
     @property
@@ -162,11 +162,11 @@ def question(noise: random.Random, language: Language) -> Question:
     return Question(language, FieldMap(SPAN, False, tuple(entries)), when, target)
 
 
-# ---- messages, each with what the oracle sees of it
+# ---- messages
 
 
 def messages(noise: random.Random, language: Language) -> Iterator[tuple[Sent, View]]:
-    """Of a frame, what the oracle sees of its first payload."""
+    """Random messages, each with the oracle's view of it, or of the first payload of a frame."""
     if language.is_ros:
         for _ in range(10):
             value = ros_message(noise, language.source)
@@ -188,7 +188,7 @@ def _view(payload: bytes) -> View:
 
 
 def _numbered(payload: bytes, count: int, place: int) -> bytes:
-    """With the fields `from` and `in`, by which a plane may make frames."""
+    """The payload with the fields `from` and `in`, which a plane can use to make frames."""
     made: Any = language_wire()[1].cases["source"].message_class()
     setattr(made, "from", count)
     setattr(made, "in", place)
@@ -201,7 +201,7 @@ def _numbered(payload: bytes, count: int, place: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What an answer may be: one message, which `read` makes a tree of values, or why there is none."""
+    """A permitted answer: one message, which `read` converts to a tree of values, or the reasons why there is none."""
 
     message: bytes | None
     reasons: frozenset[str] = frozenset()
@@ -216,7 +216,7 @@ class Verdict:
         return self.message.hex() if self.message is not None else "|".join(sorted(self.reasons))
 
     def _is_same(self, answer: bytes) -> bool:
-        """Whether it is equal but for the bits of a NaN, and for the entries of a map that others replace."""
+        """Whether two trees are equal, ignoring the bits of NaNs and map entries that later ones replace."""
         assert self.message is not None
         if self.read is None:
             return False
@@ -228,7 +228,7 @@ class Verdict:
 
 
 def oracle(asked: Question) -> Callable[[Sent, View], list[Verdict]]:
-    """What may be answered for a message, which the question is about. The compiler has accepted it."""
+    """The permitted answers for a message. The compiler has accepted the question."""
 
     def judge(message: Sent, view: View) -> list[Verdict]:
         context = context_of(view.message, view.type, asked.enums)
@@ -268,7 +268,7 @@ def _verdict(asked: Question, message: Sent, context: Context) -> Verdict:
 
 
 def verdict(make: Callable[[], Verdict], when: Expression | None, context: Context) -> Verdict:
-    """What `make` returns, unless the condition filters or something refuses."""
+    """The result of `make`, unless the condition filters the message or a value is refused."""
     try:
         if when and not meaning_of(when, context).give(context):
             return Verdict(None, frozenset([FILTERED]))
@@ -291,7 +291,7 @@ def sent(wire: Wire, case: PayloadCase, fields: FieldMap, context: Context) -> V
 
 
 class _Map(dict[Any, Any]):
-    """A map of protobuf."""
+    """A protobuf map."""
 
 
 def _has_map(tree: Any) -> bool:
@@ -300,7 +300,7 @@ def _has_map(tree: Any) -> bool:
 
 
 def _listed(value: Any) -> Any:
-    """Of protobuf's objects: dictionaries and lists."""
+    """Protobuf objects as dictionaries and lists."""
     if hasattr(value, "ListFields"):
         return {field.name: _listed(inner) for field, inner in value.ListFields()}
     if hasattr(value, "items"):
@@ -312,9 +312,9 @@ def _listed(value: Any) -> Any:
 
 
 def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | None:
-    """What a plane answers otherwise than it may, with the first message for which it does; None for nothing.
+    """The first forbidden answer of a plane, with its message; None if all answers are permitted.
 
-    Raises Misfit for a question that the compiler refuses.
+    Raises Misfit if the compiler refuses the question.
     """
     serve, judge = plane(asked), oracle(asked)
     for message, view in messages(noise, asked.language):
@@ -332,7 +332,7 @@ def disagreement(asked: Question, plane: Plane, noise: random.Random) -> str | N
 
 
 def judged_findings(asked: Question, plane: Plane, noise: random.Random) -> Collection[Diagnostic]:
-    """What the compiler refuses a question for; of one that it accepts, asserts that the plane's answers are right."""
+    """The compiler's findings if it refuses the question; otherwise assert that the plane's answers are right."""
     try:
         assert disagreement(asked, plane, noise) is None
     except Misfit as misfit:

@@ -1,7 +1,7 @@
-"""Expressions and messages at random, for the judge of the language (`judging`).
+"""Random expressions and messages for the judge of the language (`judging`).
 
-Expressions are well-typed but for what depends on ranges and lengths, which the compiler may refuse. Everything is
-drawn from a `random.Random`, since a script tries millions of them.
+Expressions are well-typed except for ranges and lengths, which the compiler may refuse. Everything is drawn from a
+`random.Random`, because a script tries millions of them.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _OTHER_FIELDS = (
     Field("wide", String(wide=True)), Field("wides", List(String(wide=True))), Field("byte", U8),
     Field("none", MessageType("made/msg/None")), Field("deep", List(DEEP)),
 )  # fmt: skip
-"""Which no expression reads."""
+"""Fields that no expression reads."""
 
 ORDERS = 40
 
 
 @cache
 def ros_source(order: int) -> MessageType:
-    """A ROS message with a field of each kind, and some others, in one of many orders."""
+    """A ROS message with a field of each kind and some others, in random order."""
     noise = random.Random(order)
     fields = [*_ROS_FIELDS, *noise.sample(_OTHER_FIELDS, noise.randrange(len(_OTHER_FIELDS) + 1))]
     return MessageType("made/msg/Source", tuple(noise.sample(fields, len(fields))))
@@ -166,7 +166,7 @@ ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
     "f64x3": {"f": ("item",)}, "u64s * 2": {"i": ("item",)}, "radians(f32s)": {"f": ("item",)},
     "[i32, u64]": {"i": ("item",)}, "i16x3 if flag else few": {"i": ("item",)},
 }  # fmt: skip
-"""Lists for `for_each`, and what expressions see of their elements."""
+"""Lists for `for_each`, and the fields of their elements in expressions."""
 
 FRAME: Mapping[str, Sequence[str]] = {
     "i": ("items[0].i32", "items[1].u64", "items[2].inner.value", "items[0].inners[1].value", "items[1].grade", "count",
@@ -180,7 +180,7 @@ FRAME: Mapping[str, Sequence[str]] = {
     "B": ("items[1].flags",),
     "S": ("items[1].names", "str(items[0].grades)"),
 }  # fmt: skip
-"""What expressions see of the payloads of a frame, beside the fields of the first one."""
+"""The names for the payloads of a frame in expressions, in addition to the fields of the first one."""
 
 _INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
              1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
@@ -189,10 +189,10 @@ _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """A source message, and expressions over it. With `is_wild`, some are of another kind than is wanted.
+    """A source message, and expressions over it. With `is_wild`, some expressions have the wrong kind.
 
-    `for_each` is one of ITEMS, or empty. `order` is that of the fields of a ROS message. `is_frame`: several payloads
-    are one message.
+    `for_each` is one of ITEMS, or empty. `order` is the order of the fields of a ROS message. `is_frame`: several
+    payloads are one message.
     """
 
     is_ros: bool
@@ -232,7 +232,7 @@ class Language:
         return noise.choice(known)
 
     def filled(self, noise: random.Random, target: Type) -> Expression:
-        """An expression that fills a field, or is refused for its range or length."""
+        """An expression that fills a field, or that is refused for its range or length."""
         if noise.randrange(12) == 0 and not isinstance(_innermost(target), MessageType):
             return self._choices(noise, target)
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
@@ -260,7 +260,7 @@ class Language:
 
 
 def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
-    """From UDP, one by one or as a frame, from ROS, or from ROS for each element of a list."""
+    """A language over datagrams, frames, ROS messages, or the elements of a list in a ROS message."""
     is_ros, has_more = noise.randrange(2) == 1, noise.randrange(3) == 0
     for_each = noise.choice([*ITEMS]) if is_ros and has_more else ""
     return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS), is_frame=has_more and not is_ros)
@@ -271,7 +271,7 @@ def _bracketed(number: int) -> str:
 
 
 def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
-    """Templates of what fills a type."""
+    """Templates of expressions that fill a type."""
     match target:
         case Bool():
             return ("{b}",)
@@ -297,7 +297,7 @@ def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
 
 
 def _of_frames(target: Type) -> Sequence[str]:
-    """Templates of what fills a type, in the topics of a frame."""
+    """Templates of expressions that fill a type in the topics of a frame."""
     match target:
         case MessageType() if target == PART:
             return ("items[1]", "message", "items[0]")
@@ -336,13 +336,13 @@ PART = MessageType(
     (Field("flag", Bool()), Field("i32", I32), Field("name", String()), Field("f64", F64), Field("inner", INNER),
      Field("i64s", List(I64)), Field("inners", List(INNER)), Field("names", List(String())), Field("is", Bool())),
 )  # fmt: skip
-"""What a payload of a frame can fill as a whole."""
+"""Messages that a payload of a frame can fill as a whole."""
 
 _PARTS: Sequence[Type] = (PART, List(PART), List(PART), List(PART, 2), List(PART, None, 2))
 
 
 def ros_target(noise: random.Random, *, is_frame: bool = False) -> MessageType:
-    """One to three fields, and one in front of them that shifts what is aligned."""
+    """One to three fields, behind one that shifts their alignment."""
     kinds = (_SCALARS, _LISTS, *([_PARTS] if is_frame else ()))
     types = [noise.choice(noise.choice(kinds)) for _ in range(noise.choice((1, 1, 2, 3)))]
     return MessageType(
@@ -398,7 +398,7 @@ def ros_value(noise: random.Random, declared: Type) -> Any:
 
 
 class _NotUtf8(str):
-    """Text that is written as other bytes."""
+    """Text that is encoded as other bytes."""
 
     __slots__ = ("octets",)
 

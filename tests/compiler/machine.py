@@ -1,4 +1,4 @@
-"""Plans run by the machine in C, on payloads of any type: what fills a message, of objects with its fields."""
+"""Runs plans on the machine in C, for payloads of any type, made from objects with their fields."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import Delivering, delivering
 
 FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
-"""What a message without a result raises here, and by the oracle."""
+"""Exceptions for a message without a result, here and in the oracle."""
 
 _ROUTE = "route"
 _OF: dict[type, Callable[[Any], int]] = {
@@ -48,7 +48,7 @@ _OF: dict[type, Callable[[Any], int]] = {
 def machine(
     plan: Record, source: MessageType, target: MessageType, received_at: int, sender: str
 ) -> Callable[[Any], bytes]:
-    """A function from a message to the bytes that the plan makes of it. It raises one of FAILURES if there are none."""
+    """A function from a message to the bytes that the plan gives. It raises one of FAILURES if there are none."""
     case = payload_of(source)
     span = SourceSpan("table.yaml", 7, 3, 9)
     checked = CheckedTarget(Topic(Located("topic", span), span), type=target, plan=plan)
@@ -70,7 +70,7 @@ def machine(
 
 @cache
 def functions() -> ctypes.CDLL:
-    """The functions by which tests deliver messages on the machine in C."""
+    """The functions with which tests deliver messages on the machine in C."""
     folder = Path(mkdtemp())
     library = LIBRARY if is_current() else build(folder / LIBRARY.name)
     return delivering(folder / "delivering.so", library, is_sanitized=False)
@@ -80,7 +80,7 @@ def functions() -> ctypes.CDLL:
 
 
 def payload_of(source: MessageType) -> PayloadCase:
-    """A payload with the fields of a type. Its integers are as wide as protobuf has them."""
+    """A payload with the fields of a type. Its integers have protobuf's widths."""
     file = FileDescriptorProto(name="made.proto", package="made", syntax="proto2")
     names: list[tuple[MessageType, str]] = []
     payload = _declare(source, file, names)
@@ -107,7 +107,7 @@ def _declare(declared: MessageType, file: FileDescriptorProto, names: list[tuple
 
 
 def _fill(payload: Any, declared: MessageType, value: Any) -> None:
-    """A field that the value does not have is left out."""
+    """Fill a payload; fields that the value lacks are left out."""
     for field in declared.fields:
         given = getattr(value, field.name, None)
         if given is None:

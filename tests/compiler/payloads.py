@@ -1,4 +1,4 @@
-"""Payloads of every kind of field (`protos/made`), and mappings that make envelopes of them."""
+"""Payloads with fields of every kind (`protos/made`), and mappings to envelopes."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ def rover_wire() -> Wire:
 
 
 def wire_of(root: Path, name: str) -> Wire:
-    """The definitions in a folder, with an envelope whose oneof is `payload`."""
+    """The definitions in a folder; the envelope's oneof is `payload`."""
     schema = load_protos(Located(root, SPAN), Located(name, SPAN))
     return schema, find_envelope(schema, Located("payload", SPAN))
 
 
 def compiled_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
-    """What the machine in C makes of a mapping without findings, of a message that comes from ROS."""
+    """The envelope that the machine in C makes from a ROS message, with a mapping without findings."""
     received = as_ros(source)
     made = machine_envelope(wire, case, fields, received)
     return lambda message: made(cdr(received, as_values(received, message)))
 
 
 def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> Callable[[bytes], bytes]:
-    """The same, of messages in CDR. `source` is a type that ROS has."""
+    """The same for messages in CDR. `source` is a type that ROS can express."""
     schema, _ = wire
     mapping = build(fields, case.type, Scope(source, tuple(schema.enums.values()), ()), SPAN)
     assert mapping.findings == []
@@ -75,7 +75,7 @@ def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: Me
 
 
 def as_ros(declared: Type) -> Any:
-    """A type that ROS has, whose values fill the same fields."""
+    """A type that ROS can express and whose values fill the same fields."""
     match declared:
         case Bytes():
             return List(Int(8, signed=False))
@@ -91,7 +91,7 @@ def as_ros(declared: Type) -> Any:
 
 
 def _exists_in_ros(declared: Type) -> bool:
-    """There are no lists of lists, and messages with nothing else in them have nothing in common with others."""
+    """Whether ROS can express the type. It has no lists of lists, nor messages made only of them."""
     match declared:
         case List():
             return not isinstance(declared.element, (Bytes, List)) and _exists_in_ros(declared.element)
@@ -102,7 +102,7 @@ def _exists_in_ros(declared: Type) -> bool:
 
 
 def as_values(declared: MessageType, message: Any) -> dict[str, Any]:
-    """A message by the names of its fields, in it as well."""
+    """A message as nested dictionaries by field name."""
     return {field.name: _value(field.type, getattr(message, field.name)) for field in declared.fields}
 
 
@@ -117,7 +117,7 @@ def _value(declared: Type, value: Any) -> Any:
 
 
 def reference_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
-    """What the oracle makes of it."""
+    """The oracle's envelope."""
     schema, envelope = wire
     enums = tuple(schema.enums.values())
 
@@ -129,9 +129,9 @@ def reference_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: 
 
 
 def made(case: str, fields: FieldMap, /, **given: tuple[Type, Any]) -> Any:
-    """The payload of `made_wire` that a mapping makes of a message with these fields.
+    """The payload of `made_wire` that a mapping makes from a message with these fields.
 
-    That it is the oracle's, in the envelope as protobuf serialises it, is seen to.
+    Asserts that the oracle gives the same payload, in an envelope as protobuf serializes it.
     """
     wire = made_wire()
     declared = wire[1].cases[case]
@@ -146,7 +146,7 @@ def made(case: str, fields: FieldMap, /, **given: tuple[Type, Any]) -> Any:
 
 
 def assert_same_bytes(wire: Wire, found: bytes, expected: bytes) -> None:
-    """Assert that two envelopes are equal, but for the entries of a map: in any order, of a key the last counts."""
+    """Assert that two envelopes are equal. Map entries may have any order, and the last entry of a key counts."""
     payload = wire[1].message_class.FromString(expected)
     if any(isinstance(value, Mapping) for _, case in payload.ListFields() for _, value in case.ListFields()):
         found, expected = (

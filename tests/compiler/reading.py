@@ -1,4 +1,4 @@
-"""ROS messages to be read, and what is read of them in a form that compares."""
+"""ROS messages to read, and their values in a comparable form."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ TIMES = tuple(
     for name in sorted(TIME_TYPES)
 )
 _NAMES = ["from", "in", "is", "class", "count", "index", "a", "a_b", "b", "b_c", "c", "item", "length", "at", "header"]
-"""Of fields. Some are Python's, some methods of tuples, some run together when they are put side by side."""
+"""Names of fields: Python keywords, methods of tuples, and names that become ambiguous when joined."""
 
 
 def plain(value: Any, declared: Type) -> Any:
-    """A value as dictionaries and lists, whether it is ours or of whom else messages are objects with attributes."""
+    """A value as dictionaries and lists, from our own form or from message objects with attributes."""
     match declared:
         case MessageType() if declared.name in TIME_TYPES:
             return value if isinstance(value, int) else value.sec * 10**9 + value.nanosec
@@ -34,7 +34,7 @@ def plain(value: Any, declared: Type) -> Any:
 
 
 def field_values(value: Any, declared: Type) -> Any:
-    """The same as what the reference takes for writing, where a time is a message as others are."""
+    """The same as input of the reference writer, in which a time is an ordinary message."""
     match declared:
         case MessageType():
             return {field.name: field_values(getattr(value, field.name), field.type) for field in declared.fields}
@@ -67,7 +67,7 @@ def _message(draw: st.DrawFn, members: st.SearchStrategy[Type], smallest: int) -
 
 
 def messages(depth: int = 2) -> st.SearchStrategy[MessageType]:
-    """ROS messages of messages, `depth` deep."""
+    """Nested ROS messages up to this depth."""
     members: st.SearchStrategy[Type] = _scalars | st.sampled_from(TIMES)
     members = members | _lists(members)
     for _ in range(depth):

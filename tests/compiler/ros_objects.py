@@ -1,6 +1,6 @@
 """rclpy's message objects from plain values and back, and their bytes. Imports nothing of ours.
 
-As a program it answers one JSON request a line, for interfaces that only another process can load.
+As a program it answers one JSON request per line, for interfaces that only another process can load.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def message_class(name: str) -> Any:
 
 
 def to_object(cls: Any, value: dict[str, Any]) -> Any:
-    """A message whose fields are `value`; a field that `value` lacks keeps what the constructor gives it."""
+    """A message with the fields in `value`; other fields keep the constructor's defaults."""
     made = cls()
     for name, index in zip(cls.get_fields_and_field_types(), cls.SLOT_TYPES, strict=True):
         if name in value:

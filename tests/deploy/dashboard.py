@@ -18,7 +18,7 @@ def dashboard() -> Json:
 
 
 def panels(row: str | None = None) -> Iterator[Json]:
-    """All panels that show something, or those of one row. The panels of an open row follow it."""
+    """All panels with data, or those of one row. The panels of an open row follow it."""
     title = ""
     for panel in dashboard()["panels"]:
         if panel["type"] == "row":

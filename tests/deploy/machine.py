@@ -1,7 +1,7 @@
-"""A small machine of its own: a real systemd as process 1, in namespaces, over a copy-on-write view of this computer.
+"""A test machine: a real systemd as process 1, in namespaces, over a copy-on-write view of this computer.
 
-What is installed there is gone with it. Needs root, overlayfs and a systemd; where one is missing, tests skip. On a
-computer that tests/platforms/boot.sh booted, it is that computer.
+Changes are lost when it ends. Needs root, overlayfs and systemd; without them, tests are skipped. On a computer that
+tests/platforms/boot.sh has booted, the machine is that computer itself.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ mount --rbind /dev dev
 for folder in "${@:2}"; do mount -t tmpfs -o mode=1777 tmpfs $folder; done
 chmod 755 run var/lib/systemd
 ip link set lo up
-# Of what this computer starts at boot, nothing.
+# Start nothing that this computer starts at boot.
 rm -rf etc/systemd/system etc/systemd/journald.conf.d
-: > etc/machine-id  # without the file it would be the first boot, which enables what was just removed
+: > etc/machine-id  # without the file, systemd would take this for the first boot and enable the removed units
 mkdir -p etc/systemd/system etc/systemd/journald.conf.d
 printf '[Journal]\nStorage=volatile\nReadKMsg=no\nAudit=no\n' > etc/systemd/journald.conf.d/test.conf
 cd etc/systemd/system
@@ -58,7 +58,7 @@ exec /usr/lib/systemd/systemd --system --log-target=journal --show-status=0
 
 
 class Machine:
-    """`run` runs a command there, as root."""
+    """A running test machine. `run` runs a command in it, as root."""
 
     def __init__(self, enter: Sequence[str] = ()) -> None:
         self._enter = enter
@@ -90,7 +90,7 @@ class Machine:
         return self.run("systemctl", "show", "--property", name, "--value", unit).stdout.strip()
 
     def environment(self, unit: str = "rover-router") -> set[str]:
-        """Of the unit's main process, as NAME=VALUE."""
+        """The environment of the unit's main process, as NAME=VALUE."""
         return set(self.run("cat", f"/proc/{self.show('MainPID', unit)}/environ").stdout.split("\0"))
 
     def wait_for(self, script: str) -> None:
@@ -101,12 +101,12 @@ class Machine:
 
 
 def hidden_by(folder: Path) -> Path | None:
-    """The folder of the machine's own in whose place that one is here."""
+    """The machine's own folder that hides this one, if any."""
     return next((own for own in OWN if folder.is_relative_to(own)), None)
 
 
 def why_not() -> str | None:
-    """What keeps this computer from running a machine within it."""
+    """Why this computer cannot run such a machine; None if it can."""
     if os.geteuid() != 0:
         return "needs root"
     for tool in ("unshare", "nsenter", "pivot_root", "ip", "systemctl"):
@@ -126,7 +126,7 @@ def _cgroups() -> Path | None:
 
 @contextmanager
 def machine(base: Path) -> Iterator[Machine]:
-    """Booted; `base` is an empty folder."""
+    """A booted machine; `base` is an empty folder."""
     if "BOOTED" in os.environ:
         yield Machine()
         return
@@ -147,7 +147,7 @@ def machine(base: Path) -> Iterator[Machine]:
     try:
         yield _booted(booting)
     finally:
-        booting.kill()  # and with it, by --kill-child, everything in there
+        booting.kill()  # --kill-child ends everything in the namespaces with it
         booting.communicate()
         _remove(own)
 
@@ -168,7 +168,7 @@ def _booted(booting: subprocess.Popen[str]) -> Machine:
 
 
 def _remove(cgroup: Path) -> None:
-    """Those below it first. The kernel needs a moment to see the last process gone."""
+    """Remove a cgroup, its children first. The kernel takes a moment to notice that the last process has exited."""
     deadline = monotonic() + PATIENCE
     for folder in sorted(cgroup.rglob("*/"), key=lambda each: -len(each.parts)):
         if folder.is_dir():

@@ -1,4 +1,4 @@
-"""The real Prometheus with what deploy/prometheus has, beside a router of a test."""
+"""A real Prometheus with the files of deploy/prometheus, scraping a test's router."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.ports import free_port
 
 PROGRAM = shutil.which("prometheus")
 SCRAPED = "127.0.0.1:9108"
-"""Whom prometheus.yml scrapes."""
+"""The targets in prometheus.yml."""
 
 
 class PrometheusServer:
-    """Scrapes `router` twice a second; keeps everything in `folder`."""
+    """Scrapes `router` twice a second and stores its data in `folder`."""
 
     def __init__(self, folder: Path, router: str) -> None:
         assert PROGRAM
@@ -54,10 +54,10 @@ class PrometheusServer:
         self._process.wait(PATIENCE)
 
     def query(self, expression: str) -> list[dict[str, Any]]:
-        """The series that an expression gives at the newest scrape, each with `metric` (labels) and `value`.
+        """The result of an expression at the newest scrape: series with `metric` (labels) and `value`.
 
-        Where the router was too busy to answer the last scrape in time, it is the next: after one that failed there is
-        no series of a router.
+        If the router was too busy to answer the last scrape, waits for the next one, because after a failed scrape a
+        router has no series.
         """
         scrape: list[dict[str, Any]] = []
 
@@ -69,7 +69,7 @@ class PrometheusServer:
         return self._at(expression, scrape[0]["value"][1])
 
     def firing(self, alert: str) -> list[Mapping[str, str]]:
-        """The labels with which an alert fires now."""
+        """The label sets with which an alert is firing."""
         alerts = self._get("alerts")["alerts"]
         return [each["labels"] for each in alerts if each["labels"]["alertname"] == alert and each["state"] == "firing"]
 

@@ -1,4 +1,4 @@
-"""Which series an expression of PromQL asks for: enough of its grammar to find selectors, and to refuse the rest."""
+"""Finds the series selectors in a PromQL expression. Parses only the necessary grammar and refuses the rest."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ _MATCHES: Mapping[str, Callable[[str, str], bool]] = {
 
 
 class NotUnderstoodError(Exception):
-    """This reader does not know enough of PromQL."""
+    """The expression uses PromQL that this parser does not support."""
 
 
 @dataclass(frozen=True)
 class Selector:
-    """`router_unhandled_total{payload_case="imu_info"}`: a metric and what its labels must be."""
+    """`router_unhandled_total{payload_case="imu_info"}`: a metric and conditions for its labels."""
 
     metric: str
     matchers: tuple[tuple[str, str, str], ...] = ()
 
     def selects(self, metric: str, labels: Mapping[str, str], added: Iterable[str] = ("instance", "job")) -> bool:
-        """Whether it is this series, before Prometheus added labels of its own."""
+        """Whether the selector matches this series, before Prometheus adds its own labels."""
         return metric == self.metric and all(
             _MATCHES[sign](value, labels.get(label, "")) for label, sign, value in self.matchers if label not in added
         )
 
 
 def selectors(expression: str) -> list[Selector]:
-    """All that an expression asks for. Raises NotUnderstoodError."""
+    """All selectors of an expression. Raises NotUnderstoodError."""
     tokens = list(_tokens(expression))
     found, index = [], 0
     while index < len(tokens):
@@ -65,7 +65,7 @@ def selectors(expression: str) -> list[Selector]:
 
 
 def grouping_labels(expression: str) -> set[str]:
-    """The labels in `by (...)`, `on (...)` and the like, wherever they stand."""
+    """All labels in `by (...)`, `on (...)` and similar clauses."""
     tokens, found = list(_tokens(expression)), set()
     for index, (_, text) in enumerate(tokens):
         if text in _LABEL_LISTS:

@@ -1,7 +1,7 @@
-"""Checks of a page in the headless browser: contrast, names of controls, sizes, and what does not fit.
+"""Checks of a page in the headless browser: contrast, names of controls, sizes, and overflow.
 
-Each check returns what it found, one string for each problem; an empty list is good. They look at what is shown now:
-open what is folded, and choose size and theme (`show_at`), before.
+Each check returns one string per problem. Checks see only what is visible: unfold sections, and choose size and theme
+(`show_at`), before.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CONTRAST, CONTRAST_OF_LARGE = 4.5, 3.0
 SMALLEST_TEXT = 11.0
 """CSS pixels."""
 SMALLEST_TARGET = 24.0
-"""CSS pixels; WCAG 2.2 AA, 2.5.8. A smaller target is good where a circle of this size has it for itself."""
+"""CSS pixels; WCAG 2.2 AA, 2.5.8. A smaller target is allowed if a circle of this size contains no other target."""
 
 _CHECKS = Path(__file__).with_suffix(".js").read_text(encoding="utf-8").partition("*/")[2].strip()
 _CONTROLS = (
@@ -36,7 +36,7 @@ _NAMED_ROLES = {
 
 
 def show_at(page: Page, size: tuple[int, int], theme: str | None = None) -> None:
-    """Show the page on a screen of this size, as a phone where it is narrow, `dark` or `light`."""
+    """Show the page on a screen of this size, as a phone if it is narrow, `dark` or `light`."""
     width, height = size
     page.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500)
     if theme is not None:
@@ -45,12 +45,12 @@ def show_at(page: Page, size: tuple[int, int], theme: str | None = None) -> None
 
 
 def contrast_problems(page: Page) -> list[str]:
-    """Texts that stand out too little from their ground; disabled controls are exempt."""
+    """Texts with too little contrast to their background; disabled controls are exempt."""
     return _found(page, "contrast", OF_TEXT=CONTRAST, OF_LARGE=CONTRAST_OF_LARGE)
 
 
 def unnamed_controls(page: Page) -> list[str]:
-    """Controls and pictures for which a screen reader has no name, as the browser computes names."""
+    """Controls and pictures without an accessible name, as computed by the browser."""
     page.call("Accessibility.enable")
     try:
         tree = page.call("Accessibility.getFullAXTree")["nodes"]
@@ -60,12 +60,12 @@ def unnamed_controls(page: Page) -> list[str]:
 
 
 def overflows(page: Page) -> list[str]:
-    """What reaches beyond the left or right of the screen, so that the page scrolls sideways."""
+    """Elements that extend beyond the left or right edge, so that the page scrolls sideways."""
     return _found(page, "overflows")
 
 
 def cut_texts(page: Page) -> list[str]:
-    """Texts that are wider than the element which cuts them off."""
+    """Texts that are cut off by their element."""
     return _found(page, "cut")
 
 
@@ -74,17 +74,17 @@ def small_texts(page: Page, least: float = SMALLEST_TEXT) -> list[str]:
 
 
 def small_targets(page: Page, least: float = SMALLEST_TARGET) -> list[str]:
-    """Controls that are too small to be hit; links within a text are exempt."""
+    """Controls that are too small to hit; links within a text are exempt."""
     return _found(page, "smallTargets", LEAST=least)
 
 
 def hidden_focus(page: Page) -> list[str]:
-    """Controls that do not take the focus of the keyboard, or do not show that they have it."""
+    """Controls that do not take the keyboard focus, or do not show it."""
     return _found(page, "focus")
 
 
 def problems(page: Page) -> list[str]:
-    """What all checks find."""
+    """The problems found by all checks."""
     checks = (contrast_problems, unnamed_controls, overflows, small_texts, small_targets, hidden_focus)
     return [f"{check.__name__}: {found}" for check in checks for found in check(page)]
 

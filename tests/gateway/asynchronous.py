@@ -1,4 +1,4 @@
-"""Tests that are coroutines, each with an event loop of its own."""
+"""Tests that are coroutines, each with a new event loop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PATIENCE_SECONDS = 20.0
 
 
 def asynchronous(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """Have pytest run a coroutine; it fails when it takes too long."""
+    """Make pytest run a coroutine; it fails on a timeout."""
 
     @functools.wraps(test)
     def run(*arguments: P.args, **settings: P.kwargs) -> None:
@@ -23,7 +23,7 @@ def asynchronous(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, No
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Wait until it holds."""
+    """Wait until the condition holds."""
     deadline = asyncio.get_running_loop().time() + PATIENCE_SECONDS
     while not condition():
         assert asyncio.get_running_loop().time() < deadline, "it never happened"

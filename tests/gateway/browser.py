@@ -1,4 +1,4 @@
-"""Headless Chromium over the DevTools protocol, as far as the tests of the gateway's page need it."""
+"""Headless Chromium over the DevTools protocol, with the commands that tests of pages need."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 PATIENCE = 30.0
-"""Seconds after which what a test waits for is taken to never come."""
+"""Timeout in seconds."""
 
 
 def executable() -> str | None:
-    """The browser's program; None where there is none."""
+    """The path of the browser; None if there is none."""
     return next((path for path in map(shutil.which, NAMES) if path), None)
 
 
 class Browser:
-    """One running browser. Pages are opened in it; `profile` is a folder of its own."""
+    """A running browser, in which pages are opened; `profile` is an empty folder."""
 
     def __init__(self, program: str, profile: Path) -> None:
         flags = ("--headless=new", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={profile}")
@@ -38,7 +38,7 @@ class Browser:
         self.events: list[dict[str, Any]] = []
 
     def _connect(self, file: Path) -> contextlib.AbstractContextManager[ClientConnection]:
-        """The browser writes its port, and the path to connect to, into a file when it is ready."""
+        """Wait for the file in which the browser writes its port and path when it is ready, and connect."""
         until = time.monotonic() + PATIENCE
         while not (file.exists() and file.read_text(encoding="ascii").count("\n")):
             assert self._process.poll() is None, "the browser has ended"
@@ -48,7 +48,7 @@ class Browser:
         return connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None, open_timeout=PATIENCE)
 
     def call(self, method: str, session: str | None = None, /, **parameters: Any) -> dict[str, Any]:
-        """The answer to one command. What happens meanwhile is kept in `events`."""
+        """Send a command and return its answer. Events in between are stored in `events`."""
         number = next(self._ids)
         request = {"id": number, "method": method, "params": parameters}
         self._connection.send(json.dumps(request if session is None else {**request, "sessionId": session}))
@@ -61,7 +61,7 @@ class Browser:
             self.events.append(answer)
 
     def open(self, url: str, width: int = 1366, height: int = 768) -> Page:
-        """A new page with the size of a laptop's, or as on a phone where it is narrow; in front of all others."""
+        """Open a page in front of all others, with a laptop's size; as on a phone if it is narrow."""
         target = self.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         page = Page(self, session, target)
@@ -74,13 +74,13 @@ class Browser:
         return page
 
     def close(self) -> None:
-        self.call("Browser.close")  # a signal would leave files of its own behind
+        self.call("Browser.close")  # a signal would leave its files behind
         self._stack.close()
         self._process.wait(PATIENCE)
 
 
 class Page:
-    """One page of a browser. Expressions are JavaScript."""
+    """A page of a browser. Expressions are JavaScript."""
 
     def __init__(self, browser: Browser, session: str, target: str) -> None:
         self._browser = browser
@@ -95,13 +95,13 @@ class Page:
         self.until(f"document.readyState === 'complete' && location.href.startsWith({json.dumps(url)})")
 
     def evaluate(self, expression: str) -> Any:
-        """Its value, as JSON. An exception in the page is one here."""
+        """The value of an expression, as JSON. An exception in the page is raised here."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, f"{expression}: {answer['exceptionDetails']}"
         return answer["result"].get("value")
 
     def until(self, expression: str) -> Any:
-        """The expression's value as soon as it is true."""
+        """Wait until the expression is true, and return its value."""
         until = time.monotonic() + PATIENCE
         while not (value := self.evaluate(expression)):
             assert time.monotonic() < until, f"never: {expression}\n{self.evaluate('document.body.innerText')}"
@@ -109,7 +109,7 @@ class Page:
         return value
 
     def text(self, selector: str) -> str:
-        """What a person reads there."""
+        """The visible text."""
         return str(self.evaluate(f"document.querySelector({json.dumps(selector)}).innerText"))
 
     def press_mouse(self, selector: str) -> None:
@@ -131,23 +131,23 @@ class Page:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def key(self, key: str) -> None:
-        """One key pressed and released, by its name as of KeyboardEvent.key."""
+        """Press and release one key, named as in KeyboardEvent.key."""
         text = {"text": "\r"} if key == "Enter" else {"text": key} if len(key) == 1 else {}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **(text if kind == "keyDown" else {}))
 
     def type(self, selector: str, text: str) -> None:
-        """Types over what is in the field."""
+        """Replace the text in the field by typing."""
         self.click(selector)
         self.evaluate(f"document.querySelector({json.dumps(selector)}).select()")
         self.call("Input.insertText", text=text)
 
     def prefer(self, scheme: str) -> None:
-        """`light` or `dark`."""
+        """Set the preferred colour scheme, `light` or `dark`."""
         self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
 
     def complaints(self) -> list[str]:
-        """Errors and exceptions that the browser reported for this page so far, a refused icon apart."""
+        """Errors and exceptions that the browser has reported for this page, except a refused icon."""
         self.evaluate("0")
         mine = [event for event in self._browser.events if event.get("sessionId") == self._session]
         logged = [event["params"]["entry"] for event in mine if event["method"] == "Log.entryAdded"]

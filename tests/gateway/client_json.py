@@ -1,4 +1,4 @@
-"""Messages as a client's own JSON library would write them, from plain values. Uses nothing of the gateway."""
+"""Messages as a client's JSON library would write them, from plain values, without any code of the gateway."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FORMS: list[dict[str, Any]] = [
 
 
 def tree(declared: Type, value: Any, *, is_wrapped: bool) -> Any:
-    """What JSON holds for a value, in the existing gateway's way or the plain one."""
+    """The JSON tree of a value, in the existing gateway's style or the plain style."""
     match declared:
         case MessageType():
             return {field.name: _member(field.type, value[field.name], is_wrapped) for field in declared.fields}
@@ -45,7 +45,7 @@ def written(value: Any, form: dict[str, Any]) -> bytes:
 
 
 def values(declared: MessageType) -> st.SearchStrategy[dict[str, Any]]:
-    """Dictionaries of what JSON and ROS hold both: no NaN, no infinity, no NUL in strings."""
+    """Values that both JSON and ROS can express: no NaN, no infinity, no NUL in strings."""
     return any_values(declared).map(lambda value: _common(declared, field_values(value, declared)))
 
 
@@ -67,5 +67,5 @@ def _common(declared: Type, value: Any) -> Any:
 
 
 def _size(text: str, wide: bool) -> int:
-    """What a bound counts: UTF-16 code units of a wstring, bytes of a string."""
+    """The size that a bound limits: UTF-16 code units of a wstring, bytes of a string."""
     return len(text.encode("utf-16-le")) // 2 if wide else len(text.encode())

@@ -1,4 +1,4 @@
-"""A gateway's websocket side without ROS: it serves the page, says what a test wants, and keeps what it is told."""
+"""The WebSocket side of a gateway without ROS: serves the page, sends a test's messages, and records requests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PAGE = Path(router.gateway.__file__).with_name("page.html")
 
 
 class FakeGateway:
-    """Lists its topics every half second, so that the page holds it for alive."""
+    """Lists its topics every half second, so that the page considers it alive."""
 
     def __init__(self) -> None:
         self.clients: set[ServerConnection] = set()
@@ -37,7 +37,7 @@ class FakeGateway:
             thread.start()
 
     def reset(self) -> None:
-        """As new, but for its port."""
+        """Reset everything except the port."""
         self.received: queue.Queue[dict[str, Any]] = queue.Queue()
         self.rows: list[dict[str, Any]] = []
         self.inbound: list[dict[str, Any]] = [TWIST, MIXED]
@@ -49,7 +49,7 @@ class FakeGateway:
         return f"http://127.0.0.1:{self.port}/"
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """As the real one answers, with its policy of what the page may do."""
+        """Answer as the real gateway does, with the page's Content-Security-Policy."""
         if self.is_down and request.headers.get("Upgrade"):
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "")
         return self._page.answer(cast("Any", connection), request)
@@ -73,7 +73,7 @@ class FakeGateway:
         return json.dumps({"op": "topics", "time": time.time() + self.clock_error, "topics": self.rows})
 
     def say(self, *documents: str | dict[str, Any]) -> None:
-        """To all clients, in one message."""
+        """Send this to all clients in one message."""
         texts = [text if isinstance(text, str) else json.dumps(text, separators=(",", ":")) for text in documents]
         for client in list(self.clients):
             with contextlib.suppress(ConnectionClosed):
@@ -87,7 +87,7 @@ class FakeGateway:
         self.say(self._listing())
 
     def go_down(self) -> None:
-        """Every connection ends, and no new one is taken."""
+        """Close all connections and accept no new ones."""
         self.is_down = True
         for client in list(self.clients):
             client.close()
@@ -104,7 +104,7 @@ def data_document(topic: str, data: object, type_name: str = "sensor_msgs/msg/Im
 
 
 def field(name: str, kind: str | dict[str, Any], is_array: bool = False) -> dict[str, Any]:
-    """One field of a schema; a schema as its kind is a nested message."""
+    """One field of a schema. If `kind` is a schema, the field is a nested message."""
     nested = isinstance(kind, dict)
     return {
         "name": name,

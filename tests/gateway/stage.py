@@ -1,4 +1,4 @@
-"""A gateway between topics and clients that the test itself plays: no ROS, no network."""
+"""A gateway between topics and clients that the test plays, without ROS or network."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ gateways: {{{gateways}}}
 
 
 def program(folder: Path, gateways: str) -> Program:
-    """Of a table with these gateways, a YAML flow mapping without its braces."""
+    """The program of a table with these gateways, a YAML flow mapping without its braces."""
     path = folder / "table.yaml"
     text = TABLE.format(protos=PROTOS, gateways=gateways)
     path.write_text(text, encoding="utf-8")
@@ -53,7 +53,7 @@ def program(folder: Path, gateways: str) -> Program:
 
 
 class Tap:
-    """What stands for a subscription."""
+    """Stands in for a subscription."""
 
     def __init__(self, depth: int) -> None:
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -77,7 +77,7 @@ class Tap:
 
 
 class Graph:
-    """Topics by name, each with one publisher of a type; what it does wrong is in `faults`, for a topic or "names"."""
+    """A ROS graph: topics by name, each with one publisher. `faults` are errors to raise, by topic or for "names"."""
 
     def __init__(self, types: Mapping[str, str]) -> None:
         self.types = dict(types)
@@ -120,7 +120,7 @@ class PlayedClient:
         return 0
 
     def close(self) -> None:
-        """There is nothing to end."""
+        """Nothing to close."""
 
     @property
     def values(self) -> list[Frame]:
@@ -128,7 +128,7 @@ class PlayedClient:
 
 
 class PlayedTransport:
-    """Its client is there from the start. `last_words` come from it while the gateway closes."""
+    """A transport with one client from the start. The client sends `last_words` while the gateway closes."""
 
     def __init__(self, events: Events) -> None:
         self.client = PlayedClient()
@@ -150,7 +150,7 @@ class PlayedTransport:
 
 
 class Stage:
-    """The gateways of a program, one `Played` each, which share topics: `async with Stage(program, graph)`."""
+    """The gateways of a program, as one `Played` each, with shared topics: `async with Stage(program, graph)`."""
 
     def __init__(self, made: Program, graph: Graph | RosTopics) -> None:
         self.faults: list[Exception] = []

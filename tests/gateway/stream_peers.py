@@ -1,4 +1,4 @@
-"""Transports for streams of three kinds, and what connects to them: peers, and what a hostile one would send."""
+"""Three stream transports, peers that connect to them, and what hostile peers send."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GREETING = (
     b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
 )
 CLOSE = 8
-"""The opcode of the frame that ends a websocket."""
+"""The opcode of a WebSocket's close frame."""
 
 
 def transport_of(kind: str, events: Events, limits: Limits = TEN, address: Address = ANY) -> StreamTransport:
@@ -34,7 +34,7 @@ def transport_of(kind: str, events: Events, limits: Limits = TEN, address: Addre
 
 @asynccontextmanager
 async def served(kind: str, limits: Limits = TEN) -> AsyncIterator[tuple[StreamTransport, Events]]:
-    """An open transport, and what it tells."""
+    """An open transport and its events."""
     events = Events()
     transport = transport_of(kind, events, limits)
     async with opened(transport):
@@ -42,7 +42,7 @@ async def served(kind: str, limits: Limits = TEN) -> AsyncIterator[tuple[StreamT
 
 
 def framed(kind: str, *messages: bytes) -> bytes:
-    """As a client sends them."""
+    """Frame messages as a client does."""
     frames = {
         "packets": lambda message: struct.pack("<I", len(message)) + message,
         "lines": lambda message: message + b"\n",
@@ -52,13 +52,13 @@ def framed(kind: str, *messages: bytes) -> bytes:
 
 
 def websocket_frame(payload: bytes, opcode: int = 2, length: int | None = None, fin: bool = True) -> bytes:
-    """Part of a websocket message, as a client sends it; the payload may end before its length does."""
+    """Part of a WebSocket message from a client; the payload may be shorter than its declared length."""
     length = len(payload) if length is None else length
     return struct.pack(">BBH", opcode | fin << 7, 0x80 | 126, length) + bytes(4) + payload
 
 
 class Peer:
-    """A client that keeps to the protocol. `join` makes it."""
+    """A client that follows the protocol. `join` creates it."""
 
     def __init__(self, kind: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.writer = writer
@@ -74,7 +74,7 @@ class Peer:
         await self.writer.drain()
 
     async def hear(self) -> bytes:
-        """The next message. Raises IncompleteReadError at the end."""
+        """Wait for the next message. Raises IncompleteReadError at the end."""
         if self._kind == "lines":
             return (await self.reader.readuntil(b"\n"))[:-1]
         if self._kind == "packets":
@@ -91,7 +91,7 @@ class Peer:
         return message
 
     async def is_closed(self) -> bool:
-        """Whether the other side closes the connection before long, whatever it says before."""
+        """Whether the other side soon closes the connection, ignoring earlier messages."""
 
         async def hear_all() -> None:
             with suppress(ConnectionError, asyncio.IncompleteReadError):
@@ -105,7 +105,7 @@ class Peer:
         return True
 
     def stand_still(self) -> None:
-        """Read nothing from now on."""
+        """Stop reading."""
         self.writer.transport.pause_reading()  # type: ignore[attr-defined]  # a stream's transport
 
     def leave(self) -> None:

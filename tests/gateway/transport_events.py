@@ -1,4 +1,4 @@
-"""Events that write down what they hear, and what the tests of the gateway's transports share."""
+"""Recorded events and shared helpers for tests of the gateway's transports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def data(payload: bytes, topic: str = "/imu", type_name: str = "T") -> Frame:
 
 @dataclass
 class Events:
-    """What is heard of clients that come and go, in order, and what they say."""
+    """Records clients that connect and disconnect, in order, and their messages."""
 
     clients: list[Client] = field(default_factory=list)
     gone: list[Client] = field(default_factory=list)
@@ -72,7 +72,7 @@ class Events:
 
 @asynccontextmanager
 async def opened(transport: Transport) -> AsyncIterator[None]:
-    """Open inside. Afterwards no task, thread or socket is left of it."""
+    """Open a transport. Check that it leaves no task, thread or socket behind."""
     tasks, threads, sockets = asyncio.all_tasks(), _threads(), _sockets()
     await transport.open()
     try:
@@ -85,15 +85,15 @@ async def opened(transport: Transport) -> AsyncIterator[None]:
 
 
 def _threads() -> set[threading.Thread]:
-    """But for those in which asyncio runs what the tests themselves wait for."""
+    """All threads except those of asyncio's executor, which tests use."""
     return {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio")}
 
 
 def _sockets() -> int:
-    """How many this process has open. Zenoh keeps descriptors of other kinds for its threads."""
+    """The number of open sockets. Zenoh keeps descriptors of other kinds for its threads."""
     count = 0
     for descriptor in Path("/proc/self/fd").iterdir():
-        with suppress(FileNotFoundError):  # the one of this listing
+        with suppress(FileNotFoundError):  # the descriptor of this listing
             count += str(descriptor.readlink()).startswith("socket:")
     return count
 

@@ -1,6 +1,6 @@
-"""A Zenoh gateway in a process of its own: `Gateway` starts it, and this file run as a script is it.
+"""A Zenoh gateway in a separate process: `Gateway` starts this file as a script.
 
-It opens at the first line of its standard input, and prints its state as a line of JSON whenever that changes.
+It opens at the first line on stdin, and prints each change of its state as a line of JSON.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # sys.path of a script lacks the repository's root
 
 from structlog.testing import capture_logs
 
@@ -27,7 +27,7 @@ HERE = SourceSpan("routes/rover.yaml")
 
 
 class Gateway:
-    """As a client that connects to the locator `where`, or in another mode. Close it."""
+    """A Zenoh gateway that connects to the locator `where` as a client, or in another mode. Close it after use."""
 
     def __init__(self, key: str, where: str, config: dict[str, Any] | None = None, mode: str = "client") -> None:
         self.process = subprocess.Popen(
@@ -51,7 +51,7 @@ class Gateway:
 
     @property
     def is_up(self) -> bool:
-        """It can be told to open."""
+        """Whether the process is ready to open the gateway."""
         return bool(self.states)
 
     @property
@@ -60,12 +60,12 @@ class Gateway:
 
     @property
     def waits(self) -> bool:
-        """For another one that has the key."""
+        """Whether it waits for another gateway that has the key."""
         return bool(self.states and not self.states[-1]["ready"] and self.states[-1]["others"])
 
     @property
     def others(self) -> list[str]:
-        """What the log says at error of who has the key."""
+        """The owners of the key, as logged at level error."""
         others: list[str] = self.states[-1]["others"]
         return others
 

@@ -1,4 +1,4 @@
-"""A router that only counts."""
+"""A router of which only the counters exist."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Program:
 
 @pytest.fixture
 def router(counted: Program) -> Counting:
-    """It has been looked at once."""
+    """A router whose health was evaluated once."""
     counting = Counting(counted)
     counting.look(0)
     return counting

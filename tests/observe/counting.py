@@ -1,4 +1,4 @@
-"""A router that only counts, with clocks that a test sets."""
+"""A router of which only the counters exist, with clocks that a test sets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ gateways:
 
 
 class Counting(FakeRunning):
-    """`now` is the boot clock, from which the wall clock differs by WALL and `shift`: ns."""
+    """`now` is the boot clock in ns; the wall clock is ahead of it by WALL and `shift`."""
 
     def __init__(self, program: Program) -> None:
         super().__init__(program)
@@ -44,10 +44,10 @@ class Counting(FakeRunning):
         self.count("endpoint_last_seen_timestamp_seconds", endpoint, to=self.wall)
 
     def look(self, after: float) -> Look:
-        """So many seconds later."""
+        """Evaluate health this many seconds later."""
         self.now += int(after * SECOND)
         return self.watch.look(self.now, self.wall)
 
     def told(self, after: float) -> list[str]:
-        """What is wrong then, in words."""
+        """Evaluate health then, and return the problems as text."""
         return [problem.text for problem in self.look(after).problems]

@@ -1,4 +1,4 @@
-"""A router that runs nothing: a real program, counters that a test writes, and datagrams that it has seen come."""
+"""A router without threads: a real program, counters that a test writes, and datagrams from a test."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ RELOADED = ReloadResult(True, (), "nothing has changed")
 
 @cache
 def sim_program() -> Program:
-    """Of routes/sim.yaml."""
+    """The program of routes/sim.yaml."""
     program = check_table(ROUTES / "sim.yaml").program
     assert program is not None
     return program
 
 
 class FakeRunning:
-    """`failures` is what consumers of the mirror raised, `collected` how often the counters were read."""
+    """`failures` has exceptions of the mirror's consumers, `collected` counts reads of the counters."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -94,9 +94,9 @@ class FakeRunning:
 
 
 class FakeHealth:
-    """Looks when it is asked. What was counted since `begin` is recent, and endpoints are silent since they sent.
+    """Evaluated on request. Counts since `begin` are recent; endpoints are silent since their last datagram.
 
-    `parked`: for how long deadmen have sent, s.
+    `parked` is how long deadmen have been sending, in s.
     """
 
     def __init__(self, running: FakeRunning) -> None:

@@ -1,4 +1,4 @@
-"""A client as Foxglove's app is one: it knows the websocket protocol, and of messages only what it is told."""
+"""A client like the Foxglove app: it knows the WebSocket protocol, and decodes messages by the advertised schemas."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PATIENCE = 20.0
 
 
 class Told(NamedTuple):
-    """One message: its topic, log time (ns), bytes, and what these are by the channel's schema."""
+    """One message: topic, log time (ns), bytes, and the value decoded by the channel's schema."""
 
     topic: str
     log_time: int
@@ -30,7 +30,7 @@ class Told(NamedTuple):
 
 
 class FoxgloveClient:
-    """`with FoxgloveClient(port) as client:`; `channels` are those advertised so far, by topic."""
+    """`with FoxgloveClient(port) as client:`; `channels` are the channels advertised so far, by topic."""
 
     def __init__(self, port: int) -> None:
         self._open = ExitStack()
@@ -61,13 +61,13 @@ class FoxgloveClient:
         self._socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": numbers}))
 
     def receive(self, timeout: float = PATIENCE) -> Told:
-        """The next message; raises TimeoutError."""
+        """Wait for the next message. Raises TimeoutError."""
         while (told := self._hear(timeout)) is None:
             pass
         return told
 
     def await_change(self) -> None:
-        """Waits for the next channels that come or go."""
+        """Wait until channels are advertised or removed."""
         before = {topic: channel["id"] for topic, channel in self.channels.items()}
         while {topic: channel["id"] for topic, channel in self.channels.items()} == before:
             self._hear()

@@ -1,4 +1,4 @@
-"""The oracle of ages and rates: the rules of `freshness.h` and `limit.h` in few words. Slow and plain."""
+"""The oracle of ages and rates: a slow and plain version of the rules in `freshness.h` and `limit.h`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ TOLERANCE, MEMORY, MOST_SETTINGS = 10_000_000, 10_000_000_000, 32
 
 @dataclass
 class Freshness:
-    """`settings` are the past ones: how far the wall clock was ahead, at most from when until when."""
+    """`settings` are earlier settings of the wall clock: its offset, and the longest period in which it applied."""
 
     settings: list[tuple[int, int, int]] = field(default_factory=list)
     now: tuple[int, int, int] | None = None
-    """How far it is ahead, since when at most, and when that was last seen."""
+    """The current offset, the earliest time it can apply from, and the time it was last observed."""
 
     def look(self, received_at: int, now: int) -> None:
         offset = received_at - now

@@ -1,4 +1,4 @@
-"""What boards can take, decided a second time: `board.h` has to give the same answers."""
+"""Limits of boards, implemented a second time: `board.h` has to give the same answers."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a board cannot take a datagram: TOO_LARGE or NON_FINITE, and in words."""
+    """Why a board cannot take a datagram: TOO_LARGE or NON_FINITE, and a text."""
 
     reason: str
     text: str
 
 
 def refusal(limits: BoardLimits, datagram: bytes) -> Refusal | None:
-    """Why the board cannot take an envelope that is well formed; None if it can."""
+    """Why the board cannot take this well-formed envelope; None if it can."""
     if len(datagram) > limits.longest:
         return _too_many("the envelope", len(datagram), "byte", limits.longest)
     return next(_refusals(limits, datagram, limits.fields, {}), None)
 
 
 def _refusals(limits: BoardLimits, message: bytes, fields: BoardMessage, counts: dict[str, int]) -> Iterator[Refusal]:
-    """`counts` are the elements of each list so far, by path; a message that comes twice is merged."""
+    """`counts` are the elements of each list so far, by path, because repeated messages are merged."""
     for number, wire_type, value in wire_fields(message):
         field = fields.get(number)
         if field is None:
@@ -69,7 +69,7 @@ def _fits(size: int, bound: int, is_fixed: bool) -> bool:
 
 
 def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes] | None:
-    """The elements that a field brings, as they are encoded; None if it has another wire type than its own."""
+    """The encoded elements of a field; None if the wire type is not the declared one."""
     own = encoding_of(field.descriptor).wire_type
     if wire_type == own:
         return [value]
@@ -82,9 +82,9 @@ def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes
 
 
 def wire_fields(message: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The fields of a well-formed message: number, wire type, and the value as it is encoded, without a size.
+    """The fields of a well-formed message: number, wire type, and the encoded value without its size.
 
-    Groups are left out.
+    Skips groups.
     """
     position, open_groups = 0, 0
     while position < len(message):

@@ -17,7 +17,7 @@ from router.compiler.program import DeadmanPlan
 START, START_AGAIN, GREETING = 10_000_000_000, 1_000_000_000, 500_000_000
 
 Event = tuple[str, str, str, int]
-"""What happened, to the deadman of which route, and at which endpoint, with which errno."""
+"""An event: what happened, the deadman's route, the endpoint and the errno."""
 
 
 @dataclass(eq=False)
@@ -25,7 +25,7 @@ class Deadman:
     plan: DeadmanPlan
     outlets: dict[str, bytes]
     is_armed: bool = False
-    """Or tripped."""
+    """Armed or tripped."""
     has_tripped: bool = False
     due: int | None = None
     greets_until: int = 0
@@ -40,7 +40,7 @@ class Deadman:
 
 @dataclass
 class Deadmen:
-    """Those of a group. `broken` endpoints take nothing; `refused` ones are said to have refused what came before."""
+    """The deadmen of a group. Sending to `broken` endpoints fails; `refused` ones have refused a datagram."""
 
     deadmen: list[Deadman] = field(default_factory=list)
     sent: list[tuple[str, bytes]] = field(default_factory=list)
@@ -86,7 +86,7 @@ class Deadmen:
             self._send_at_start(deadman, now)
         else:
             repeat, trips = deadman.plan.repeat, not deadman.has_tripped
-            deadman.due = due + repeat * (1 + (now - due) // repeat)  # what a stalled process has missed is left out
+            deadman.due = due + repeat * (1 + (now - due) // repeat)  # repeats missed by a stalled process are skipped
             deadman.has_tripped = True
             self.counts["trips", deadman.plan.route] += trips
             self._send_all(deadman)
@@ -94,7 +94,7 @@ class Deadmen:
                 self._tell("tripped", deadman)
 
     def start(self, deadman: Deadman, now: int) -> list[str]:
-        """As the router starts, which sends the payload without a change of state. Return who was reached."""
+        """Send the payload at the router's start, without changing the state. Return the endpoints reached."""
         return self._send_at_start(deadman, now) if deadman.plan.at_start else []
 
     def _send_at_start(self, deadman: Deadman, now: int) -> list[str]:
@@ -110,7 +110,7 @@ class Deadmen:
         deadman.greets_until = now + START if deadman.plan.at_start else 0
 
     def greet(self, deadman: Deadman, now: int) -> bool:
-        """A subscriber was met: it is sent to at once and, as it may not have met us yet, a second time."""
+        """Handle a new subscriber: send at once, and again later, because it may not have discovered us yet."""
         if now >= deadman.greets_until or deadman.is_armed:
             return False
         deadman.due, deadman.greets_again = now, now + GREETING
@@ -133,7 +133,7 @@ class Deadmen:
             next_one.due, next_one.greets_again = due, earlier.greets_again
 
     def end(self, deadman: Deadman) -> None:
-        """It sends a last time if it is not unarmed: also one that was replaced, where the next one does not send."""
+        """Send a last time unless unarmed; also when replaced by a deadman that does not send."""
         is_armed, deadman.is_armed = deadman.is_armed, False
         deadman.due, deadman.greets_until = None, 0
         if is_armed:

@@ -1,4 +1,4 @@
-"""The oracle of envelopes: what protobuf says of a datagram, before senders are looked at."""
+"""The oracle of envelopes: protobuf's verdict on a datagram, before the sender is checked."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from router.types.protobuf import Envelope
 
 @dataclass(frozen=True)
 class Decision:
-    """What becomes of a datagram before senders are looked at.
+    """The decision about a datagram before the sender is checked.
 
-    `reason` is None for the payload case `number`, which may have no route. For `unknown_case` and `malformed` it is
-    the number of the field to blame, or 0. `is_repaired`: counted as padded.
+    If `reason` is None, `number` is the payload case, which may have no route. For `unknown_case` and `malformed`,
+    `number` is the offending field or 0. `is_repaired`: the datagram counts as padded.
     """
 
     reason: str | None
@@ -26,7 +26,7 @@ class Decision:
 
 
 def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, repairs: bool) -> Decision:
-    """What becomes of `data`, of which at most `most` bytes are taken. `routed` are the payload cases with a route."""
+    """The decision about `data`, of at most `most` bytes. `routed` are the payload cases with a route."""
     if len(data) > most:
         return Decision("truncated", 0, False)
     if not data:
@@ -50,9 +50,9 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
 
 
 def _only_payload(envelope: Envelope, routed: Container[int], data: bytes) -> int | None:
-    """The payload case with a route that is the only field of an envelope, and that protobuf parses by itself.
+    """The routed payload case that is an envelope's only field and that protobuf parses separately.
 
-    It may be nested one level deeper than one that protobuf parses in its envelope.
+    Its nesting may be one level deeper than protobuf allows within an envelope.
     """
     tag, at = _short_varint(data, 0)
     size, at = _short_varint(data, at)

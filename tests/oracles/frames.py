@@ -1,7 +1,7 @@
 """`collect` by its rules in docs/reference/table.md, in lists that are searched from end to end.
 
-One collector, with limits and a timeout of its own. It counts what becomes of each part but the first one of a frame
-that gets complete: that is what becomes of the frame.
+One collector with its limits and timeout. It counts the outcome of each part except the first part of a completed
+frame, whose outcome is the outcome of the frame.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ COLLECTED, FILTERED, INCOMPLETE, MAPPING_ERROR = "collected", "filtered", "incom
 
 
 class Part(NamedTuple):
-    """A datagram: `key` is its sender with what the sender calls the frame, `place` where it belongs."""
+    """A datagram: `key` is the sender with its name for the frame, `place` is the position in the frame."""
 
     key: Hashable
     size: int
@@ -24,7 +24,7 @@ class Part(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """`size` in bytes of all payloads that are held."""
+    """`size` limits the bytes of all held payloads."""
 
     frames: int
     parts: int
@@ -49,11 +49,11 @@ class Frames:
     limits: Limits = LIMITS
     counted: Counter[str] = field(default_factory=Counter)
     details: list[str] = field(default_factory=list)
-    """Of what was lost, in order."""
+    """Texts of the losses, in order."""
     open: list[_Frame] = field(default_factory=list)
-    """The oldest first."""
+    """Open frames, oldest first."""
     closed: list[tuple[Hashable, int]] = field(default_factory=list)
-    """With the time until which they are, the earliest first."""
+    """Ended frames with the time until which they are remembered, earliest first."""
 
     @property
     def next_due(self) -> int | None:
@@ -70,7 +70,7 @@ class Frames:
             self._end(frame, now)
 
     def offer(self, now: int, part: Part) -> list[bytes] | None:
-        """Return the payloads of the frame that is complete now, if one is."""
+        """Add a part. Return the payloads of the frame if it is now complete, else None."""
         if not 0 <= part.place < part.size:
             self._lose(MAPPING_ERROR, f"a frame of {part.size} has no part {part.place}")
             return None

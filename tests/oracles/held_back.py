@@ -1,4 +1,4 @@
-"""The oracle of messages that are held back: the rules of `defer.h` and `pace.h` in few words. Slow and plain."""
+"""The oracle of held-back messages: a slow and plain version of the rules in `defer.h` and `pace.h`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ OVERDRAFT, LEAST_OVERDRAFT = NS // 10, 2048
 LEAST_ROOM, MOST_ROOM, BYTES_PER_DATAGRAM = 65536, 1 << 24, 16
 
 Fate = Callable[[int, "Message", str], None]
-"""Called with the time, a message and what became of it: "sent", or why it was dropped."""
+"""Called with the time, a message and its outcome: "sent", or the reason of the drop."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """`expires` is None for one that never does. `rank` is its place among the priorities, commands first."""
+    """`expires` is None for no expiry. `rank` is the rank of its priority, commands first."""
 
     number: int
     target: object
@@ -67,7 +67,7 @@ class Pacer:
         self._limit_savings(now)
 
     def end(self, now: int) -> None:
-        """All that waits leaves, whatever the bandwidth."""
+        """Send all queued messages, regardless of the bandwidth."""
         self.has_ended, self.next_due = True, None
         for each in sorted(self._waiting, key=lambda each: each.rank):
             self._send(now, each)
@@ -104,7 +104,7 @@ class Pacer:
 
 @dataclass(eq=False)
 class Deferral:
-    """`hertz` of `on_limit: latest`, None without; what passes goes to `pacer`, if there is one."""
+    """`hertz` is the rate with `on_limit: latest`, else None. Messages that pass go to `pacer`, if there is one."""
 
     hertz: float | None
     pacer: Pacer | None
@@ -134,7 +134,7 @@ class Deferral:
             self._release(now)
 
     def change(self, now: int, hertz: float | None) -> None:
-        """A reload: with another rate, what is held leaves now."""
+        """Reload. If the rate changes, send the held message now."""
         if hertz != self.hertz:
             self._release(now)
             self.hertz = hertz

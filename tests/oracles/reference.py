@@ -1,8 +1,8 @@
-"""The oracle: a plain, slow answer to what a table makes of one message.
+"""The oracle of mappings: a plain, slow implementation for one message.
 
-Of the compiler it shares the functions and the type model, and must not know expressions, scalars, conversion,
-mapping, cdr, payload or source: what both agree on is right for two reasons. Expects a table that the compiler
-has accepted. `router.rehearsal.cdr` and `reference_protobuf` make messages of what comes out here.
+It shares functions and the type model with the compiler, but must not import expressions, scalars, conversion,
+mapping, cdr, payload or source: then two implementations have to agree. Expects a table that the compiler has
+accepted. `router.rehearsal.cdr` and `reference_protobuf` serialize the results.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from tests.oracles.reference_kinds import (
 )
 
 Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
-"""What fills a field; a message is a dictionary of its fields, in their order."""
+"""The value of a field; a message is a dictionary of its fields, in their order."""
 
 
 def fill(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
-    """The ROS message that `fields` makes of a message, with all its fields.
+    """The ROS message that `fields` makes from a message, with all fields.
 
-    Raises Refused where a field has no value.
+    Raises Refused if a field has no value.
     """
     try:
         given = fill_given(fields, target, context)
     except Refused as refused:
-        # A text with a NUL is found below, where nothing else is refused.
+        # The reason may also be a text with a NUL, which is only detected later.
         raise Refused(*refused.reasons, *[MAPPING_ERROR] * _has_text(target)) from None
     return _completed(target, given)
 
@@ -55,7 +55,7 @@ def _has_text(declared: Type) -> bool:
 
 
 def _completed(message: MessageType, values: Mapping[str, Value]) -> dict[str, Value]:
-    """With the fields that nobody fills: ROS messages have them all."""
+    """The message with its unfilled fields added, because ROS messages have all fields."""
     return {
         field.name: _complete(field.type, values[field.name])
         if field.name in values
@@ -77,7 +77,7 @@ def _complete(declared: Type, value: Any) -> Any:
 
 
 def fill_given(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
-    """The same without the fields that nothing fills."""
+    """The same without unfilled fields."""
     tree: dict[str, Any] = {}
     for entry in fields.entries if fields else ():
         holder = reduce(lambda inner, name: inner.setdefault(name, {}), entry.path[:-1], tree)
@@ -109,7 +109,7 @@ def _of_expression(given: Expression, target: Type, context: Context) -> Value:
 
 
 def initial(declared: Type, default: object = None) -> Value:
-    """What a field of a ROS message holds that nobody fills: its declared default, else zero."""
+    """The value of an unfilled field of a ROS message: its declared default, else zero."""
     match declared:
         case MessageType():
             return {field.name: initial(field.type, field.default) for field in declared.fields}
@@ -130,7 +130,7 @@ def initial(declared: Type, default: object = None) -> Value:
 
 
 def converted(value: Any, target: Type) -> Value:  # noqa: C901 - a case a type
-    """The value as a field of the target's type holds it. Raises Refused when it does not fit."""
+    """The value converted to the target's type. Raises Refused if it does not fit."""
     match target:
         case MessageType():
             return _to_message(value, target)
@@ -160,7 +160,7 @@ _OCTET = Int(8, signed=False)
 
 
 def _to_list(elements: Sequence[Computation], target: List | Bytes) -> Value:
-    """A list or bytes of elements that are still to be computed."""
+    """A list or bytes, from elements that are not computed yet."""
     declared = target.element if isinstance(target, List) else _OCTET
     least, most = (target.length or 0, _most_elements(target)) if isinstance(target, List) else (0, target.bound)
 
@@ -211,7 +211,7 @@ def _to_text(value: str, target: String) -> str:
 
 
 def _to_enum(value: int | str, target: Enum) -> int:
-    """A number as it is, a name as what it stands for."""
+    """The number of an enum value given as number or name."""
     numbers = dict(target.values)
     if isinstance(value, str) and value not in numbers:
         raise Refused(MAPPING_ERROR)

@@ -1,8 +1,8 @@
-"""The oracle's expressions: what docs/reference/table.md says of them, in Python's exact integers and doubles.
+"""The oracle's expressions, as in docs/reference/table.md, with Python's exact integers and doubles.
 
-Reads the syntax that the user wrote, over a message. Expects expressions that the compiler has accepted; see
-`reference`. Where several parts of an expression have no result, the reason may be that of any of them, as the page
-does not say what is computed first.
+Evaluates the user's syntax for a message. Expects expressions that the compiler has accepted; see `reference`. If
+several parts of an expression have no result, the reason of any of them is correct, because the page does not define
+the order of evaluation.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ from tests.oracles.reference_kinds import (
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What expressions can see: a message, who sent it, when (ns since 1970), and the constants by holder.
+    """The environment of expressions: a message, its sender, its time (ns since 1970), and constants by holder.
 
-    `names` are values beside the fields, which win over fields of the same name, with their kinds.
+    `names` are additional values with their kinds, which take precedence over fields of the same name.
     """
 
     view: View
@@ -71,10 +71,10 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What an expression means: its kind, and its value in a context of the same types.
+    """The meaning of an expression: its kind, and a function from a context of the same types to its value.
 
-    `items` are those of a list literal, whose kinds may differ. `constant` is the value of one that is known.
-    `elements` are those of a list that is computed, each still to be computed; of others it is None.
+    `items` are the items of a list literal, whose kinds may differ. `constant` is a value known at compile time.
+    `elements` computes the elements of a computed list one by one; otherwise it is None.
     """
 
     kind: Kind
@@ -90,21 +90,21 @@ def evaluate(expression: Expression, context: Context, expected: Type | None = N
 
 
 def value_of(meaning: Meaning, context: Context) -> Any:
-    """A list literal gives its items as they are: each fills an element by itself."""
+    """The value of a meaning. The items of a list literal stay unconverted, because each fills one element."""
     if isinstance(meaning.kind, Listing):
         return all_of(elements_of(meaning, context))
     return meaning.give(context)
 
 
 def elements_of(meaning: Meaning, context: Context) -> list[Computation]:
-    """The elements of a list, still to be computed. Raises Refused where it is made of lists of different length."""
+    """The uncomputed elements of a list. Raises Refused if it combines lists of different lengths."""
     if meaning.items is not None:
         return [partial(value_of, item, context) for item in meaning.items]
     return _elements(meaning, context)
 
 
 def meaning_of(expression: Expression, context: Context, expected: Type | None = None) -> Meaning:
-    """What an expression means in all contexts with these types."""
+    """The meaning of an expression in all contexts with these types."""
     if expression.items is not None:
         return _literal([meaning_of(item, context, _innermost(expected)) for item in expression.items])
     if expression.literal:
@@ -152,7 +152,7 @@ def _constant(kind: Kind, value: Any) -> Meaning:
 
 
 def _literal(items: Sequence[Meaning]) -> Meaning:
-    """A list literal; as one value, its elements have a kind in common."""
+    """The meaning of a list literal. As one value, its elements have a common kind."""
     kind = Listing(joined([item.kind for item in items]) if items else None, len(items))
     each = [_as_value(item) for item in items]
     made = _list_of(kind, lambda context: _shaped_elements([partial(item.give, context) for item in each], kind))
@@ -196,7 +196,7 @@ def _applied(rule: Rule, operands: Sequence[Meaning], *, folds: bool = False) ->
 
 
 def _side_by_side(lists: Sequence[Meaning], context: Context) -> list[list[Computation]]:
-    """The elements of lists, which have to have one length. If they have not, some may have been computed before."""
+    """The elements of lists side by side. If the lengths differ, some elements may be computed before the refusal."""
     try:
         columns = all_of([partial(_elements, each, context) for each in lists])
         if len({len(column) for column in columns}) > 1:
@@ -225,7 +225,7 @@ def _elements(values: Meaning, context: Context) -> list[Computation]:
 
 
 def _folded(kind: Kind, give: Callable[[Context], Any]) -> Meaning:
-    """What operators make of constants is a constant."""
+    """The constant that an operator gives for constant operands."""
     value = give(None)  # type: ignore[arg-type]
     return _constant(Whole(value, value) if isinstance(kind, Whole) else kind, value)
 
@@ -263,7 +263,7 @@ def _shaped_elements(elements: Sequence[Computation], kind: Listing) -> list[Com
 
 
 def _chosen(choices: Choices, context: Context, expected: Type | None) -> Meaning:
-    """A map: choices by the value of its subject, the first of which is outermost."""
+    """The meaning of a map: nested choices by the value of its subject, the first one outermost."""
     subject = meaning_of(choices.subject, context)
     values = [(name.value, meaning_of(value, context, expected)) for name, value in choices.values]
 
@@ -307,7 +307,7 @@ _SYMBOLS: dict[type[ast.operator], str] = {
 
 @dataclass(frozen=True, slots=True)
 class _Reader:
-    """Reads syntax. Of the context it needs the types only."""
+    """Converts syntax to a Meaning. Uses only the types of the context."""
 
     context: Context
 
@@ -399,7 +399,7 @@ class _Reader:
         return self._field(self.read(node.value), _name(node.attr))
 
     def _constant_of(self, holder: str, name: str) -> Meaning:
-        """`SensorState.SENSOR_ERROR`: an enum of the message's own, one of exactly this name, or any."""
+        """`SensorState.SENSOR_ERROR`: looks in the message's enums, then for this exact name, then in all enums."""
         own = f"{self.context.view.type.name}.{holder}"
         others = [enum.name for enum in self.context.enums if enum.name.endswith(f".{holder}")]
         for full_name in [own, holder, *others]:

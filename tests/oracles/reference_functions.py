@@ -1,7 +1,7 @@
-"""The oracle's operators and functions: what docs/reference/table.md and functions.md say, one rule each.
+"""The oracle's operators and functions, one rule for each in docs/reference/table.md and functions.md.
 
-A rule takes the kinds of the operands, and those that are constants, and gives the kind of the result and a function
-that computes it. Lists are no concern of a rule: `reference_expressions` applies it to each element.
+A rule takes the kinds and constants of the operands, and returns the kind of the result and a function that computes
+it. Rules do not handle lists: `reference_expressions` applies them to each element.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _power(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Compu
 
 
 def _finite(compute: Compute, *values: Any) -> Any:
-    """A result, unless there is none, or an infinite one of finite values."""
+    """The result of a computation. Raises Refused if there is none, or if finite operands give infinity."""
     try:
         return compute(*values)
     except (OverflowError, ValueError):
@@ -125,7 +125,7 @@ def negate(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Compu
 
 
 def same_number(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Compute]:
-    """Of `+x`."""
+    """The rule of `+x`."""
     return number(kinds[0]), lambda x: x
 
 
@@ -170,7 +170,7 @@ def _to_whole(compute: Callable[[float], int], x: float) -> int:
 
 
 def _extreme(is_better: Callable[[Any, Any], bool], pick: Callable[[list[int]], int]) -> Rule:
-    """Of min() and max() with several arguments."""
+    """The rule of min() and max() with several arguments."""
 
     def rule(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Compute]:
         compute = _alike(kinds, lambda *values: best(values, is_better))
@@ -183,7 +183,7 @@ def _extreme(is_better: Callable[[Any, Any], bool], pick: Callable[[list[int]], 
 
 
 def best(values: Sequence[Any], is_better: Callable[[Any, Any], bool]) -> Any:
-    """The first one, unless a later one is better."""
+    """The first value, unless a later one is better."""
     chosen = values[0]
     for value in values[1:]:
         if is_better(value, chosen):
@@ -218,7 +218,7 @@ def _wrap(kinds: Sequence[Kind], constants: Sequence[Any]) -> tuple[Kind, Comput
 
 
 def _float32(x: float) -> float:
-    if math.isfinite(x) and abs(x) >= 3.4028235677973366e38:  # this much rounds to infinity
+    if math.isfinite(x) and abs(x) >= 3.4028235677973366e38:  # rounds to infinity
         raise Refused(MAPPING_ERROR)
     return float(x)
 
@@ -296,7 +296,7 @@ FUNCTIONS: dict[str, Rule] = {
 
 
 def extreme_of(name: str, values: Sequence[Any]) -> Any:
-    """min(list) and max(list)."""
+    """The rule of min(list) and max(list)."""
     if not values:
         raise Refused(MAPPING_ERROR)
     return best(values, operator.lt if name == "min" else operator.gt)
@@ -312,7 +312,7 @@ def kind_of_sum(kind: Listing) -> Kind:
 
 
 def sum_of(values: Sequence[Any], kind: Kind) -> Any:
-    """Added in order; each partial sum has to fit the 64 bits of the result."""
+    """The rule of sum(list): adds in order; each partial sum has to fit the 64 bits of the result."""
     if isinstance(kind, Real):
         return sum_in_order(values, 0.0, kind)
     assert isinstance(kind, Whole)

@@ -1,4 +1,4 @@
-"""An oracle for the tests: what JSON of a message's value reads back as. Never used to run a gateway.
+"""The oracle of JSON: the parsed JSON of a message's value. No gateway uses it.
 
 Takes values as `router.rehearsal.cdr` does: dictionaries, lists and scalars.
 """
@@ -13,7 +13,7 @@ from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
 
 def reference_value(message: MessageType, value: dict[str, Any], *, is_wrapped: bool) -> dict[str, Any]:
-    """In the existing gateway's style or bare, with sorted keys; ValueError for text that is no Unicode."""
+    """The value as JSON in the existing gateway's style or bare, keys sorted. Raises ValueError for invalid Unicode."""
     members = {field.name: _member(field.type, value[field.name], is_wrapped) for field in message.fields}
     if not members:
         members["structure_needs_at_least_one_member"] = [0] if is_wrapped else 0

@@ -1,4 +1,4 @@
-"""The oracle's kinds and values: what docs/reference/table.md says of numbers, and how expressions see fields."""
+"""The oracle's kinds and values: numbers as in docs/reference/table.md, and fields in expressions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAPPING_ERROR, NON_FINITE = "mapping_error", "non_finite"
 
 
 class Refused(MappingError):
-    """There is no result. `reasons` has more than one where it depends on what is computed first."""
+    """There is no result. `reasons` has several entries if the reason depends on the order of evaluation."""
 
     def __init__(self, *reasons: str) -> None:
         super().__init__(" or ".join(sorted(reasons)))
@@ -23,11 +23,11 @@ class Refused(MappingError):
 
 
 class Nanoseconds(int):
-    """A time, told apart from a number."""
+    """A time, as a type distinct from numbers."""
 
 
 class EnumNumber(int):
-    """The value of a protobuf enum, told apart from a number: it saturates."""
+    """The value of a protobuf enum, as a type distinct from numbers, because it saturates."""
 
 
 # kinds
@@ -46,7 +46,7 @@ class Whole:
 
 @dataclass(frozen=True, slots=True)
 class Real:
-    """`low` and `high` are what clamp() leaves of it, if its bounds are constants."""
+    """`low` and `high` are the bounds of clamp(), if they are constants."""
 
     low: float | None = None
     high: float | None = None
@@ -74,7 +74,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """`length` is None where it is not known from the type. An empty literal has no `element`."""
+    """`length` is None if the type does not determine it. An empty literal has no `element`."""
 
     element: Kind | None
     length: int | None = None
@@ -86,7 +86,7 @@ INT32 = Whole(-(1 << 31), (1 << 31) - 1)
 SIGNED = Whole(-(1 << 63), (1 << 63) - 1)
 UNSIGNED = Whole(0, (1 << 64) - 1)
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-"""Messages that are read as one value."""
+"""Messages that expressions read as one value."""
 
 
 def kind_of(declared: Type) -> Kind:
@@ -110,7 +110,7 @@ def kind_of(declared: Type) -> Kind:
 
 
 def whole(bounds: Iterable[int]) -> Whole:
-    """The integers between these, as far as 64 bits hold them."""
+    """The integers of this range that fit in 64 bits."""
     made = [*bounds]
     limits = SIGNED if min(made) < 0 else UNSIGNED
     return Whole(max(min(made), limits.low), min(max(made), limits.high))
@@ -126,7 +126,7 @@ def number(kind: Kind) -> Whole | Real:
 
 
 def joined(kinds: Sequence[Kind]) -> Kind:
-    """The kind of what is of one of these kinds."""
+    """The common kind of these kinds."""
     first, *others = kinds
     if all(kind == first for kind in others):
         return first
@@ -143,7 +143,7 @@ def joined(kinds: Sequence[Kind]) -> Kind:
 
 
 def shaped(value: Any, kind: Kind) -> Any:
-    """A value as one of this kind. Raises Refused for an integer that does not fit."""
+    """A value converted to this kind. Raises Refused for an integer that does not fit."""
     match kind:
         case Whole(low, high):
             if not low <= value <= high:
@@ -162,11 +162,11 @@ def shaped(value: Any, kind: Kind) -> Any:
 
 
 Computation = Callable[[], Any]
-"""Gives a value, or raises Refused."""
+"""Returns a value or raises Refused."""
 
 
 def all_of(computations: Iterable[Computation]) -> list[Any]:
-    """What each computation gives. If some are refused, it is for one of their reasons."""
+    """The results of computations. If some are refused, raises Refused with the reasons of all of them."""
     made: list[Any] = []
     reasons: set[str] = set()
     for compute in computations:
@@ -180,7 +180,7 @@ def all_of(computations: Iterable[Computation]) -> list[Any]:
 
 
 def known(values: Iterable[Any]) -> list[Computation]:
-    """Values as computations that give them."""
+    """Values as computations."""
     return [partial(_itself, value) for value in values]
 
 
@@ -193,13 +193,13 @@ def _itself(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A message, as an object or a mapping, together with what its type model says about it."""
+    """A message, as an object or a mapping, with its type model."""
 
     message: Any
     type: MessageType
 
     def read(self, name: str) -> Any:
-        """The value of a field. Raises KeyError when the type has none of this name."""
+        """The value of a field. Raises KeyError if the type has no field of this name."""
         field = self.type.field(name)
         if field is None:
             raise KeyError(f"{self.type} has no field '{name}'")
@@ -210,7 +210,7 @@ class View:
 
 
 def seen(raw: Any, declared: Type) -> Any:
-    """A field's value as expressions see it. Raises Refused for text that is not UTF-8, which comes as bytes."""
+    """A field's value in expressions. Raises Refused for text that is not UTF-8, which is given as bytes."""
     match declared:
         case MessageType() if declared.name in TIMES:
             time = View(raw, declared)

@@ -1,6 +1,6 @@
-"""The oracle's other half: what `reference` makes of a mapping as a protobuf message, by its constructor.
+"""The oracle's other half: makes protobuf messages from the results of `reference`, with their constructors.
 
-Knows values and descriptors only. What protobuf refuses is a ValueError.
+Uses only values and descriptors. Raises ValueError for what protobuf refuses.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.oracles.reference import Value
 
 
 def envelope_of(schema: ProtoSchema, envelope: Envelope, case: PayloadCase, payload: dict[str, Value]) -> bytes:
-    """A payload of these fields in its envelope, as protobuf serialises it."""
+    """An envelope with a payload of these fields, serialized by protobuf."""
     made = _message(schema.descriptor(case.type.name), payload)
     return envelope.message_class(**{case.name: made}).SerializeToString()
 

@@ -1,7 +1,7 @@
-"""The oracle of a whole table, put together of the others: what its targets get, and what they miss.
+"""The oracle of a whole table, composed of the other oracles: the messages that targets get and lose.
 
-It knows the rules of docs/reference/table.md and docs/design/reload.md, and in which order timers are served that are
-due at the same time: what was added last, first.
+Implements the rules of docs/reference/table.md and docs/design/reload.md. Of timers that are due at the same time, the
+one added last is served first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ COMMAND, TELEMETRY, BULK = range(3)
 
 
 class Happened(NamedTuple):
-    """`what` is sent, braked, published, filtered, collected, or why a message was dropped; `data` what has left."""
+    """`what` is sent, braked, published, filtered, collected or the reason of a drop; `data` is the sent message."""
 
     at: int
     route: str
@@ -33,7 +33,7 @@ class Happened(NamedTuple):
 
 @dataclass(frozen=True)
 class Target:
-    """One of a route; `only_positive` is its condition, of the number that messages have."""
+    """A target of a route; `only_positive` is a condition on the number in messages."""
 
     route: str
     label: str
@@ -44,7 +44,7 @@ class Target:
     is_latest: bool = False
     only_positive: bool = False
     feeds: tuple[str, ...] = ()
-    """The routes whose deadmen its messages feed, or disarm if it is another route's."""
+    """The routes whose deadmen its messages feed, or disarm if the deadman is another route's."""
 
     @property
     def place(self) -> tuple[str, str]:
@@ -78,7 +78,7 @@ class Timer(Protocol):
 
 
 class Timers:
-    """Those that one thread serves, the one that was added last first."""
+    """The timers of one thread, the one added last first."""
 
     def __init__(self) -> None:
         self.listed: list[Timer] = []
@@ -137,7 +137,7 @@ class _FramesTimer:
 
 
 class Model:
-    """A table at work from `start` on. `happened` in order; `changes` are those of deadmen: whose, and to tripped."""
+    """A running table. `happened` has events in order, `changes` those of deadmen: route, and whether tripped."""
 
     def __init__(self, table: Table, start: int) -> None:
         self.now, self.ahead = start, 0
@@ -157,14 +157,14 @@ class Model:
     def datagram(
         self, route: str, source: str | None, data: bytes, number: int, arrived: int, topics: Mapping[str, bytes]
     ) -> None:
-        """`topics` are what they get of it."""
+        """Serve a datagram; `topics` are the messages that topics get."""
         born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
         for target in self.table.of(route):
             oldest = born.oldest if target.is_board else born.youngest
             self._deliver(target, source, topics[target.label] if target.is_topic else data, number, oldest)
 
     def part(self, route: str, part: Part, arrived: int) -> None:
-        """A datagram of a route with `collect` and one source, for its one topic; that gets the payloads."""
+        """Serve a datagram of a route with `collect`, one source and one topic, which gets the payloads."""
         born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
         (target,), (source,) = self.table.of(route), self.table.sources[route]
         timer: _FramesTimer = self._kept[_frames_key(self.table, route)]
@@ -221,7 +221,7 @@ class Model:
         self._deadmen.events.clear()
 
     def _tell_frames(self, target: Target, frames: Frames) -> None:
-        """What was lost gave way to the part that was counted last."""
+        """Report losses, which made room for the part counted last."""
         for what in (MAPPING_ERROR, INCOMPLETE, FILTERED, COLLECTED):
             self.happened += [Happened(self.now, *target.place, what)] * frames.counted[what]
         frames.counted.clear()
@@ -249,7 +249,7 @@ class Model:
     # reloads
 
     def reload(self, table: Table) -> None:
-        """State of the same key goes along. What the next table does not hold leaves first, then what it changes."""
+        """Reload, keeping state with the same key. Messages without a place in the next table leave first."""
         kept: dict[Key, Any] = {}
         for key, make in self._state_of(table, kept):
             kept[key] = self._kept[key] if key in self._kept else make()
@@ -266,7 +266,7 @@ class Model:
         self._kept, self.table = kept, table
 
     def _state_of(self, table: Table, kept: Mapping[Key, Any]) -> Iterator[tuple[Key, Callable[[], Any]]]:
-        """The keys of what a table keeps, in the order in which timers are added, and what makes it."""
+        """The keys of a table's state with functions that create it, in the order in which timers are added."""
         for endpoint, bandwidth in table.bandwidths.items():
             yield ("pacer", endpoint, bandwidth), partial(Pacer, bandwidth, self._fate)
         for target in table.targets:
@@ -291,7 +291,7 @@ class Model:
             group.add(kept)
 
     def _replace_deadmen(self, table: Table) -> list[Timer]:
-        """Return those that end."""
+        """Replace the deadmen, and return those that end."""
         ended: list[Timer] = []
         for route, plan in table.deadmen.items():
             earlier = self._deadman_timers.get(route)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Does what docs/guides say for ROS 2 from apt, on Ubuntu 24.04 with a /opt/ros/jazzy that ros_prefix.py makes. Needs root.
+# Follows docs/guides for ROS 2 from apt, on Ubuntu 24.04 with a /opt/ros/jazzy built by ros_prefix.py. Needs root.
 #
-#   tests/platforms/apt.sh [STEP...]     all of them in this order unless said
+#   tests/platforms/apt.sh [STEP...]     by default all, in this order
 #
 #   setup      make setup ROS=/opt/ros/jazzy, router validate, doctor and test, as docs/guides/deploy.md says
 #   demo       make demo
@@ -9,13 +9,14 @@
 #   workspace  colcon build and the built router, as docs/guides/ros-workspace.md says, and test_ros_package.py
 #   test       make test; TESTS=tests/ros for some
 #
-# It tests the last commit, in the clone ~rover/ws/src/router of the root `noble` (root.sh), which it leaves there. The
-# user rover does all but the service. `ros2 run` and `ros2 launch` are left out: PyPI has neither ros2cli nor launch.
+# Tests the last commit in the clone ~rover/ws/src/router of the root file system `noble` (root.sh), and keeps the
+# clone. The user rover runs everything except the service. `ros2 run` and `ros2 launch` are not tested: PyPI has neither
+# ros2cli nor launch.
 set -euo pipefail
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 here=$repository/tests/platforms
 clone=/home/rover/ws/src/router
-# What ros-jazzy-ros-base takes from Ubuntu, then what the steps need.
+# Dependencies of ros-jazzy-ros-base from Ubuntu, then those of the steps.
 packages="python3-catkin-pkg python3-empy python3-lark python3-numpy python3-packaging python3-psutil"
 packages+=" python3-setuptools python3-yaml systemd systemd-sysv"
 steps=("$@")
@@ -59,7 +60,7 @@ service() {
   "$here/root.sh" noble bash -ec "
     cd $clone
     . .venv/env.sh
-    # The clone is rover's: nothing of root's is left in it.
+    # The clone belongs to rover and contains no files of root.
     PYTHONDONTWRITEBYTECODE=1 .venv/bin/python -m pytest -q -p no:cacheprovider tests/deploy/test_systemd.py"
 }
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Installs the router on an emulated aarch64 with Python 3.13, from a wheel as docs/guides/deploy.md says, and tries it:
-# `validate` and `test`, a router from UDP to UDP with a deadman, and the carrier's tests that need no ROS, which has no
-# wheels for aarch64. Needs root, and takes an hour with the root that it builds the first time.
+# Installs the router from a wheel, as in docs/guides/deploy.md, on an emulated aarch64 with Python 3.13. Runs
+# installed.sh, and the carrier's tests that need no ROS, which has no wheels for aarch64. Needs root. Takes an hour the
+# first time, when it builds the root file system.
 #
-#   tests/platforms/arm64.sh [TEST...]     of the carrier's, as pytest takes them; all unless said
+#   tests/platforms/arm64.sh [TEST...]     arguments for pytest; by default all tests of the carrier
 #
-# What is tested is the last commit. Do not judge speed by it.
+# Tests the last commit. Says nothing about speed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 
@@ -18,7 +18,7 @@ tar x -C checkout
 python3 -m venv venv
 . venv/bin/activate
 say "install, on $(uname -m), $(python3 -V)"
-# Byte code is made of what is imported only: of everything, it takes as long as all the rest.
+# Compile only imported modules: compiling all takes as long as everything else.
 export PIP_CONSTRAINT=$PWD/checkout/constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_COMPILE=1
 pip wheel -q --no-deps -w dist ./checkout
 ls dist

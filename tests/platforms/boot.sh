@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# Boots a root of root.sh as a computer of its own, with its systemd as process 1, and runs a command there. Needs root.
+# Boots a root file system of root.sh as a separate computer with systemd as process 1, and runs a command there. Needs
+# root.
 #
 #   tests/platforms/boot.sh noble|trixie COMMAND...
 #
-# The kernel is User Mode Linux, an ordinary process: it may do what a container here may not, such as raise the limits
-# of a service. The computer has no network but loopback. What is written in its root is gone with it.
+# The kernel is User Mode Linux, an ordinary process, in which a service may raise its limits; a container here may not.
+# The computer has only a loopback network. Changes of its root file system are lost.
 set -euo pipefail
 
 die() {
@@ -23,7 +24,7 @@ for each in lib/systemd/systemd lib/systemd/systemd-udevd usr/bin/dbus-daemon sb
   [ -e "$root/$each" ] || NEEDS="systemd udev dbus kmod procps" "$(dirname "$0")/root.sh" "$name" true
 done
 
-# What both sides see: here it is a folder, there it is /host.
+# Shared folder, mounted at /host on the booted computer.
 shared=$(mktemp -d)
 init=$(mktemp -p "$root/var/tmp")
 trap 'rm -rf "$shared" "$init"' EXIT

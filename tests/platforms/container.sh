@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Builds deploy/container with podman, runs it as compose.yaml says, and looks at what it does. Needs root.
+# Builds deploy/container with podman, runs it with compose.yaml, and checks it. Needs root.
 #
 #   tests/platforms/container.sh
 #
-# No image registry is asked. Ubuntu 24.04 of root.sh, with ROS as ros_prefix.py makes it, stands for
-# ros:jazzy-ros-base; Prometheus and Grafana are left out. The router runs the tests' rover in a network of its own,
-# where all addresses of rover and boards are this computer's, and beside nothing else.
+# Uses no image registry. Ubuntu 24.04 of root.sh, with ROS from ros_prefix.py, replaces ros:jazzy-ros-base; Prometheus
+# and Grafana are left out. The router runs the tests' rover alone in a separate network, in which this computer has all
+# addresses of rover and boards.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
@@ -44,8 +44,8 @@ build() {
   podman build --network host --ulimit "nofile=$(ulimit -Hn)" --ulimit nproc=4096 "$@"
 }
 
-# In mounts of its own: podman uses no hybrid hierarchy of control groups. Limits stay, since it may not raise them where
-# this is a container itself.
+# In a separate mount namespace, because podman does not support hybrid cgroups. Keeps the limits, because podman cannot
+# raise them inside a container.
 if [ "${1:-}" != inside ] && [ "${1:-}" != running ]; then
   [ "$(id -u)" = 0 ] || die "needs root"
   command -v podman >/dev/null || die "needs podman: apt-get install podman"
@@ -66,7 +66,7 @@ if [ "$1" = inside ]; then
   exec unshare --net "$0" running
 fi
 
-# Here the network is the one of the router, which its container has as well.
+# In the network namespace of the router's container.
 ip link set lo up
 for address in 192.168.0.{1,10,30,40,50,222}; do ip address add "$address/24" dev lo; done
 work=$(mktemp -d)

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Tries an installed router in the current folder: the tables that come with it, a router from UDP to UDP, and, where ROS
-# is installed, a router that publishes to a ROS topic.
+# Tests an installed router in the current folder: its tables, a router from UDP to UDP, and, if ROS is installed, a
+# router that publishes to a ROS topic.
 #
 #   tests/platforms/installed.sh VENV/bin/router
 set -euo pipefail

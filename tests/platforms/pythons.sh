@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Runs `make test` with each Python from 3.10 to 3.13 that is found here, and says which passed, failed or are missing.
+# Runs `make test` with each Python from 3.10 to 3.13 found here, and prints which passed, failed or are missing.
 #
-#   tests/platforms/pythons.sh [VARIABLE=VALUE...]   variables for make, such as TESTS=tests/wire
+#   tests/platforms/pythons.sh [VARIABLE=VALUE...]   variables for make, for example TESTS=tests/wire
 #
-# Each tests the last commit, in a clone with a .venv of its own. Clones and logs lie in $ROUTER_PYTHONS,
-# ~/.cache/rover-router/pythons unless said, and stay there, so that the next run is set up in seconds.
+# Tests the last commit, for each Python in a separate clone. Clones and logs are kept in $ROUTER_PYTHONS, by default
+# ~/.cache/rover-router/pythons, so that the next set-up takes seconds.
 set -euo pipefail
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 folder=${ROUTER_PYTHONS:-$HOME/.cache/rover-router/pythons}

@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# Runs a command in a root of another distribution, which is built once by debootstrap. Needs root.
+# Runs a command in a root file system of another distribution, built once by debootstrap. Needs root.
 #
-#   tests/platforms/root.sh NAME [COMMAND...]     a shell unless said
+#   tests/platforms/root.sh NAME [COMMAND...]     by default a shell
 #
 #   noble         Ubuntu 24.04, Python 3.12
 #   jammy         Ubuntu 22.04, Python 3.10
 #   trixie        Debian 13, Python 3.13
 #   trixie-arm64  the same for aarch64, emulated by qemu-user-static
 #
-# Each has what the README asks for. They lie in $ROUTER_ROOTS, ~/.cache/rover-router/roots unless said; remove them
-# there. This checkout is at /checkout, read-only: clone it. The command sees this computer's network, and processes and
-# mounts of its own. NEEDS="git curl" installs more packages before it runs.
+# Each has the packages that the README requires. They are in $ROUTER_ROOTS, by default ~/.cache/rover-router/roots.
+# This checkout is at /checkout, read-only: clone it. The command has this computer's network, but its own PID and mount
+# namespaces. NEEDS="git curl" installs more packages first.
 set -euo pipefail
 
 die() {
@@ -51,7 +51,7 @@ find_ubuntus_keys() {  # Debian has them in a package; where this computer's doe
 
 build() {
   rm -rf --one-file-system "$root.new"
-  # A mirror that is not said is the distribution's own.
+  # By default the distribution's own mirror.
   debootstrap --variant=minbase --arch=$architecture --include=$packages "${more[@]}" "$suite" "$root.new" '' $script \
     >"$root.log" 2>&1 || die "the root of $name could not be built: see $root.log"
   mv "$root.new" "$root"
@@ -68,7 +68,7 @@ flock 9
 [ -d "$root" ] || build
 exec 9>&-
 
-# In mounts and processes of its own, which end with the command. Names and certificates are this computer's.
+# In its own mount and PID namespaces, which end with the command, with this computer's DNS and certificates.
 enter='
 set -e
 root=$1 checkout=$2 needs=$3

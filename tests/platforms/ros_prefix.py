@@ -1,10 +1,10 @@
-"""Makes /opt/ros/jazzy as Ubuntu's packages lay it out, of the wheels that pyproject.toml names.
+"""Builds /opt/ros/jazzy with the layout of Ubuntu's packages from the wheels in pyproject.toml.
 
 python3 tests/platforms/ros_prefix.py [PREFIX]
 
-Run it by the distribution's Python 3.12, which has what ROS there takes from Debian packages: `apt.sh` does. There are
-no wheels of launch and ros2cli. ament's own templates make the scripts to be sourced; the hooks of ros_environment,
-which has no wheel either, say the same as the real ones.
+`apt.sh` runs it with the distribution's Python 3.12, which has ROS's dependencies from Debian packages. There are no
+wheels of launch and ros2cli. ament's templates generate the set-up scripts; the hooks of ros_environment, which has no
+wheel either, are equivalent to the real ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VENV_ONLY = ("pyvenv.cfg", "lib64", "bin/activate*", "bin/Activate.ps1", "bin/py
 
 
 def requirements() -> list[str]:
-    """The ROS packages without what comes along with the wheels: Ubuntu has these in Debian packages."""
+    """The ROS packages without the wheels' other dependencies, which Ubuntu has as Debian packages."""
     return re.findall(r'"(ros-jazzy-[^"]*)"', (ROOT / "pyproject.toml").read_text())
 
 
@@ -49,7 +49,7 @@ def make(prefix: Path) -> None:
 
 
 def leave_only_ros(packages: Path) -> None:
-    """Remove all other packages, and what pip knows of any."""
+    """Remove all other packages and all of pip's metadata."""
     for metadata in list(packages.glob("*.dist-info")):
         if not metadata.name.startswith("ros_"):
             distribution = Distribution.at(metadata)
@@ -76,7 +76,7 @@ def take_shebangs_from_the_system(prefix: Path) -> None:
 
 
 def write_setup(prefix: Path, packages: Path) -> None:
-    """What ament_generate_environment() does in ros_workspace."""
+    """Write the set-up scripts, as ament_generate_environment() does in ros_workspace."""
     filled = {
         "CMAKE_INSTALL_PREFIX": str(prefix),
         "SKIP_PARENT_PREFIX_PATH": "1",

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs tests/deploy/test_systemd.py on a booted computer: with the systemd of a root of root.sh as process 1, udev, and
-# the right to raise limits, which is what a rover has. Needs root, and some minutes.
+# Runs tests/deploy/test_systemd.py on a booted root file system of root.sh: with systemd as process 1, udev, and the
+# right to raise limits, as on a rover. Needs root, and takes some minutes.
 #
 #   tests/platforms/systemd.sh noble|trixie [PYTEST ARGUMENT...]
 set -euo pipefail
@@ -10,7 +10,7 @@ name=${1:?noble or trixie}
 shift
 "$here/root.sh" "$name" true
 
-# A copy of this checkout in the root, with an environment that stays for the next time.
+# A copy of this checkout in the root file system. Its environment is kept for the next run.
 copy=$roots/$name/srv/router
 mkdir -p "$copy"
 find "$copy" -mindepth 1 -maxdepth 1 ! -name .venv -exec rm -rf {} +

@@ -1,7 +1,7 @@
 """A router from UDP to UDP with a deadman, on loopback: `python3 udp_to_udp.py ROUTER`, with any Python.
 
-Exits with 0 if each datagram arrived as it was sent, the brake came when commands stopped, `/metrics` told both, and
-SIGTERM ended the router with 0. Prints what it saw, also of the router's log.
+Exits with 0 if each datagram arrived unchanged, the brake came when commands stopped, `/metrics` counted both, and the
+router exited with 0 on SIGTERM. Prints the results, and warnings of the router's log.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def counted(metric: str) -> int:
 
 
 def drive(operator: socket.socket, board: socket.socket) -> tuple[int, float]:
-    """How many commands arrived byte for byte, and seconds from the last one to the brake."""
+    """The number of commands that arrived unchanged, and the seconds from the last one to the brake."""
     whole, arrived_at = 0, monotonic()
     for number in range(128, 128 + COMMANDS):
         operator.sendto(command(number), LISTENER)

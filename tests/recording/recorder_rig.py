@@ -1,4 +1,4 @@
-"""What tests of recordings share: datagrams of the rover, and a router that is nothing but a mirror."""
+"""Helpers for tests of recordings: datagrams of the rover, and a router that is only a mirror."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def imu(accel_x: float = 1.5) -> bytes:
 
 @st.composite
 def datagrams(draw: st.DrawFn) -> bytes:
-    """What boards send, what is left of it, and what nobody sends."""
+    """Datagrams of boards, truncated ones, and garbage."""
     kind = draw(st.sampled_from(["bytes", "payload", "cut", "changed", "padded", "long length"]))
     if kind == "bytes":
         return draw(st.binary(max_size=300))
@@ -72,7 +72,7 @@ def endpoints() -> dict[str, Endpoint]:
 
 
 def table(**changed: Any) -> RouteTable:
-    """All of it that a recording knows."""
+    """The part of a table that a recording contains."""
     listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
     told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, **changed}
     return cast("RouteTable", SimpleNamespace(**told))
@@ -86,17 +86,17 @@ def classifier() -> Classifier:
 def shown(
     data: bytes, at: int = START, peer: Peer = SENSOR_BOARD, listener: str = "rover", reason: str = ""
 ) -> MirroredDatagram:
-    """What the mirror says of a datagram."""
+    """The mirror's record of a datagram."""
     return MirroredDatagram(at, listener, peer, NAMES.get(peer, ""), reason, data)
 
 
 def seen(*datagrams: bytes, at: int = START, peer: Peer = SENSOR_BOARD, reason: str = "") -> list[MirroredDatagram]:
-    """One each millisecond."""
+    """Records of datagrams, one per millisecond."""
     return [shown(data, at + number * MILLISECOND, peer, reason=reason) for number, data in enumerate(datagrams)]
 
 
 def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
-    """A file with a chunk of each batch, on a clock that nobody sets."""
+    """A file with one chunk per batch, with a constant clock offset."""
     channels = Channels()
     encoder = Encoder(channels)
     chunks = [encoded(encoder, batch) for batch in batches]
@@ -104,7 +104,7 @@ def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = Tr
 
 
 def encoded(encoder: Encoder, batch: Sequence[MirroredDatagram]) -> Chunk:
-    """A chunk of one batch, on a clock that nobody sets."""
+    """A chunk of one batch, with a constant clock offset."""
     encoder.add(batch, classifier(), batch[-1].at, batch[-1].at - START)
     return taken(encoder)
 
@@ -132,12 +132,12 @@ def read(path: Path) -> list[Recorded]:
 
 
 def again(found: Recorded) -> MirroredDatagram:
-    """What was recorded, as it was seen."""
+    """The recorded datagrams, as the mirror showed them."""
     return MirroredDatagram(found.at, found.listener, found.peer, found.endpoint, found.reason, found.data)
 
 
 class FakeMirror:
-    """Shows what the test says, at once: datagrams of a router that runs `program`."""
+    """Shows a test's datagrams at once, as of a router that runs `program`."""
 
     def __init__(self) -> None:
         self.show: Callable[[Sequence[MirroredDatagram]], None] = print

@@ -18,12 +18,12 @@ SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
 
 
 def cdr(text: str) -> bytes:
-    """A std_msgs/msg/String."""
+    """The CDR bytes of a std_msgs/msg/String."""
     return padded(serialize_message(String(data=text)))
 
 
 def padded(data: bytes) -> bytes:
-    """As DDS hands on what was published: to a multiple of four."""
+    """The bytes as DDS delivers them: padded to a multiple of four."""
     return bytes(data) + bytes(-len(data) % 4)
 
 

@@ -1,8 +1,8 @@
-"""A ROS publisher or subscriber in a process of its own: `Publisher` and `Subscriber` start it, this file is it.
+"""A ROS publisher or subscriber in a separate process: `Publisher` and `Subscriber` start this file as a script.
 
-The publisher prints "matched" for each subscriber that it finds, publishes each line of its standard input (a message's
-bytes in hex), prints "acknowledged" at an empty line when subscribers have all of it. The subscriber prints "matched"
-for each publisher that it finds, and each message's bytes in hex. Both end with their standard input.
+The publisher prints "matched" for each subscriber that it finds, and publishes each line of stdin (a message's bytes in
+hex). After an empty line it prints "acknowledged" when subscribers have all messages. The subscriber prints "matched"
+for each publisher that it finds, and each message's bytes in hex. Both exit when stdin ends.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-sys.path.insert(0, str(Path(__file__).parents[2]))  # a script is not started from the repository's root
+sys.path.insert(0, str(Path(__file__).parents[2]))  # sys.path of a script lacks the repository's root
 
 from router.ros.types import installed_class
 from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
@@ -29,19 +29,19 @@ from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
 class Publisher(RosProcess):
     """`Publisher("arm_target", "comms/msg/ArmBoardTargetMovement", "--best-effort")`; close it.
 
-    With `--flood` it publishes what it was last told over and over.
+    With `--flood` it publishes the last message again and again.
     """
 
     def __init__(self, topic: str, type_name: str, *options: str) -> None:
         super().__init__(__file__, "publish", topic, type_name, *options)
 
     def publish(self, messages: Iterable[bytes]) -> None:
-        """CDR bytes, in this order."""
+        """Publish messages, as CDR bytes, in this order."""
         self.process.stdin.writelines(f"{cdr.hex()}\n" for cdr in messages)
         self.process.stdin.flush()
 
     def await_receipt(self) -> None:
-        """Subscribers have all that was published when this returns, in their queues at least."""
+        """Wait until subscribers have received all messages, at least in their queues."""
         self.publish([b""])
         assert self.line() == "acknowledged"
 
@@ -80,8 +80,8 @@ def main() -> None:
     node = rclpy.create_node("peer")
 
     def on_matched(status: Any) -> None:
-        if status.current_count_change > 0:  # not where a peer of an earlier test is found to be gone
-            # A subscriber learns of a publisher later; what it misses until then has to be repaired.
+        if status.current_count_change > 0:  # not when a peer of an earlier test disappears
+            # A subscriber discovers a publisher later, and earlier messages have to be resent to it.
             sleep(0.1 if arguments.role == "publish" else 0)
             for _ in range(status.current_count_change):
                 print("matched", file=lines)

@@ -22,7 +22,7 @@ SETTINGS = {
         "validate": True,
         "hover": True,
         "completion": True,
-        "schemaStore": {"enable": False, "url": ""},  # schemas come from the modeline alone, nothing from the network
+        "schemaStore": {"enable": False, "url": ""},  # schemas come from the modeline only, not from the network
     }
 }
 
@@ -81,7 +81,7 @@ class LanguageServer:
         self._process.communicate()
 
     def open(self, path: Path, text: str) -> list[dict[str, Any]]:
-        """Open a document with this text, once; what the editor underlines in it."""
+        """Open a document with this text and return the editor's diagnostics."""
         uri = path.as_uri()
         document = {"uri": uri, "languageId": "yaml", "version": 1, "text": text}
         self._notify("textDocument/didOpen", {"textDocument": document})
@@ -90,12 +90,12 @@ class LanguageServer:
         return self._diagnostics[uri]
 
     def hover(self, path: Path, line: int, character: int) -> str:
-        """The text beside the pointer in an open document; positions count from 0."""
+        """The hover text at a position in an open document; positions count from 0."""
         result = self.request("textDocument/hover", _position(path, line, character))
         return str(result["contents"]["value"]) if result else ""
 
     def completions(self, path: Path, line: int, character: int) -> set[str]:
-        """What the editor offers to insert at a place of an open document."""
+        """The editor's completions at a position in an open document."""
         result = self.request("textDocument/completion", _position(path, line, character))
         return {str(item["label"]) for item in result["items"]}
 
@@ -111,7 +111,7 @@ class LanguageServer:
             self._take(message)
 
     def _take(self, message: Mapping[str, Any]) -> None:
-        """What the server says or asks on its own account."""
+        """Handle the server's notifications and requests."""
         if message.get("method") == "textDocument/publishDiagnostics":
             self._diagnostics[message["params"]["uri"]] = message["params"]["diagnostics"]
         elif message.get("method") == "workspace/configuration":

@@ -1,4 +1,4 @@
-"""A good table for the tests of this folder, and shortcuts to load texts."""
+"""A valid table for the tests of this folder, and shortcuts to load texts."""
 
 from __future__ import annotations
 
@@ -95,20 +95,20 @@ GATEWAY = """\
         deadman: {timeout: 500ms, send: {linear.x: 0.0, angular: {z: 1}}}
       - {topic: /stop, type: std_msgs/msg/Empty, deadman: {timeout: 1s, send: {}, repeat: 50ms}}
 """
-"""A good gateway, to stand under the key `gateways`."""
+"""A valid gateway for the key `gateways`."""
 
 
 def load(
     folder: Path, text: str | bytes, environ: Mapping[str, str] | None = None
 ) -> tuple[RouteTable | None, list[Diagnostic]]:
-    """The table of a text, written to `folder`."""
+    """Load the table of a text, written to `folder`."""
     path = folder / "table.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
     return load_table(path, environ or {})
 
 
 def good(folder: Path, text: str, environ: Mapping[str, str] | None = None) -> RouteTable:
-    """The table of a text without a finding."""
+    """The table of a text without findings."""
     table, findings = load(folder, text, environ)
     assert findings == []
     assert table
@@ -116,7 +116,7 @@ def good(folder: Path, text: str, environ: Mapping[str, str] | None = None) -> R
 
 
 def parts(folder: Path, text: str) -> tuple[RouteTable, list[Diagnostic]]:
-    """What is left of the table of a text with findings."""
+    """The valid parts of the table of a text with findings."""
     table, findings = load(folder, text)
     assert table
     assert findings
@@ -141,14 +141,14 @@ def places(findings: list[Diagnostic]) -> list[tuple[Code, int, int]]:
 
 
 def references(schema: Any, here: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Where a table's schema refers to a definition: keys from the root, `*` for any name; and the definition."""
+    """References in a table's schema: keys from the root, with `*` for any name, and the definition."""
     if isinstance(schema, list):
         for member in schema:
             yield from references(member, here)
     elif isinstance(schema, dict):
         if name := schema.get("$ref", "").rpartition("/")[2]:
             yield here, name
-            if name not in ("field_value", "nested_fields"):  # which hold themselves
+            if name not in ("field_value", "nested_fields"):  # which are recursive
                 yield from references(table_schema()["definitions"][name], here)
         for key, inner in schema.get("properties", {}).items():
             yield from references(inner, (*here, key))

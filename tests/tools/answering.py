@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from router.observe.problems import Problem
 
 COLLECTED_AT = 1_500_000_000.25
-"""When its numbers were read, s."""
+"""The time at which the metrics were collected, in s."""
 
 
 @contextmanager
@@ -23,9 +23,9 @@ def answering(
     table: str = "",
     health: str | None = None,
 ) -> Iterator[str]:
-    """Yield its URL. `text` is that of /metrics, `table` the SHA-256 of the running table.
+    """Yield the server's URL. `text` is the text of /metrics, `table` the SHA-256 of the running table.
 
-    `health` is what /health.json says in place of that and the problems.
+    `health` replaces the whole text of /health.json.
     """
     if health is None:
         told = [problem.json() for problem in problems]
@@ -40,7 +40,7 @@ def answering(
             self.wfile.write(answers.get(self.path, "").encode())
 
         def log_message(self, *_: object) -> None:
-            """Quiet."""
+            """Log nothing."""
 
     with HTTPServer(address, Handler) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))

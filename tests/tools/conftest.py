@@ -30,7 +30,7 @@ routes:
 
 @pytest.fixture(scope="session")
 def protos() -> Path:
-    """A folder with `every_kind.proto` alone."""
+    """A folder with `every_kind.proto` only."""
     return PROTOS
 
 
@@ -46,7 +46,7 @@ def every_kind(wire: Wire) -> PayloadCase:
 
 @pytest.fixture
 def table_path(tmp_path: Path) -> Callable[..., Path]:
-    """A table of a board and a basestation on free ports; `source` is that of `every_kind`."""
+    """Write a table with a board and a basestation on free ports; `source` is the source of `every_kind`."""
 
     def write(source: str = "board", source_port: bool = False) -> Path:
         path = tmp_path / "table.yaml"

@@ -40,7 +40,7 @@ _ENVIRONMENT = {"COLUMNS": "100", "NO_COLOR": "1"}
 
 
 class Played(NamedTuple):
-    """A command of a page, with what became of it."""
+    """A command of a page with its result."""
 
     command: Command
     output: str
@@ -53,7 +53,7 @@ class Played(NamedTuple):
 
     @property
     def shown(self) -> list[str]:
-        """What a page shows of it; lines with `...` that hold stay."""
+        """The command's text in a page; matching lines with `...` are kept."""
         masked = [line for line in self.command.printed if ANY in line and line != ANY]
         lines = []
         for line in self.output.rstrip().splitlines():

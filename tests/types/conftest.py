@@ -1,4 +1,4 @@
-"""Folders of `.proto` and `.msg` files written by the test, and what the router makes of them."""
+"""Folders of `.proto` and `.msg` files written by the test, and functions to load them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
 
 @pytest.fixture
 def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
-    """Write files by name; the folder is the working directory, so findings name them without a folder."""
+    """Write files by name into the working directory, so that findings name them without a folder."""
     monkeypatch.chdir(tmp_path)
 
     def write_files(files: Mapping[str, str]) -> Path:
@@ -51,7 +51,7 @@ def refusal(root: Path, message: str = "Envelope") -> tuple[Diagnostic, ...]:
 
 
 def with_envelope(root: Path) -> Path:
-    """The folder with a file that declares `Envelope` and imports all others, unless one of these declares it."""
+    """Add a file that declares `Envelope` and imports all others, unless one of them declares it. Return the folder."""
     own = root / "zz_envelope.proto"
     texts = {path: path.read_bytes() for path in root.rglob("*.proto") if path != own}
     if not any(b"message Envelope" in text for text in texts.values()):
@@ -61,7 +61,7 @@ def with_envelope(root: Path) -> Path:
 
 
 def settings(root: Path, message: str = "Envelope") -> tuple[Located[Path], Located[str]]:
-    """The folder and the envelope's name as a table says them."""
+    """The folder and the envelope's name as in a table."""
     return Located(root, SourceSpan("table.yaml", 2, 1)), Located(message, SourceSpan("table.yaml", 3, 12))
 
 
