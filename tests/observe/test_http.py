@@ -162,7 +162,7 @@ def test_what_there_is_not_is_said(server: HttpServer) -> None:
 
 def test_no_page_says_where_the_table_is(server: HttpServer, running: FakeRunning) -> None:
     path = running.program.table.path
-    for page in ("/", "/status.json", "/map.json", "/metrics", "/healthz", "/ready", "/nothing"):
+    for page in ("/", "/status.json", "/recent.json", "/map.json", "/metrics", "/healthz", "/ready", "/nothing"):
         assert f"{path.parent.name}/{path.name}" not in ask(server, page).text, page
     assert ask(server, "/status.json").json["table"] == path.name
 
@@ -485,6 +485,7 @@ def test_what_the_page_asks_for_is_made_once_for_all_that_look(
     monkeypatch.setattr(responses, "KEPT_SECONDS", 3600)
     assert len({ask(server, "/status.json").text for _ in range(5)}) == 1
     assert running.collected == 1
+    assert len({ask(server, "/recent.json").text for _ in range(5)}) == 1
     assert len({ask(server, "/map.json").text for _ in range(5)}) == 1
     assert len(mapped) == 1
 

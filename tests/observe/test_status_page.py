@@ -204,7 +204,7 @@ def test_what_is_dropped_is_crossed_and_said_in_words(running: FakeRunning, page
     assert page.text("#todo").startswith("The network refuses it, or nobody listens there")
     page.click("#show")
     page.until("document.querySelector('#name').textContent === 'imu_info'")
-    assert "dropped: 12 send_error" in page.text("#facts")
+    page.until("document.querySelector('#facts').textContent.includes('dropped: 12 send_error')")
 
 
 def test_what_the_table_holds_back_is_not_wrong(running: FakeRunning, page: Page) -> None:
