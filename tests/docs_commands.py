@@ -78,6 +78,8 @@ def steps(page: Path) -> list[File | Command]:
             continue
         if block.language == "console":
             found += commands(block)
+        elif block.language == "sh":
+            found += [Command(block.line + number, line, ()) for number, line in enumerate(block.lines)]
         elif block.lines and (path := file_name(block.lines[0])):
             lines = block.lines[block.language == "json" :]  # where a comment would be an error
             found.append(File(block.line, path, "\n".join([*lines, ""])))

@@ -27,7 +27,7 @@ PATIENCE = 60.0
 FIRST_LINE = 10.0
 """Seconds to wait for the first line of a background process before the next command."""
 
-UNSAID = ("", "sh", "bash", "shell")
+UNSAID = ("", "bash", "shell")
 
 
 def name(page: Path) -> str:
@@ -40,7 +40,7 @@ pages = pytest.mark.parametrize("page", PAGES, ids=name)
 @pages
 def test_each_block_says_what_it_is(page: Path) -> None:
     found = [f"{name(page)}:{block.line - 1}" for block in blocks(page) if block.language in UNSAID]
-    assert found == [], "commands are in `console` blocks, other text in `text` blocks"
+    assert found == [], "commands are in `console` or `sh` blocks, other text in `text` blocks"
 
 
 @pages
@@ -63,6 +63,13 @@ def test_output_is_compared_with_what_is_shown() -> None:
     assert (three.line, three.is_background) == (13, True)
     assert three.is_printed("ready\nmore\n")
     assert not three.is_printed("more\n")
+
+
+def test_commands_to_paste_are_steps_of_their_own(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Paste:\n\n```sh\nmake\nrouter demo &\n```\n")
+    one, two = steps(page)
+    assert (one, two) == (Command(4, "make", ()), Command(5, "router demo &", ()))
 
 
 @pytest.mark.slow
