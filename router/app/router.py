@@ -323,4 +323,4 @@ def _save(recorder: Recorder, reason: str) -> None:
     try:
         recorder.save(reason)
     except RecordError as error:
-        logger.error("the last datagrams could not be saved", problem=str(error))
+        logger.error("cannot save the last datagrams", problem=str(error))

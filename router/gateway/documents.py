@@ -94,7 +94,7 @@ def request(text: bytes) -> Request:
     try:
         found = _read(text)
     except msgspec.ValidationError as error:
-        raise PacketError(f"no request: {shown(str(error))}") from None
+        raise PacketError(f"not a request: {shown(str(error))}") from None
     if isinstance(found, _Schema):
         return SchemaRequest(found.type)
     return PublishRequest(found.topic, found.type, found.time, bytes(found.data))

@@ -125,13 +125,13 @@ class InboundPublisher:
         if request.type_name not in (None, wanted):
             raise self.refusal("wrong_type", f"{name} has the type {wanted}", name)
         if topic.ttl is not None and request.time is None:
-            raise InvalidMessageError(f"{name} needs the time at which it was sent")
+            raise InvalidMessageError(f"{name} requires `time`, the time of sending")
         return topic
 
     def _text(self, request: PublishRequest) -> bytes:
         """The JSON text of a message. Raises PacketError."""
         if len(request.data) > self._most:
-            raise TooLargeError(f"{len(request.data)} bytes are more than {self._most}")
+            raise TooLargeError(f"{len(request.data)} bytes exceed the limit of {self._most}")
         return decompress(request.data, self._most) if request.is_compressed else request.data
 
     def _publish(self, topic: _Topic, cdr: bytes, sent: float | None, arrived_ns: int) -> None:
@@ -168,7 +168,7 @@ class InboundPublisher:
             self.log.note(
                 topic.plan.label,
                 logger.warning,
-                "a client's clock is ahead: its messages are published for longer than ttl",
+                "a client's clock is ahead, so its messages stay valid for longer than ttl",
                 gateway=self._gateway,
                 topic=topic.plan.label,
                 ahead_s=round(ahead, 3),

@@ -194,7 +194,7 @@ def _layout(takes: Sequence[tuple[str, int, str]], phase: int) -> tuple[str, int
 
 
 def _refuse(representation: bytes) -> NoReturn:
-    raise UnreadableError(f"the message begins with 0x{representation.hex()}, which is not CDR_LE")
+    raise UnreadableError(f"the message starts with 0x{representation.hex()}, not with the header of CDR_LE")
 
 
 def _cut_off(cdr: bytes) -> NoReturn:
@@ -221,7 +221,7 @@ def _units(data: bytes) -> Any:
 
     units = np.frombuffer(data, "<u4")
     if len(units) and units.max() > _LARGEST_UNIT:
-        raise UnreadableError("a wstring has units that are no UTF-16")
+        raise UnreadableError("a wstring contains values above 0xFFFF, which are not UTF-16")
     return units
 
 
@@ -319,7 +319,7 @@ def reader(decoder: msgspec.json.Decoder[T]) -> Callable[[bytes], T]:
         except msgspec.ValidationError:
             raise
         except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
-            raise PacketError(f"no JSON: {shown(str(error))}") from None
+            raise PacketError(f"not JSON: {shown(str(error))}") from None
 
     return read
 
@@ -408,7 +408,7 @@ class _Writing:
                 put_wide_text(data, text)
             case String():
                 if "\0" in value:
-                    raise InvalidMessageError(f"{path}: a string of ROS holds no NUL")
+                    raise InvalidMessageError(f"{path}: a ROS string cannot contain NUL")
                 _check_size(len(value.encode()), "bytes", declared.bound, path)
                 put_text(data, value)
             case _:
@@ -417,7 +417,7 @@ class _Writing:
 
 def _check_size(size: int, unit: str, bound: int | None, path: str) -> None:
     if bound is not None and size > bound:
-        raise InvalidMessageError(f"{path}: {size} {unit} are more than {bound}")
+        raise InvalidMessageError(f"{path}: {size} {unit} exceed the bound of {bound}")
 
 
 def _put_scalars(data: bytearray, declared: Type, values: Sequence[Any], path: str) -> None:
@@ -425,11 +425,11 @@ def _put_scalars(data: bytearray, declared: Type, values: Sequence[Any], path: s
     try:
         put_numbers(data, letter, struct.calcsize(letter), values)
     except struct.error:  # msgspec has checked all others
-        raise InvalidMessageError(f"{path}: {max(values)} is outside of {declared}") from None
+        raise InvalidMessageError(f"{path}: {max(values)} is out of range for {declared}") from None
 
 
 def _wide_text_of_units(units: Sequence[int], path: str) -> str:
     try:
         return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
     except UnicodeDecodeError:
-        raise InvalidMessageError(f"{path}: the string has half of a surrogate pair") from None
+        raise InvalidMessageError(f"{path}: the string has an unpaired surrogate") from None

@@ -92,7 +92,9 @@ class KeptMessages:
                 self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
             )
         except StartError as error:
-            logger.warning("what publishers keep for late clients is not sent", topic=self._topic, error=str(error))
+            logger.warning(
+                "cannot fetch the messages that publishers keep for late joiners", topic=self._topic, error=str(error)
+            )
         else:
             self._found, arrived = await self._collect(self._tap, len(publishers))
             self._found_at = arrived, publishers

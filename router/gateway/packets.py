@@ -64,12 +64,12 @@ def pack(packet: Packet) -> bytes:
 def unpack(data: bytes) -> Packet:
     """Parse a packet; the names in it may be anything that is UTF-8. Raises PacketError."""
     if len(data) < HEAD.size:
-        raise PacketError(f"{len(data)} bytes are no packet")
+        raise PacketError(f"{len(data)} bytes are too short for a packet")
     time, kind = HEAD.unpack_from(data)
     if kind > 1:
-        raise PacketError(f"a packet of kind {kind}, where 0 and 1 are known")
+        raise PacketError(f"the packet has the unknown kind {kind}")
     if not math.isfinite(time):
-        raise PacketError(f"the time is {time}")
+        raise PacketError(f"the time is not finite: {time}")
     topic, start = _name(data, HEAD.size, "topic")
     type_name, start = _name(data, start, "type")
     return Packet(time, kind == 1, topic, type_name, data[start:])
@@ -120,7 +120,7 @@ def _batch(packets: list[bytes], time: float) -> Iterator[bytes]:
 def unbatched(datagram: bytes) -> list[bytes]:
     """The packets of a datagram, which is a batch or a packet itself. Raises PacketError."""
     if len(datagram) < HEAD.size:
-        raise PacketError(f"{len(datagram)} bytes are no packet")
+        raise PacketError(f"{len(datagram)} bytes are too short for a packet")
     if datagram[HEAD.size - 1] != BATCH:
         return [datagram]
     packets: list[bytes] = []
@@ -134,7 +134,7 @@ def unbatched(datagram: bytes) -> list[bytes]:
         if len(packet) < length:
             raise PacketError(f"the batch ends within a packet of {length} bytes")
         if length < HEAD.size or packet[HEAD.size - 1] == BATCH:
-            raise PacketError("a batch within another, or what is no packet")
+            raise PacketError("an item of the batch is a batch itself, or too short for a packet")
         packets.append(packet)
         start += length
     return packets
@@ -180,10 +180,10 @@ def decompress(data: bytes, most: int) -> bytes:
     Raises TooLargeError for more, PacketError for anything else: damage, a second frame, what needs a dictionary.
     """
     if not data.startswith(_MAGIC):
-        raise PacketError("the payload is no zstd frame")
+        raise PacketError("the payload is not a zstd frame")
     declared = _declared_size(data)
     if declared > most:
-        raise TooLargeError(f"the payload is {declared} bytes uncompressed, more than {most}")
+        raise TooLargeError(f"the payload has {declared} bytes uncompressed, more than {most}")
     limit = declared or most
     window = max(_LEAST_WINDOW_LOG, (most - 1).bit_length())
     try:
@@ -192,9 +192,9 @@ def decompress(data: bytes, most: int) -> bytes:
     except zstd.ZstdError as error:
         raise PacketError(f"the payload cannot be decompressed: {error}") from error
     if len(content) > limit:
-        raise TooLargeError(f"the payload is more than {limit} bytes uncompressed")
+        raise TooLargeError(f"the payload exceeds {limit} bytes uncompressed")
     if not decompressor.eof:
-        raise PacketError("the payload ends before its zstd frame does")
+        raise PacketError("the payload is a truncated zstd frame")
     if decompressor.unused_data:
         raise PacketError("bytes follow the payload's zstd frame")
     return content

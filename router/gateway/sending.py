@@ -224,7 +224,7 @@ class TopicSender:
         served.readable = sample
         if len(data.data) > self._most:
             if is_new:
-                detail = f"{len(data.data)} bytes, and at most {self._most} can be sent; {self._remedy}"
+                detail = f"{len(data.data)} bytes exceed the limit of {self._most}; {self._remedy}"
                 self._counters.dropped("too_large", sample.topic, detail=detail)
             return None
         return data

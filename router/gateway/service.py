@@ -136,7 +136,7 @@ class GatewayService:
         now = self._context.clock_ns()
         queue = self.clients.queues.get(client)
         if queue is None or now - self._answered < _ANSWER_NS:
-            refused = self._inbound.refusal("rate_limited", "schemas are sent 10 times per second at most")
+            refused = self._inbound.refusal("rate_limited", "schemas are sent at most 10 times per second")
             self._tell(client, refused)
             return
         self._answered = now

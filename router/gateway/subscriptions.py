@@ -181,7 +181,7 @@ class TopicSubscription:
         try:
             callback(self, sample)
         except Exception as error:  # noqa: BLE001 reported; the next message and the next gateway matter as much
-            self._loop.call_exception_handler({"message": f"a message of {self.topic} was lost", "exception": error})
+            self._loop.call_exception_handler({"message": f"a message on {self.topic} was lost", "exception": error})
 
 
 OnSample = Callable[[TopicSubscription, Sample], None]

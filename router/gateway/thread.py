@@ -178,9 +178,7 @@ class GatewayThread:
         try:
             await service.open()
         except StartError as error:
-            raise StartError(
-                f"{settings.transport.span}: gateway '{settings.name}' cannot be opened: {error}"
-            ) from error
+            raise StartError(f"{settings.transport.span}: cannot open gateway '{settings.name}': {error}") from error
         return service
 
     def _transport(self, settings: Gateway, events: Events) -> Transport:
@@ -200,7 +198,7 @@ class GatewayThread:
         try:
             self._call(_close(self._services.values()), _PATIENCE_OF_STOP_S)
         except StuckError as error:
-            logger.error("gateways are left open", why=str(error))
+            logger.error("gateways did not close within the timeout; continuing", why=str(error))
         finally:  # a running thread would keep the process
             self._loop.call_soon_threadsafe(self._subscriptions.close)
             self._loop.call_soon_threadsafe(self._loop.stop)
@@ -214,7 +212,7 @@ class GatewayThread:
         try:
             return done.result(patience)
         except FutureTimeoutError as error:
-            raise StuckError("the gateways are stuck in the middleware") from error
+            raise StuckError("the gateways are blocked by the ROS middleware") from error
 
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Report what a callback of the loop raised: a fault of the router."""

@@ -127,7 +127,7 @@ class Topics:
                 self._forget(topic)
             if topic not in self._not_installed:
                 self._not_installed.add(topic)
-                logger.warning("a topic cannot be served", gateway=self._name, topic=topic, error=str(error))
+                logger.warning("topic cannot be served", gateway=self._name, topic=topic, error=str(error))
         except Exception as error:  # noqa: BLE001 reported; other topics are served all the same
             self._failed(error)
 
@@ -156,7 +156,7 @@ class Topics:
             self._tasks.run(self._introduce(served))
         if selection.others:
             logger.warning(
-                "a topic has several types, and is served as that of most publishers",
+                "the topic has several types; serving the type of most publishers",
                 gateway=self._name,
                 topic=topic,
                 type=selection.type_name,

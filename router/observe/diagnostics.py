@@ -77,7 +77,7 @@ class Diagnostics:
                 self._publish(diagnostic_array(wall_ns(), self._node, report.statuses()))
             except Exception as error:  # noqa: BLE001 routing goes on without diagnostics
                 if not has_failed:
-                    logger.error("diagnostics cannot be published", problem=repr(error))
+                    logger.error("cannot publish diagnostics", problem=repr(error))
                 has_failed = True
             else:
                 has_failed = False

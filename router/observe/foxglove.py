@@ -105,11 +105,11 @@ class FoxgloveServer(ServerListener):
                 self._attach_while_subscribed()
             except StartError as error:
                 if is_well:
-                    logger.error("the view for Foxglove is closed; the router tries to open it again", why=str(error))
+                    logger.error("Foxglove server is down; retrying", why=str(error))
                 is_well = False
             except Exception as error:  # noqa: BLE001 a fault of the router, reported once; it may be over next time
                 if is_well:
-                    fault(error, "holds it up", "the view for Foxglove").log()
+                    fault(error, "stopped its updates", "the Foxglove server").log()
                 is_well = False
             else:
                 is_well = True
@@ -121,7 +121,7 @@ class FoxgloveServer(ServerListener):
             self._server.stop()
             self._subscribed.clear()
             self._server = _started(self._address, self._running.program.table.node.name, self._context, self)
-            logger.warning("Foxglove can connect again", address=str(self.address))
+            logger.warning("Foxglove server is up again", address=str(self.address))
 
     def _attach_while_subscribed(self) -> None:
         if not self._subscribed:
@@ -175,7 +175,7 @@ def _started(address: Located[Address], name: str, context: Context, listener: S
             why = f"{port_holder('tcp', port)} has the port"
         elif number == errno.EADDRNOTAVAIL:
             why = "no network interface of this computer has that address"
-        what = f"{address.span}: Foxglove cannot be served at {address.value}: {why}"
+        what = f"{address.span}: cannot serve Foxglove at {address.value}: {why}"
         raise StartError(what, "choose another foxglove.address") from error
 
 

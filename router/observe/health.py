@@ -1,7 +1,7 @@
-"""What is wrong with a running router, in words: decided here, and shown by all others.
+"""Decides what is wrong with a running router.
 
-The status page, `/diagnostics`, `router status`, `router top` and doctor show `Look.problems`. An alert of Prometheus
-has the name of its kind; tests compare words, levels and thresholds.
+The status page, `/diagnostics`, `router status`, `router top` and doctor all show `Look.problems`. The Prometheus
+alerts are named after the kinds; tests compare words, levels and thresholds.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ PERIOD = 1.0
 """Seconds between two snapshots."""
 
 WINDOW = 10
-"""Seconds: a loss is a problem for so long. One that comes and goes would be overlooked."""
+"""Seconds for which a loss remains a problem, so that a short one is not overlooked."""
 
 REMEDIES: Mapping[str, str] = {
-    "send_error": "The network refuses it, or nobody listens there: check that the receiver runs, and its address.",
-    "send_buffer_full": "The network is slower than what is sent: route less to it.",
-    "queue_full": "It is more than the `bandwidth`, or a thread is behind: route less to it, or raise the bandwidth.",
-    "stale": "It was older than its `ttl`: check the link, and that the clocks of both computers agree.",
-    "publish_error": "The ROS middleware refuses it: the log says why.",
-    "mapping_error": "The mapping fails on these values, as in a division by zero: `router explain` shows it.",
+    "send_error": "The network rejects them, or nothing listens there: check that the receiver runs, and its address.",
+    "send_buffer_full": "The network is too slow for them: route less to this target.",
+    "queue_full": "They exceed `bandwidth`, or a thread is behind: route less to this target, or raise the bandwidth.",
+    "stale": "They are older than `ttl`: check the link, and that the clocks of both computers agree.",
+    "publish_error": "The ROS middleware rejects them: the log says why.",
+    "mapping_error": "The mapping fails on these values, for example dividing by zero: `router explain` shows it.",
     "non_finite": "A value is NaN or infinite: check what the sender measures.",
-    "too_large": "It is larger than the receiver takes: the log names the field and its bound.",
-    "incomplete": "Frames are not complete when their time is up: datagrams are lost on the way.",
-    "source_mismatch": "No route takes it from that address: `router tap --only rejected` shows what comes from whom.",
+    "too_large": "They are larger than the receiver accepts: the log names the field and its limit.",
+    "incomplete": "Frames are still incomplete when their time is up: datagrams are lost on the way.",
+    "source_mismatch": "No route accepts them from that address: `router tap --only rejected` shows who sends what.",
     "unknown_case": "The sender's protos are newer than the router's: update them.",
     "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
-    "truncated": "They are longer than the router takes.",
-    "no_payload": "They are envelopes whose sender sets no payload: `router tap --only rejected` shows who sends them.",
-    "empty": "They have no bytes: `router tap --only rejected` shows who sends them.",
+    "truncated": "They are longer than the router accepts.",
+    "no_payload": "They are envelopes without a payload: `router tap --only rejected` shows who sends them.",
+    "empty": "They are empty: `router tap --only rejected` shows who sends them.",
 }
-"""By the reason of a loss."""
+"""Remedies by the reason of a loss."""
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
     Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
     Kind.GATEWAY_TOPIC_NOT_SERVED: ", topics not served: {:.0f}",
 }
-"""By how much a value is too large, where that is of interest."""
+"""The text that gives the value, for kinds where it matters."""
 
 _GAUGES = (Kind.LISTENER_WAITING, *_MORE)
 _LOSSES = (
@@ -64,25 +64,25 @@ _LOSSES = (
     Kind.RECORDING_INCOMPLETE,
 )
 _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
-"""What the table asks for, and what UNHANDLED_CASE says."""
+"""Reasons that the table asks for, and the one that UNHANDLED_CASE reports."""
 
 _NAMED = 3
-"""Routes that are named in words."""
+"""The most routes that a text names."""
 
 _OTHER_ADDRESS = (
-    "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and `router reload`: "
+    "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
     "`router tap --only rejected` shows what it sends."
 )
-_ALL_SILENT = "All endpoints are silent: check this computer's network, its cable, the switch, the radio."
+_ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
 @dataclass(frozen=True)
 class Look:
-    """A router at the time of the last of `snapshots`, of the last WINDOW seconds, oldest first.
+    """The state of a router. `snapshots` are those of the last WINDOW seconds, oldest first.
 
-    `silence`: for how long each endpoint has been silent, or was not heard yet, s. `standing`: for how long the receive
-    thread has made no progress, s. `tripped`: for how long the deadmen that send now have done so, s, by route.
-    `mismatches`: who sent in the last seconds what no route takes from them.
+    Times in seconds. `silence`: how long each endpoint has been silent, or has not been heard yet. `standing`: how long
+    the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
+    `mismatches`: recent senders of messages that no route accepts from them.
     """
 
     program: Program
@@ -98,11 +98,11 @@ class Look:
 
     @property
     def seconds(self) -> float:
-        """Between the first and the last snapshot."""
+        """The time from the first to the last snapshot."""
         return max(self.now.at - self.snapshots[0].at, 1e-9)
 
     def grown(self, metric: str) -> Iterator[tuple[Labels, int]]:
-        """The series that have counted in the last seconds, and how much."""
+        """Yield the series that have grown since the first snapshot, and by how much."""
         earlier = self.snapshots[0].counts(metric)
         for labels, value in self.now.counts(metric).items():
             if value > (before := earlier.get(labels, 0)):
@@ -110,7 +110,7 @@ class Look:
 
     @cached_property
     def problems(self) -> tuple[Problem, ...]:
-        """All that is wrong, in the order of kinds."""
+        """All problems, in the order of kinds."""
         found = chain(
             self._states(),
             self._silent(),
@@ -124,8 +124,8 @@ class Look:
 
     @cached_property
     def halted(self) -> frozenset[str]:
-        """The routes whose deadman has sent for so long that nobody drives: none of whose commands is refused, and
-        which the deadman reaches."""
+        """The routes that nobody drives: the deadman has been sending for long, reaches its endpoints, and no command
+        is dropped."""
         failing = {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
         for labels, _ in self.grown(Kind.MESSAGES_DROPPED.metric):
             named = dict(zip(SERIES[Kind.MESSAGES_DROPPED.metric], labels, strict=True))
@@ -135,7 +135,7 @@ class Look:
 
     @cached_property
     def away(self) -> Mapping[str, Sequence[str]]:
-        """By halted route, those who send its commands and are silent because nobody drives. A board is not."""
+        """By halted route, the senders of its commands that are silent because nobody drives. Boards do not count."""
         endpoints = self.program.table.endpoints
         away = {
             name for name in self._stale if endpoints[name].kind is not EndpointKind.BOARD and self._was_heard(name)
@@ -144,12 +144,12 @@ class Look:
 
     @cached_property
     def _sources(self) -> Mapping[str, set[str]]:
-        """The endpoints that each route takes messages from."""
+        """The endpoints that each route accepts messages from."""
         return {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
 
     @cached_property
     def _limits(self) -> Mapping[str, float]:
-        """The `stale_after` of each endpoint that a route takes messages from, s."""
+        """The `stale_after` (s) of each endpoint that a route accepts messages from."""
         senders = {name for names in self._sources.values() for name in names}
         return {
             endpoint.name: endpoint.stale_after / 1e9
@@ -174,7 +174,7 @@ class Look:
                 yield self._problem(Kind.GATEWAY_DISCONNECTED, {"route": name})
 
     def _silent(self) -> Iterator[Problem]:
-        """Those whose commands a deadman replaces first."""
+        """Yield silent endpoints, those whose commands a deadman replaces first."""
         silent, away = self._stale, set(chain.from_iterable(self.away.values()))
         held = set(chain.from_iterable(self._sources.get(route, ()) for route in self.tripped))
         for name in sorted(silent - away, key=lambda name: (name not in held, name)):
@@ -187,14 +187,14 @@ class Look:
                 remedy = _OTHER_ADDRESS.format(endpoint=name, address=self._host(name), sender=sender)
                 labels = {"endpoint": name, "sender": sender}
                 problem = problem._replace(
-                    labels=labels, more=f"{more}, and {sender} sends what it should", remedy=remedy
+                    labels=labels, more=f"{more}; {sender} sends its messages instead", remedy=remedy
                 )
             elif len(silent) == len(self._limits) > 1:
                 problem = problem._replace(remedy=_ALL_SILENT)
             yield problem
 
     def _expected(self, mismatch: Mismatch) -> list[str]:
-        """The endpoints that routes take this payload case from."""
+        """Return the endpoints that routes accept this payload case from."""
         routes = (route for route in self.program.table.routes if route.case.value == mismatch.payload_case)
         return list(dict.fromkeys(name for route in routes for name in sorted(self._sources[route.name] - {ANY})))
 
@@ -202,30 +202,30 @@ class Look:
         return self.program.table.endpoints[endpoint].address.value.host
 
     def _in_place_of(self, endpoint: str) -> str | None:
-        """Another host that sends what only this endpoint should."""
+        """Return another host that sends messages expected only from this endpoint."""
         hosts = (each.host for each in sorted(self.mismatches) if self._expected(each) == [endpoint])
         return next((host for host in hosts if host != self._host(endpoint)), None)
 
     def _mismatched(self, listener: str) -> tuple[str, tuple[str, ...]]:
-        """Who sends to a listener what others should, in words; and the routes that do not take it."""
+        """Describe who sends messages expected from others to a listener; also return the routes that reject them."""
         found = sorted(each for each in self.mismatches if each.listener == listener and self._expected(each))
-        names = {self._host(endpoint.name): f"{endpoint.name}, " for endpoint in self.program.table.endpoints.values()}
+        names = {self._host(endpoint.name): endpoint.name for endpoint in self.program.table.endpoints.values()}
         told: dict[str, None] = {}
         for each in found:
-            who = f"{names[each.host]}{each.host}," if each.host in names else each.host
+            who = f"{names[each.host]} ({each.host})" if each.host in names else each.host
             expected = self._expected(each)
             if each.host in map(self._host, expected):
-                told[f"{who} sends from another port, or to another listener, than the table says"] = None
+                told[f"{who} uses another port or listener than the table says"] = None
             else:
-                others = " or ".join(f"{name}, {self._host(name)}," for name in expected)
-                told[f"{who} sends what {others} should"] = None
+                others = " or ".join(f"{name} ({self._host(name)})" for name in expected)
+                told[f"{who} sends messages expected from {others}"] = None
         cases = {each.payload_case for each in found}
         routes = tuple(route.name for route in self.program.table.routes if route.case.value in cases)
         more = f"; and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
         return "; ".join([*told][:_NAMED]) + more, routes
 
     def _tripped(self) -> Iterator[Problem]:
-        """Deadmen that send in place of commands: somebody drove until just now, or nobody drives."""
+        """Yield the deadmen that send in place of commands."""
         for route, seconds in self.tripped.items():
             kind, more = Kind.DEADMAN_ACTIVE, ""
             if route in self.halted:
@@ -235,7 +235,7 @@ class Look:
             yield self._problem(kind, {"route": route}, more, (self._owner(route),))
 
     def _waiting(self) -> Iterator[Problem]:
-        """In a publish call, or for a thread."""
+        """Yield topics whose publish calls are stuck, and messages that wait for a thread."""
         stalls = [(each.at, each.counts(Kind.PUBLISH_STALLED.metric)) for each in self.snapshots]
         for topic, seconds in stalls[-1][1].items():
             between = (min(counts.get(topic, 0.0), at - before) for (before, _), (at, counts) in pairwise(stalls))
@@ -245,7 +245,7 @@ class Look:
         counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]
         waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
         if waiting > Kind.MESSAGES_WAITING.threshold:
-            yield self._problem(Kind.MESSAGES_WAITING, {}, f", {waiting:.0f} at least")
+            yield self._problem(Kind.MESSAGES_WAITING, {}, f", at least {waiting:.0f}")
 
     def _above(self, kind: Kind) -> Iterator[Problem]:
         for values, value in self.now.counts(kind.metric).items():
@@ -255,7 +255,7 @@ class Look:
                 yield self._problem(kind, labels, _MORE.get(kind, "").format(value), routes)
 
     def _lost(self, kind: Kind) -> Iterator[Problem]:
-        """What was lost in the last seconds and is not meant to be, summed over the labels that its words lack."""
+        """Yield unintended losses of the last seconds, summed over the labels that the words do not contain."""
         sums: dict[Labels, Counter[str]] = defaultdict(Counter)
         for metric in (kind.metric, *(["mirror_dropped"] if kind is Kind.RECORDING_INCOMPLETE else [])):
             for values, count in self.grown(metric):
@@ -280,7 +280,7 @@ class Look:
         return Kind.COMMANDS_DROPPED if are_commands else Kind.MESSAGES_DROPPED
 
     def _owner(self, route: str) -> str:
-        """The gateway that a client's deadman belongs to, which is called GATEWAY:TOPIC; or the route itself."""
+        """Return the gateway of a client's deadman, whose route is called GATEWAY:TOPIC; else the route itself."""
         gateway, _, topic = route.partition(":")
         return gateway if topic and gateway in self.program.table.gateways else route
 

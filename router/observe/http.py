@@ -96,7 +96,7 @@ class HttpServer:
         except OSError as error:
             in_use = error.errno == errno.EADDRINUSE
             why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
-            what = f"{span}: metrics cannot be served at {address}: {why}"
+            what = f"{span}: cannot serve HTTP at {address}: {why}"
             raise StartError(what, "choose another http.address") from error
         self._thread = Thread(self._server.serve, "http")
         try:
@@ -300,7 +300,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             query = parse_qs(asked, max_num_fields=MAX_IN_QUERY)
         except ValueError:
-            self._respond(plain(HTTPStatus.BAD_REQUEST, f"at most {MAX_IN_QUERY} values can be asked for"))
+            self._respond(plain(HTTPStatus.BAD_REQUEST, f"a query can have at most {MAX_IN_QUERY} values"))
             return
         if path == "/tap":
             asked_for = [query.get(key, []) for key in ("case", "from", "only")]
@@ -353,7 +353,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._respond(plain(HTTPStatus.BAD_REQUEST, str(error)))
             return
         if not self._connections.admit_tap(self.connection):
-            self._respond(plain(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MAX_TAPS} taps already: end one"))
+            self._respond(plain(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MAX_TAPS} taps already: close one"))
             return
         self.close_connection = True
         self.send_response(HTTPStatus.OK)

@@ -1,6 +1,6 @@
-"""The problems that a router can have: each kind with its level, words and remedy, and one of them as JSON.
+"""The problems that a router can have: the kinds with level, words and remedy, and a problem as JSON.
 
-`router status` needs no more than this, so it imports neither compiler nor protobuf.
+Imports neither compiler nor protobuf, so that `router status` starts fast.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 PAGE = "docs/troubleshooting/alerts.md"
-"""It has a section for each kind."""
+"""Has a section for each kind."""
 
 
 class Level(enum.Enum):
-    """CRITICAL: the rover may not obey. WARNING: something is lost. INFO: something is not as the table has it.
+    """CRITICAL: the rover may not obey. WARNING: something is lost. INFO: something differs from the table.
 
     CALM: nothing is wrong, but the rover stands still.
     """
@@ -33,8 +33,8 @@ class Level(enum.Enum):
 class Kind(enum.Enum):
     """A kind of problem, first those that explain others.
 
-    `words` have labels of `metric`, which is at fault above the `threshold`: losses per second, times in seconds.
-    `remedy` may also have the `{address}` of what the labels name.
+    `words` contain labels of `metric`. There is a problem while its value exceeds `threshold`: for losses per second,
+    for times in seconds. `remedy` can also contain the `{address}` of what the labels name.
     """
 
     def __init__(self, level: Level, words: str, remedy: str = "", metric: str = "", threshold: float = 0.0) -> None:
@@ -44,20 +44,20 @@ class Kind(enum.Enum):
     RECEIVE_STUCK = (
         Level.CRITICAL,
         "the receive thread is stuck",
-        "`systemctl restart rover-router`, then report it with its log.",
+        "Run `systemctl restart rover-router`, then report it with the log.",
         "",
-        2.0,  # without datagrams it makes progress each half second
+        2.0,  # without datagrams it makes progress every half second
     )
     LISTENER_WAITING = (
         Level.CRITICAL,
-        "{listener} receives nothing: its address or network interface is not there",
-        "It waits for {address}; `ip -br address` shows what there is.",
+        "{listener} receives nothing: its address or network interface does not exist",
+        "It waits for {address}: `ip -br address` shows the addresses and interfaces that exist.",
         "listener_waiting",
     )
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
-        "{destination} does not get what the deadman of {route} sends",
-        "Nobody listens at {address}, or the network refuses it. Stop the rover by other means.",
+        "the deadman of {route} cannot reach {destination}",
+        "Stop the rover by other means. Nothing listens at {address}, or the network rejects the datagrams.",
         "deadman_send_errors",
     )
     COMMANDS_DROPPED = (
@@ -70,25 +70,25 @@ class Kind(enum.Enum):
     ENDPOINT_SILENT = (
         Level.WARNING,
         "{endpoint} is silent",
-        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what comes.",
+        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what arrives.",
         "endpoint_last_seen_timestamp_seconds",  # the threshold is the endpoint's `stale_after`
     )
     DEADMAN_ACTIVE = (
         Level.WARNING,
         "commands of {route} do not get through: its deadman sends in their place",
-        "`router explain` says who sends them. Do they come often enough, from a clock that agrees with this one?",
+        "`router explain` says who sends them. Check that they arrive often enough, and that both clocks agree.",
         "deadman_active",
     )
     PUBLISH_STALLED = (
         Level.WARNING,
         "publishing on {topic} is stuck in the ROS middleware",
-        "A subscriber may be stuck, or was killed; forwarding and deadmen go on.",
+        "A subscriber may be stuck or was killed; forwarding and deadmen continue.",
         "publish_stalled_seconds",
         1.0,  # of all calls together
     )
     RELOAD_FAILED = (
         Level.WARNING,
-        "the last reload failed: the table from before it goes on",
+        "the last reload failed; the old table is still running",
         "`router validate` says what is wrong with the changed table.",
         "config_last_reload_successful",
     )
@@ -102,14 +102,14 @@ class Kind(enum.Enum):
     MESSAGES_WAITING = (
         Level.WARNING,
         "messages wait for a thread that publishes or sends",
-        "The computer is overloaded (`router top`), or the ROS middleware holds a thread.",
+        "The computer is overloaded (`router top`), or the ROS middleware blocks the thread.",
         "messages_waiting",
-        20,  # at all times, of all targets together; a few are there at each look where much is published
+        20,  # of all targets together, in each snapshot; where much is published, there are always a few
     )
     KERNEL_DROPS = (
         Level.WARNING,
         "the kernel drops datagrams of {listener}",
-        "Raise its `receive_buffer`, or find what takes the processor: `router top --once --sort rate`.",
+        "Raise its `receive_buffer`, or find what uses the CPU: `router top --once --sort rate`.",
         "kernel_drops",
     )
     DATAGRAMS_REJECTED = (
@@ -121,69 +121,69 @@ class Kind(enum.Enum):
     )
     UNHANDLED_CASE = (
         Level.WARNING,
-        "{payload_case} is received, and has no route",
+        "{payload_case} is received but has no route",
         "Write a route for it, or `ignore: reason`; `router tap` shows it.",
         "unhandled",
     )
     QOS_INCOMPATIBLE = (
         Level.WARNING,
         "nothing passes between {topic} and peers with another {policy}",
-        "`ros2 topic info -v {topic}` shows theirs, `router explain {route}` ours.",
+        "`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` the router's.",
         "qos_incompatible",
     )
     GATEWAY_DISCONNECTED = (
         Level.WARNING,
         "gateway {route} is not connected to its Zenoh router",
-        "Check that the hub runs, and that `connect` can be reached; the log says why it cannot.",
+        "Check that the hub runs and that `connect` is reachable; the log has the error.",
         "gateway_connections",
     )
     RECORDING_INCOMPLETE = (
         Level.WARNING,
-        "recordings or taps lack datagrams",
-        "The disk is full or too slow, or the computer too busy: `df`, `router doctor`.",
+        "recordings or taps are missing datagrams",
+        "The disk is full or too slow, or the computer is too busy: run `df` and `router doctor`.",
         "record_dropped",  # and mirror_dropped
     )
     ENDPOINT_NEVER_HEARD = (
         Level.INFO,
-        "{endpoint} was never heard since the router started",
+        "{endpoint} has not been heard since the router started",
         ENDPOINT_SILENT[2],
     )
     GATEWAY_CLIENT_SLOW = (
         Level.INFO,
         "client {client} of {route} is behind",
-        "It gets the latest values only. Give its gateway smaller `rates`, or `compression`.",
+        "It gets only the latest values. Give its gateway lower `rates`, or `compression`.",
         "gateway_client_lag_seconds",
         5,
     )
     GATEWAY_TOPIC_NOT_SERVED = (
         Level.INFO,
-        "types that {route} would need are not installed",
-        "`router explain {route} --live` names them: source their packages, or exclude them.",
+        "types that {route} needs are not installed",
+        "`router explain {route} --live` names them: source their packages, or exclude the topics.",
         "gateway_topics",
     )
     HALTED = (
         Level.CALM,
         "{route} is halted: no commands",
-        "Nobody drives; the next command ends it. Otherwise `router explain` says who sends commands.",
+        "Normal while nobody drives; the next command ends it. Otherwise `router explain` says who sends commands.",
         "deadman_active",
-        60,  # s; until then nobody knows whether the link was lost
+        60,  # s; until then it may be a lost link
     )
 
     @property
     def alert(self) -> str:
-        """The name of its alert and of its section on PAGE, such as `EndpointSilent`."""
+        """The name of its alert and of its section on PAGE, for example `EndpointSilent`."""
         return self.name.title().replace("_", "")
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Those in its words."""
+        """The labels in `words`."""
         return tuple(label for _, label, *_ in string.Formatter().parse(self.words) if label)
 
 
 class Problem(NamedTuple):
-    """What is wrong (`words`), with labels of its metric; by how much (`more`), which changes; and what to do.
+    """A problem of a running router. `labels` are those of its metric; `more` says by how much, which changes.
 
-    `routes`: the routes and gateways whose messages it concerns.
+    `routes`: the routes and gateways whose messages are affected.
     """
 
     kind: Kind
@@ -210,11 +210,11 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, read: Mapping[str, Any]) -> Problem:
-        """The one with this `json()`. Raises KeyError where it is not."""
+        """Return the problem with this `json()`. Raises KeyError if it is none."""
         kind = {kind.alert: kind for kind in Kind}[read["kind"]]
         labels = {label: str(read["labels"][label]) for label in {*kind.labels, *read["labels"]}}
         return cls(kind, labels, read["more"], read["remedy"], tuple(read["routes"]))
 
 
 DROPS = (Kind.COMMANDS_DROPPED, Kind.MESSAGES_DROPPED)
-"""What a target loses."""
+"""Losses of targets."""

@@ -66,7 +66,7 @@ class Reporter:
             return
         if report.kind == "drop":
             self._lost[report.place, report.target] = boottime_ns(), report
-        event = "message dropped" if report.kind == "drop" else "the deadman could not send"
+        event = "message dropped" if report.kind == "drop" else "deadman could not send"
         detail = {"detail": report.detail} if report.detail else {}
         error = {"error": self._text(report.error, report.target)} if report.error is not None else {}
         self._floods.note(
@@ -94,12 +94,12 @@ class Reporter:
     def deadman_changed(self, route: str, active: bool, plan: DeadmanPlan | None) -> None:
         """Log that the deadman of a route has tripped or was released; `plan` is that of the running table."""
         if not active:
-            logger.warning("commands come again: the deadman is released", route=route)
+            logger.warning("commands arrive again; the deadman has stopped sending", route=route)
         elif lost := self._lost_for(plan):
-            what = "commands come and are dropped: the deadman sends in their place"
+            what = "commands arrive but are dropped; the deadman sends in their place"
             logger.warning(what, route=route, target=lost.target, reason=lost.reason, detail=lost.detail)
         else:
-            logger.warning("commands stopped coming: the deadman sends in their place", route=route)
+            logger.warning("no commands arrive; the deadman sends in their place", route=route)
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
         """The last command that was lost since the last one left; None if there was none."""

@@ -42,7 +42,7 @@ GZIP_FROM = 1000
 OPEN_METRICS = "application/openmetrics-text"
 
 TEXT, JSON, HTML = "text/plain; charset=utf-8", "application/json", "text/html; charset=utf-8"
-_NO_RECORDING = "the table keeps nothing to save; it would with 'record: {last: 60s}'"
+_NO_RECORDING = "the table keeps no datagrams to save: add 'record: {last: 60s}'"
 
 Query = Mapping[str, Sequence[str]]
 
@@ -120,8 +120,8 @@ class Responder:
         if path in self._get:
             return self._get[path](query)
         if path in self._post:
-            return plain(HTTPStatus.METHOD_NOT_ALLOWED, f"{path} is an order: POST")
-        return plain(HTTPStatus.NOT_FOUND, "there are /, /metrics, /healthz, /ready and /tap")
+            return plain(HTTPStatus.METHOD_NOT_ALLOWED, f"{path} requires POST")
+        return plain(HTTPStatus.NOT_FOUND, "not found; there are /, /metrics, /healthz, /ready and /tap")
 
     def metrics(self, accepts: str) -> Response:
         """In one of two formats: each version and escaping, which clients may make up, would be encoded anew."""
@@ -139,7 +139,7 @@ class Responder:
     def post(self, path: str) -> Response:
         if path in self._post:
             return self._post[path]()
-        return plain(HTTPStatus.NOT_FOUND, f"there are {' and '.join(self._post)}")
+        return plain(HTTPStatus.NOT_FOUND, f"not found; there are {' and '.join(self._post)}")
 
     def _map(self) -> Response:
         key = f"map {self.running.program.table.sha256}"
@@ -173,7 +173,7 @@ class Responder:
         with self._page_saving:
             wait = self._page_saved + SAVE_SECONDS - monotonic()
             if wait > 0 and self._save is not None:
-                text = f"a recording was saved just now: try again in {ceil(wait)} s"
+                text = f"a recording has just been saved: try again in {ceil(wait)} s"
                 return _json(HTTPStatus.TOO_MANY_REQUESTS, {"ok": False, "text": text})
             self._page_saved = monotonic()
         response = self._save_recording()

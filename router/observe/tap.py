@@ -72,7 +72,7 @@ def wanted(
 
 def _of_decision(decisions: Sequence[str]) -> Wanted:
     if unknown := [name for name in decisions if name not in DECISIONS]:
-        raise TapRequestError(f"datagrams are {' or '.join(DECISIONS)}, not '{unknown[0]}'")
+        raise TapRequestError(f"'only' must be {' or '.join(DECISIONS)}, not '{unknown[0]}'")
 
     def is_wanted(datagram: Mirrored) -> bool:
         *_, reason, _ = datagram
@@ -200,7 +200,7 @@ class StreamReader:
             if len(waiting) < len(MAGIC):
                 return
             if not waiting.startswith(MAGIC):
-                raise TransportError(f"this is no stream of a tap, or of another version: {bytes(waiting[:20])!r}")
+                raise TransportError(f"this is not a tap stream, or one of another version: {bytes(waiting[:20])!r}")
             self._has_begun = True
             del waiting[: len(MAGIC)]
         start = 0
@@ -208,7 +208,7 @@ class StreamReader:
             (length,) = _LENGTH.unpack_from(waiting, start)
             end = start + _LENGTH.size + length
             if not 0 < length <= _LONGEST:
-                raise TransportError(f"the stream of a tap is broken: a record of {length} bytes")
+                raise TransportError(f"the tap stream is corrupt: a record of {length} bytes")
             if len(waiting) < end:
                 break
             yield from _record(bytes(waiting[start + _LENGTH.size : end]))

@@ -108,7 +108,7 @@ class Health:
                 self.look()
             except Exception as error:  # noqa: BLE001 routing goes on without health
                 if not has_failed:
-                    logger.error("the router's health cannot be determined", problem=repr(error))
+                    logger.error("cannot determine the router's health", problem=repr(error))
                 has_failed = True
             else:
                 has_failed = False

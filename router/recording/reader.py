@@ -97,9 +97,9 @@ class Recording:
         try:
             header = next(self._records)
         except _DAMAGED:
-            raise UsageError(f"{self.path} is no MCAP file") from None
+            raise UsageError(f"{self.path} is not an MCAP file") from None
         if not isinstance(header, Header) or not header.library.startswith(LIBRARY):
-            raise UsageError(f"{self.path} was not recorded by a router")
+            raise UsageError(f"{self.path} is not a recording of a router")
 
 
 def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]:

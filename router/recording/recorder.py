@@ -102,11 +102,11 @@ class Recorder:
     def save(self, reason: str) -> Path:
         """Write what is in memory to a file of its own. Any thread may call it; raises RecordError."""
         if self._ring is None:
-            raise RecordError("nothing is kept in memory: the table's `record` has no `last`")
+            raise RecordError("nothing is kept in memory: give the table's `record` a `last`")
         done: Future[Path] = Future()
         with self._requesting:
             if self._closing:
-                raise RecordError("the router is stopping")
+                raise RecordError("the router is shutting down")
             self._requests.append((reason, done))
         self._wake()
         try:
@@ -138,7 +138,7 @@ class Recorder:
         self._wake()
         self._thread.join(STOP_SECONDS)
         if self._thread.is_alive():
-            event = "the disk is too slow to finish the recordings; they can be read as far as they were written"
+            event = "the disk is too slow to finish the recordings; they are readable as far as they were written"
             logger.error(event, directory=str(self._directory.path))
         else:
             self._wake_up.close()
@@ -255,10 +255,10 @@ class Recorder:
         try:
             path = self._write_ring(reason)
         except OSError as error:
-            logger.error("the last datagrams could not be saved", reason=reason, problem=error.strerror)
+            logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
         except Exception as error:
-            found = fault(error, "kept it from saving", "the recorder")
+            found = fault(error, "prevented saving", "the recorder")
             found.log()
             raise RecordError(f"{found.event}: {error!r}") from error
         logger.info("saved the last datagrams", reason=reason, file=str(path))

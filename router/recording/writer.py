@@ -177,7 +177,7 @@ def _encoded(records: Iterable[McapRecord]) -> bytes:
 
 def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
     there = settings.directory
-    remedy = f"make it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
+    remedy = f"create it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
     return StartError(f"{settings.span}: cannot record to {there}: {why}", remedy)
 
 
@@ -193,7 +193,7 @@ class RecordingDirectory:
         except OSError as error:
             raise _cannot_record(settings, error.strerror) from error
         if not os.access(settings.directory, os.W_OK | os.X_OK):
-            raise _cannot_record(settings, "this user may not write there")
+            raise _cannot_record(settings, "this user has no write permission there")
         self.path = settings.directory.resolve()
         self._stem = stem
         self._retention = settings.retention
@@ -208,7 +208,7 @@ class RecordingDirectory:
                 return RecordingFile(self.path / name, channels, about)
             except FileExistsError:
                 continue
-        raise FileExistsError(errno.EEXIST, f"there are a thousand recordings of {time}", str(self.path))
+        raise FileExistsError(errno.EEXIST, f"there are already a thousand recordings of {time}", str(self.path))
 
     def make_room(self, coming: int, writing: Path | None = None) -> None:
         """Remove the oldest, by name, until there is room for `coming` bytes beside the file `writing`. Raises OSError.
@@ -223,7 +223,7 @@ class RecordingDirectory:
                 return
             path.unlink(missing_ok=True)
             total -= size
-            logger.info("removed the oldest recording, to keep within 'retention'", file=str(path), bytes=size)
+            logger.info("removed the oldest recording to stay within 'retention'", file=str(path), bytes=size)
 
 
 def recording_sizes(path: Path, stem: str) -> dict[Path, int]:
@@ -285,7 +285,7 @@ class ContinuousWriter:
             raise
         if self._retry_at is not None:
             self._retry_at = None
-            logger.info("recording again", file=str(file.path), lost=self.lost)
+            logger.info("recording resumed", file=str(file.path), lost=self.lost)
         self.datagrams += chunk.datagrams
         self.bytes += chunk.size
 
@@ -300,13 +300,13 @@ class ContinuousWriter:
         try:
             file.close()
         except OSError as error:
-            event = "a recording could not be finished; it can be read all the same"
+            event = "the recording has no index because it could not be finished; it is readable without"
             logger.error(event, file=str(file.path), problem=error.strerror)
 
     def _file_for(self, chunk: Chunk, now: int) -> RecordingFile:
         file = self._file
         if file is not None and file.is_gone:
-            logger.warning("the recording is gone from its path; beginning another", file=str(file.path))
+            logger.warning("the recording was moved or removed; starting another", file=str(file.path))
             self.close()
         elif file is not None and file.size + chunk.size_in_file > self._max_size:
             self.close()
@@ -320,8 +320,8 @@ class ContinuousWriter:
         self.lost += chunk.datagrams
         if self._retry_at is None:
             where = str(self._file.path if self._file is not None else self._directory.path)
-            remedy = "make room, or give `record` a smaller `retention`"
-            logger.error("cannot record; trying again every 10 s", where=where, problem=error.strerror, remedy=remedy)
+            remedy = "free disk space, or give `record` a smaller `retention`"
+            logger.error("cannot record; retrying every 10 s", where=where, problem=error.strerror, remedy=remedy)
         self._retry_at = now + _RETRY
         if self._file is not None:
             self._file.abandon()

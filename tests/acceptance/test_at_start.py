@@ -121,8 +121,8 @@ def test_a_router_that_cannot_reach_the_board_starts_all_the_same(tmp_path: Path
     table.write_text(text.replace("127.0.0.1:", "0.0.0.0:").replace("127.0.0.5:", "0.0.0.0:"))
     router = RouterProcess(tmp_path, table, within=ALONE)
     with router:
-        wait_until(lambda: bool(router.events("the deadman could not send")), "the report")
-        [lost] = router.events("the deadman could not send")
+        wait_until(lambda: bool(router.events("deadman could not send")), "the report")
+        [lost] = router.events("deadman could not send")
         assert (lost["route"], lost["target"], lost["reason"]) == ("manual_drive", "driving_board", "send_error")
         assert router.events(SENT) == []
 
@@ -132,8 +132,8 @@ def test_that_nobody_listens_yet_is_no_loss_of_the_first_command(place: Site) ->
     address = place.endpoints["driving_board"].getsockname()
     place.endpoints["driving_board"].close()
     with RouterProcess(place.folder, table) as router, udp(*address) as board:
-        wait_until(lambda: bool(router.events("the deadman could not send")), "the report")
-        [lost] = router.events("the deadman could not send")
+        wait_until(lambda: bool(router.events("deadman could not send")), "the report")
+        [lost] = router.events("deadman could not send")
         assert (lost["route"], lost["target"]) == ("manual_drive", "driving_board")
         place.send("basestation", DRIVE)
         assert board.recv(1000) == DRIVE

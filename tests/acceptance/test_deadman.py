@@ -22,8 +22,8 @@ from tests.compiler.ros_objects import serialized
 from tests.ros.peers import Publisher
 from tests.ros_child import ForkedProcess
 
-TRIPPED = "commands stopped coming: the deadman sends in their place"
-RELEASED = "commands come again: the deadman is released"
+TRIPPED = "no commands arrive; the deadman sends in their place"
+RELEASED = "commands arrive again; the deadman has stopped sending"
 
 LATE = 5
 """Commands that wait while the router is stopped: no more than its queues hold."""

@@ -176,7 +176,7 @@ def test_a_listener_waits_for_its_network_and_the_others_serve(site: Rover, what
         assert (warning["listener"], warning["why"]) == ("tunnel", why)
         assert [site.count("listener_waiting", listener=each) for each in ("tunnel", "rover")] == [1, 0]
         if is_reloaded:
-            assert "tunnel receives nothing: its address or network interface is not there" in status(site)
+            assert "tunnel receives nothing: its address or network interface does not exist" in status(site)
         site.board.sendto(b"", LAN)
         wait_until(lambda: site.count("datagrams_received_total", listener="rover") == 1, "the other listener's input")
         comes(site)

@@ -156,7 +156,7 @@ def test_a_recording_has_everything_in_order_and_the_stranger_on_a_topic_of_its_
 
 
 def test_a_board_with_another_address_is_found_out(tmp_path: Path) -> None:
-    said = "127.0.0.9 sends what sensor_board, 127.0.0.30, should"
+    said = "127.0.0.9 sends messages expected from sensor_board (127.0.0.30)"
     with site(tmp_path) as place, udp("127.0.0.9") as board:
         table = place.table(ROVER)
 

@@ -241,7 +241,7 @@ def test_rovers_and_operators_find_a_hub_that_comes_back(
         assert now.site.changes(before)[key("messages_published", route="fleet", topic="/drive_motor")] > 0
 
 
-WAITS = "another gateway has the Zenoh key: this gateway waits until it is free"
+WAITS = "another gateway uses the Zenoh key: this gateway waits until the key is free"
 PASSWORD = "fjord-4711"  # noqa: S105 - of nobody
 ENVIRONMENT = {"ZENOH_PASSWORD": PASSWORD}
 

@@ -108,8 +108,8 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
     told = [entry["event"] for entry in logged if entry.get("route") == "manual_drive"]
     assert told == [
         "the deadman has sent its payload, since the router starts",
-        "commands stopped coming: the deadman sends in their place",
-        "commands come again: the deadman is released",
+        "no commands arrive; the deadman sends in their place",
+        "commands arrive again; the deadman has stopped sending",
     ]
 
 
@@ -430,7 +430,7 @@ def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) 
 def test_what_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         program = site.program(ROUTE + f'http: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
-        with pytest.raises(StartError, match=r"table.yaml:12:\d+: metrics cannot be served"), Router(program):
+        with pytest.raises(StartError, match=r"table.yaml:12:\d+: cannot serve HTTP"), Router(program):
             pass
     with Router(program):  # the listener's port is free again
         pass

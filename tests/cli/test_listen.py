@@ -63,7 +63,7 @@ def test_what_arrives_is_printed_one_line_each(gateway: socket.socket) -> None:
         "/a/t p/msg/T schema x:float32",
         "/a/t p/msg/T x=1.5",
         f"/a/t p/msg/T x=0.5 y=[{'z' * 120}...(5000)]",
-        "(1 bytes are no packet): 3f",
+        "(1 bytes are too short for a packet): 3f",
         "/a/t p/msg/T x=2.5",
     ]
     assert err == "3 messages, 1 schemas, 1 undecodable, 0 lost\n"

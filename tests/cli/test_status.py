@@ -22,7 +22,7 @@ SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
     ("problems", "code", "line"),
     [
         ([], OK, "running: 7 datagrams received"),
-        ([SWITCHED_OFF], OK, "running: arm_board was never heard since the router started; 7 datagrams received"),
+        ([SWITCHED_OFF], OK, "running: arm_board has not been heard since the router started; 7 datagrams received"),
         ([HALTED], OK, "running: drive is halted: no commands for 27 min; 7 datagrams received"),
         (
             [SILENT, HALTED],

@@ -113,7 +113,7 @@ def test_what_is_no_request_is_refused_with_the_reason(text: str, complaint: str
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff", b'{"op":"publish","topic":"/t","data":' + b"[" * 100_000])
 def test_what_is_no_json_is_refused_as_that(text: bytes) -> None:
-    with pytest.raises(PacketError, match="no JSON"):
+    with pytest.raises(PacketError, match="not JSON"):
         request(text)
 
 

@@ -44,7 +44,7 @@ def test_a_gateway_that_cannot_open_leaves_nothing_of_the_others(tmp_path: Path)
     port = free_port(kind=socket.SOCK_STREAM)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         table = f"{tcp('first', port)}, {tcp('second', taken.getsockname()[1])}"
-        with pytest.raises(StartError, match=r"gateway 'second' cannot be opened: .* has the port"):
+        with pytest.raises(StartError, match=r"cannot open gateway 'second': .* has the port"):
             opened(program(tmp_path, table))
     assert "gateway" not in threads()
     socket.create_server(("127.0.0.1", port)).close()

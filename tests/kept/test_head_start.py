@@ -40,7 +40,7 @@ DRIVING = """\
     destinations: [basestation]
     deadman: {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 1h}
 """
-TRIPPED = "commands stopped coming: the deadman sends in their place"
+TRIPPED = "no commands arrive; the deadman sends in their place"
 ROOT = Path(__file__).parents[2]
 
 

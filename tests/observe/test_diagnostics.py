@@ -72,7 +72,7 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
             Level.WARN,
             "dashboard rejects datagrams: invalid",
         ),
-        ("record_dropped overflow", "router", Level.WARN, "recordings or taps lack datagrams, 9 in 1 s"),
+        ("record_dropped overflow", "router", Level.WARN, "recordings or taps are missing datagrams, 9 in 1 s"),
         (
             "deadman_active dashboard:/cmd_vel",
             "gateway/dashboard",
@@ -83,10 +83,15 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
             "gateway_topics dashboard not_installed",
             "gateway/dashboard",
             Level.OK,
-            "types that dashboard would need are",
+            "types that dashboard needs are",
         ),
-        ("deadman_send_errors manual_drive driving_board", "endpoint/driving_board", Level.ERROR, "driving_board does"),
-        ("deadman_send_errors manual_drive driving_board", "route/manual_drive", Level.ERROR, "driving_board does not"),
+        ("deadman_send_errors manual_drive driving_board", "endpoint/driving_board", Level.ERROR, "the deadman of"),
+        (
+            "deadman_send_errors manual_drive driving_board",
+            "route/manual_drive",
+            Level.ERROR,
+            "the deadman of manual_drive",
+        ),
         ("messages_dropped imu_info basestation stale", "endpoint/basestation", Level.WARN, "messages for basestation"),
         ("messages_dropped imu_info basestation stale", "route/imu_info", Level.WARN, "messages for basestation are"),
     ],
@@ -106,8 +111,8 @@ def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Count
     status = reported(router, 6)["route/manual_drive"]
     assert status.level == Level.ERROR
     assert status.message == (
-        "driving_board does not get what the deadman of manual_drive sends, 3 in 6 s; "
-        "basestation was never heard since the router started; "
+        "the deadman of manual_drive cannot reach driving_board, 3 in 6 s; "
+        "basestation has not been heard since the router started; "
         "commands of manual_drive do not get through: its deadman sends in their place"
     )
 

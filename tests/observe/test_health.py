@@ -39,9 +39,9 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
         (
             "deadman_send_errors manual_drive driving_board",
             1,
-            "driving_board does not get what the deadman of manual_drive sends, 1 in 2 s",
+            "the deadman of manual_drive cannot reach driving_board, 1 in 2 s",
         ),
-        ("config_last_reload_successful", 0, "the last reload failed: the table from before it goes on"),
+        ("config_last_reload_successful", 0, "the last reload failed; the old table is still running"),
         (
             "messages_dropped imu_info basestation send_error",
             9,
@@ -63,19 +63,19 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
         ("datagrams_rejected rover malformed", 9, "rover rejects datagrams: malformed, 9 in 2 s"),
         ("datagrams_rejected rover ignored", 9, None),
         ("datagrams_rejected rover unhandled", 9, None),  # the next one says it
-        ("unhandled arm_diag", 9, "arm_diag is received, and has no route, 9 in 2 s"),
+        ("unhandled arm_diag", 9, "arm_diag is received but has no route, 9 in 2 s"),
         (
             "qos_incompatible imu_info imu_data reliability",
             1,
             "nothing passes between imu_data and peers with another reliability, 1 of them",
         ),
-        ("record_dropped overflow", 9, "recordings or taps lack datagrams, 9 in 2 s"),
-        ("mirror_dropped", 9, "recordings or taps lack datagrams, 9 in 2 s"),
+        ("record_dropped overflow", 9, "recordings or taps are missing datagrams, 9 in 2 s"),
+        ("mirror_dropped", 9, "recordings or taps are missing datagrams, 9 in 2 s"),
         ("gateway_topics dashboard served", 9, None),
         (
             "gateway_topics dashboard not_installed",
             2,
-            "types that dashboard would need are not installed, topics not served: 2",
+            "types that dashboard needs are not installed, topics not served: 2",
         ),
     ],
 )
@@ -95,7 +95,7 @@ def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
     router.look(0)
     assert router.told(2.5) == [
         "the receive thread is stuck for 2.5 s",
-        "rover receives nothing: its address or network interface is not there",
+        "rover receives nothing: its address or network interface does not exist",
         "the kernel drops datagrams of rover, 2 in 2 s",
     ]
 
@@ -139,7 +139,7 @@ def test_messages_that_wait_at_all_times_are_a_problem(router: Counting) -> None
     for _ in range(int(WINDOW / PERIOD)):
         router.hear("sensor_board")
         told = router.told(1)
-    assert "messages wait for a thread that publishes or sends, 25 at least" in told
+    assert "messages wait for a thread that publishes or sends, at least 25" in told
 
 
 def test_a_publisher_is_stuck_in_one_call_or_in_many_until_it_goes_on(router: Counting) -> None:
@@ -174,7 +174,7 @@ def test_an_endpoint_is_silent_after_its_own_time_and_with_it_the_routes_that_on
 def test_who_was_never_heard_may_be_switched_off(router: Counting) -> None:
     found = router.look(5.1).problems
     assert {problem.kind for problem in found} == {Kind.ENDPOINT_NEVER_HEARD}
-    assert "basestation was never heard since the router started" in [problem.text for problem in found]
+    assert "basestation has not been heard since the router started" in [problem.text for problem in found]
     silent = {problem.labels["endpoint"] for problem in router.look(1000).problems}
     assert not silent & {"arm_board", "container_board"}  # `never` is stale; is no source
 
@@ -191,15 +191,16 @@ def test_a_board_with_another_address_is_named_with_the_one_that_it_should_have(
     found = {problem.labels.get("endpoint", problem.kind.alert): problem for problem in router.look(1).problems}
     told = found["DatagramsRejected"]
     assert told.text == (
-        "rover rejects datagrams: source_mismatch, 9 in 6 s: 192.168.0.20 sends what sensor_board, 192.168.0.30, should"
+        "rover rejects datagrams: source_mismatch, 9 in 6 s: "
+        "192.168.0.20 sends messages expected from sensor_board (192.168.0.30)"
     )
     assert told.routes == ("imu_info", "gps_info")
     silent = found["sensor_board"]
     assert silent.text == (
-        "sensor_board was never heard since the router started, and 192.168.0.20 sends what it should"
+        "sensor_board has not been heard since the router started; 192.168.0.20 sends its messages instead"
     )
     assert "If 192.168.0.20 is sensor_board, give it the address 192.168.0.30, or correct `endpoints`" in silent.remedy
-    assert "sends what" not in found["basestation"].text
+    assert "instead" not in found["basestation"].text
     router.count("datagrams_rejected", "rover", "source_mismatch", to=10)
     assert "192.168.0.20" not in "; ".join(router.told(WINDOW))
 
@@ -207,16 +208,20 @@ def test_a_board_with_another_address_is_named_with_the_one_that_it_should_have(
 @pytest.mark.parametrize(
     ("host", "case", "told"),
     [
-        ("192.168.0.40", "imu_info", "arm_board, 192.168.0.40, sends what sensor_board, 192.168.0.30, should"),
+        (
+            "192.168.0.40",
+            "imu_info",
+            "arm_board (192.168.0.40) sends messages expected from sensor_board (192.168.0.30)",
+        ),
         (
             "192.168.0.9",
             "ph_info",
-            "192.168.0.9 sends what arm_board, 192.168.0.40, or sensor_board, 192.168.0.30, should",
+            "192.168.0.9 sends messages expected from arm_board (192.168.0.40) or sensor_board (192.168.0.30)",
         ),
         (
             "192.168.0.30",
             "imu_info",
-            "sensor_board, 192.168.0.30, sends from another port, or to another listener, than the table says",
+            "sensor_board (192.168.0.30) uses another port or listener than the table says",
         ),
     ],
 )
@@ -230,7 +235,7 @@ def test_of_many_strangers_a_few_are_named(router: Counting) -> None:
     for number in range(20):
         mismatched(router, f"10.0.0.{number}", "imu_info")
     [rejected] = [each for each in router.look(1).problems if each.kind is Kind.DATAGRAMS_REJECTED]
-    assert rejected.more.count("sends what sensor_board") == 3
+    assert rejected.more.count("sends messages expected from sensor_board") == 3
     assert rejected.more.endswith("; and 17 more")
 
 

@@ -233,7 +233,7 @@ def test_pages_save_once_in_ten_seconds_and_the_command_line_whenever_it_likes(
     assert ask(server, "/record/save", "POST", own_page(server)).status == 200
     refused = ask(server, "/record/save", "POST", own_page(server))
     assert refused.status == 429
-    assert re.fullmatch(r"a recording was saved just now: try again in ([1-9]|10) s", refused.json["text"])
+    assert re.fullmatch(r"a recording has just been saved: try again in ([1-9]|10) s", refused.json["text"])
     assert ask(server, "/record/save", "POST").status == 200
     monkeypatch.setattr(responses, "SAVE_SECONDS", 0)
     assert ask(server, "/record/save", "POST", own_page(server)).status == 200
@@ -377,7 +377,7 @@ def test_of_taps_there_are_a_few_only_and_one_that_is_not_read_goes(
         with asking(server, "/tap") as one_more:
             refused = one_more.getresponse()
             assert refused.status == 503
-            assert refused.read() == b"there are 6 taps already: end one\n"
+            assert refused.read() == b"there are 6 taps already: close one\n"
 
         def is_let_in() -> bool:
             for _ in range(0 if running.waiting else 50):  # a tap drops batches of many more

@@ -143,5 +143,5 @@ def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
         collector = CountersCollector(Counters(), lambda: [[]], {}, BUILD)
-        with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
+        with pytest.raises(StartError, match=rf"rover.yaml:8:20: cannot serve HTTP at {taken}: .*\(pid \d+\)"):
             HttpServer(taken, SPAN, cast("Running", collector), NO_HEALTH, None)

@@ -85,4 +85,4 @@ def test_a_deadman_that_trips_says_whether_commands_come_and_are_dropped(
         reporter.close()
     *_, line = logged
     assert line.get("reason") == reason
-    assert line["event"].startswith("commands come and are dropped" if reason else "commands stopped coming")
+    assert line["event"].startswith("commands arrive but are dropped" if reason else "no commands arrive")

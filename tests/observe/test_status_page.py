@@ -201,7 +201,7 @@ def test_what_is_dropped_is_crossed_and_said_in_words(running: FakeRunning, page
     assert page.evaluate(f"{line('case:imu_info', 'to:@basestation')}.cross.checkVisibility()")
     assert "✕ dropping" in page.evaluate(f"{box('case:imu_info')}.innerText")
     until_said(page, "Messages for basestation are dropped: send_error, 12 of imu_info in ", "warn")
-    assert page.text("#todo").startswith("The network refuses it, or nobody listens there")
+    assert page.text("#todo").startswith("The network rejects them, or nothing listens there")
     page.click("#show")
     page.until("document.querySelector('#name').textContent === 'imu_info'")
     page.until("document.querySelector('#facts').textContent.includes('dropped: 12 send_error')")
@@ -243,8 +243,8 @@ def test_what_matters_most_is_said_in_the_banner_and_the_rest_beside_it(running:
     page.until("document.querySelectorAll('#others li').length === 4")
     said = others(page)
     assert "Commands of manual_drive do not get through: its deadman sends in their place router explain says" in said
-    assert "The last reload failed: the table from before it goes on router validate says what is wrong" in said
-    assert "arm_diag is received, and has no route, 3 in " in said
+    assert "The last reload failed; the old table is still running router validate says what is wrong" in said
+    assert "arm_diag is received but has no route, 3 in " in said
     assert "Nothing passes between imu_data and peers with another reliability, 1 of them ros2 topic info -v" in said
 
 
@@ -324,7 +324,7 @@ def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: F
         running.count("endpoint_last_seen_timestamp_seconds", endpoint, to=0)
     page.until(f"{box('from:@sensor_board')}.innerText.includes('○ not heard yet')")
     health._began -= 60 * 10**9
-    until_said(page, "was never heard since the router started", "")
+    until_said(page, "has not been heard since the router started", "")
     assert page.text("#todo").startswith("All endpoints are silent: check this computer's network")
 
 
@@ -397,7 +397,7 @@ def test_a_page_saves_the_last_minute_and_says_in_which_file(page: Page) -> None
     page.until("!document.querySelector('#save').disabled")
     page.click("#save")
     page.until("document.querySelector('#saved').textContent.startsWith('!')")
-    assert "a recording was saved just now: try again in " in page.text("#saved")
+    assert "a recording has just been saved: try again in " in page.text("#saved")
     assert "/var/lib" not in page.text("body")
     refused = [text for text in page.complaints() if "429" in text]
     page._browser.events.clear()

@@ -200,7 +200,7 @@ def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_pat
 def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
     with running_recorder(tmp_path) as (made, _):
         made.deadman_tripped("drive_motor")
-        with pytest.raises(RecordError, match="no `last`"):
+        with pytest.raises(RecordError, match="a `last`"):
             made.save("http")
 
 
@@ -262,7 +262,7 @@ def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
     with running_recorder(tmp_path, last=10**9) as (made, _):
         pass
     made.deadman_tripped("drive_motor")
-    with pytest.raises(RecordError, match="stopping"):
+    with pytest.raises(RecordError, match="shutting down"):
         made.save("http")
 
 
@@ -327,7 +327,7 @@ def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
         mirror.show(batch := now(imu(1)))
         with monkeypatch.context() as faulty:
             faulty.setattr(Recorder, "_write_ring", _fault)
-            with pytest.raises(RecordError, match="kept it from saving; please report it: LookupError"):
+            with pytest.raises(RecordError, match="prevented saving; please report it: LookupError"):
                 made.save("http")
             made.deadman_tripped("drive_motor")
         assert [again(each) for each in read(made.save("http"))] == batch
@@ -412,7 +412,7 @@ def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
             sleep(0.001)
     for thread in asking:
         thread.join(PATIENCE)
-    assert [answer for answer in answers if not isinstance(answer, Path)] == ["the router is stopping"] * 4
+    assert [answer for answer in answers if not isinstance(answer, Path)] == ["the router is shutting down"] * 4
 
 
 def test_a_ring_has_what_came_in_its_time() -> None:

@@ -152,7 +152,7 @@ def test_a_damaged_chunk_ends_what_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"", "is no MCAP file"), (b"version: 1", "is no MCAP file"), (None, "No such file or directory")],
+    [(b"", "is not an MCAP file"), (b"version: 1", "is not an MCAP file"), (None, "No such file or directory")],
 )
 def test_what_is_no_recording_is_refused(content: bytes | None, said: str, tmp_path: Path) -> None:
     path = tmp_path / "it.mcap"
@@ -169,7 +169,7 @@ def test_mcap_of_somebody_else_is_refused(tmp_path: Path) -> None:
         writer = Writer(file)
         writer.start()
         writer.finish()  # type: ignore[no-untyped-call]  # of mcap
-    with pytest.raises(UsageError, match="was not recorded by a router"):
+    with pytest.raises(UsageError, match="is not a recording of a router"):
         Recording(tmp_path / "it.mcap")
 
 

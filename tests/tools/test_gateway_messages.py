@@ -59,11 +59,11 @@ def test_a_packet_whose_time_begins_like_a_document_is_a_packet() -> None:
 @pytest.mark.parametrize(
     ("data", "complaint"),
     [
-        (b"", "no packet"),
+        (b"", "too short for a packet"),
         (packet(b""), "not JSON"),
         (packet(b"[]"), "JSON that is not an object"),
         (packet(b'{"x":\xff}'), "not JSON: .*decode"),
-        (packet(b"{}", is_compressed=True), "no zstd frame"),
+        (packet(b"{}", is_compressed=True), "not a zstd frame"),
         (packet(b'{"x":' + b"[" * 100 + b"]" * 100 + b"}"), "more than 64 levels"),
         (packet(b'{"x":' + b"[" * 100_000 + b"]" * 100_000 + b"}"), "not JSON"),
         (packet(b'{"name":"T","namespace":"p","fields":[{"name":"x"}]}'), "not a schema: KeyError"),

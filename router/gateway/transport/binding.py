@@ -40,7 +40,7 @@ class Binding:
         except OSError as error:
             if error.errno != errno.EADDRNOTAVAIL:
                 raise self._refusal(error) from error
-            logger.warning("no network interface has this address yet: waiting for it", address=str(self._address))
+            logger.warning("no network interface has this address yet; waiting for it", address=str(self._address))
             self._retrying = asyncio.get_running_loop().create_task(self._retry())
 
     async def close(self) -> None:
@@ -58,11 +58,11 @@ class Binding:
             except OSError as error:
                 if error.errno not in (None, errno.EADDRNOTAVAIL, reported):
                     reported = error.errno
-                    logger.error("this address cannot be used: trying on", why=str(self._refusal(error)))
+                    logger.error("cannot bind to the address; retrying", why=str(self._refusal(error)))
             except Exception as error:  # noqa: BLE001 - a fault of the router is reported, and no reason to give up
-                report_fault(f"kept {self._address} closed", error)
+                report_fault(f"kept {self._address} from being opened", error)
             else:
-                logger.info("the address is here now, and used", address=str(self._address))
+                logger.info("the address exists now; listening", address=str(self._address))
                 return
 
     def _refusal(self, error: OSError) -> StartError:

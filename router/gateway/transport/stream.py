@@ -190,9 +190,9 @@ class StreamTransport(ABC):
     def enter(self, client: StreamClient) -> str:
         """Add a client and return "", or return (and log) why it is refused."""
         if self.is_closing:
-            return "the gateway closes"
+            return "the gateway is shutting down"
         if key := self.limits.exceeded_by(client.host, [each.host for each in self._clients]):
-            what = "a client was turned away: there are too many" + (" from its host" if "host" in key else "")
+            what = "too many clients" + (" from this host" if "host" in key else "") + "; client rejected"
             self._log.note(key, logger.warning, what, client=client.label, limit=key)
             return what
         self._clients.add(client)
@@ -212,14 +212,16 @@ class StreamTransport(ABC):
 
     def timed_out(self, client: StreamClient) -> None:
         """Log that the kernel closed the connection of a client that took, or acknowledged, nothing."""
-        what = "a client was closed: send stalled, or its computer does not answer"
+        what = "client disconnected: it does not read, or its computer does not answer"
         self.close_client(client, what, seconds=STALLED_SECONDS)
 
     def _watch(self) -> None:
         begun_before = monotonic() - MESSAGE_SECONDS
         for client in self._clients:
             if client.unfinished_since is not None and client.unfinished_since < begun_before:
-                self.close_client(client, f"a client was closed: it did not end a message within {MESSAGE_SECONDS:g} s")
+                self.close_client(
+                    client, f"client disconnected: it did not finish a message within {MESSAGE_SECONDS:g} s"
+                )
         self._log.flush()
         self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._watch)
 

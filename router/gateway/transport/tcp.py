@@ -62,7 +62,7 @@ class TcpTransport(StreamTransport):
                 await self._read(client, reader)
         except TooLongError as error:  # where the next message begins is unknown
             self.events.refused("too_large")
-            self.close_client(client, "a client was closed", why=str(error))
+            self.close_client(client, "client disconnected", why=str(error))
         except TimeoutError:
             self.timed_out(client)
         except (asyncio.IncompleteReadError, OSError):
@@ -89,7 +89,7 @@ class TcpTransport(StreamTransport):
     async def _read_packet(self, reader: asyncio.StreamReader, first: bytes) -> bytes:
         (length,) = LENGTH.unpack(first + await reader.readexactly(LENGTH.size - 1))
         if length > self.limits.message:
-            raise TooLongError(f"a packet of {length} bytes, and at most {self.limits.message} are taken")
+            raise TooLongError(f"a packet of {length} bytes exceeds the limit of {self.limits.message}")
         return await reader.readexactly(length)
 
     async def _read_line(self, reader: asyncio.StreamReader, first: bytes) -> bytes:
@@ -98,5 +98,5 @@ class TcpTransport(StreamTransport):
         try:
             line = first + await reader.readuntil(b"\n")
         except asyncio.LimitOverrunError:
-            raise TooLongError(f"a line of more than {self.limits.message} bytes") from None
+            raise TooLongError(f"a line exceeds the limit of {self.limits.message} bytes") from None
         return line[:-1].removesuffix(b"\r")

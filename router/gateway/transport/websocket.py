@@ -181,11 +181,11 @@ class Page:
             if _is_from_elsewhere(request.headers):
                 return connection.respond(
                     HTTPStatus.FORBIDDEN,
-                    "a page of another host may not connect; open the page by this computer's address\n",
+                    "pages of other hosts may not connect; open the page at this computer's address\n",
                 )
             return None
         if request.path.partition("?")[0] != "/":
-            return connection.respond(HTTPStatus.NOT_FOUND, "there is one page: /\n")
+            return connection.respond(HTTPStatus.NOT_FOUND, "not found; the only page is /\n")
         return Response(HTTPStatus.OK, "OK", self._headers(request.headers), self._html)
 
     def _headers(self, request: Headers) -> Headers:

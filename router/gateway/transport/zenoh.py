@@ -97,7 +97,7 @@ class ZenohTransport:
             if why := permanent(self._settings, str(error)):
                 await self.close()
                 raise StartError(why) from None  # the library's error may quote passwords
-            logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=short(error))
+            logger.warning("Zenoh is not reachable yet; retrying every second", key=self._key, why=short(error))
             self._tasks.append(self._loop.create_task(self._retry(config)))
 
     async def close(self) -> None:
@@ -142,9 +142,9 @@ class ZenohTransport:
             try:
                 await self._connect(config)
             except zenoh.ZError as error:
-                logger.debug("Zenoh cannot be reached yet", key=self._key, why=short(error))
+                logger.debug("Zenoh is not reachable yet", key=self._key, why=short(error))
             else:
-                logger.info("Zenoh is reached", key=self._key)
+                logger.info("connected to Zenoh", key=self._key)
 
     async def _mind_connections(self, session: zenoh.Session) -> None:
         """Report at each change to how many routers and peers the session is connected. Zenoh connects by itself."""
@@ -155,10 +155,10 @@ class ZenohTransport:
                 self._events.connected(connected)
                 if not connected and reported:
                     was_lost = True
-                    logger.warning("the Zenoh network is lost: Zenoh tries to connect again", key=self._key)
+                    logger.warning("connection to the Zenoh network lost; Zenoh is reconnecting", key=self._key)
                 elif connected and was_lost:
                     was_lost = False
-                    logger.info("the Zenoh network is there again", key=self._key)
+                    logger.info("reconnected to the Zenoh network", key=self._key)
                 reported = connected
             await asyncio.sleep(CONNECTIONS_SECONDS)
 
@@ -218,11 +218,15 @@ class ZenohTransport:
         if self._owner is not None and has_to_wait:
             await self._give_up()
         if new := self._met - self._reported:
-            what = "this gateway waits until it is free" if has_to_wait else "that came later, and has to give way"
-            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(min(new)))
+            what = (
+                "this gateway waits until the key is free"
+                if has_to_wait
+                else "it came later and has to give the key up"
+            )
+            logger.error(f"another gateway uses the Zenoh key: {what}", key=self._key, other=str(min(new)))
             self._events.contended()
         elif self._reported and not self._others:
-            logger.info("no other gateway has the Zenoh key any more", key=self._key)
+            logger.info("no other gateway uses the Zenoh key any more", key=self._key)
         self._reported = set(self._others)
         self._met.clear()
 
@@ -285,7 +289,7 @@ class ZenohTransport:
                 frames = await self._events.snapshot()
                 error = await self._loop.run_in_executor(self._answering, _reply, waiting, self._key, frames)
             except Exception as fault:  # noqa: BLE001 reported; the next query matters as much
-                report_fault("left a query without an answer", fault)
+                report_fault("left a query unanswered", fault)
             else:
                 if error is not None:
                     self._events.failed(None, error, 0)
@@ -359,7 +363,7 @@ class Queries:
         """Runs in Zenoh's thread."""
         if len(self._waiting) >= MOST_QUERIES:
             with query:
-                query.reply_err("too many queries wait for an answer: ask again")
+                query.reply_err("too many pending queries: try again")
             return
         self._waiting.append(query)
         if len(self._waiting) == 1:
@@ -470,7 +474,7 @@ class Putter:
             is_newer = key in self._large_waiting
             self._large_waiting[key] = data
         if is_newer:
-            raise TransportError("a large value was not put before the next one of its topic came")
+            raise TransportError("a large message was replaced by a newer one before it was sent")
         self._large.submit(self._put_large)
 
     def _put_large(self) -> None:

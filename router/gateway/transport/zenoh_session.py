@@ -40,7 +40,7 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
     try:
         zenoh.KeyExpr(settings.key.value)
     except zenoh.ZError as error:
-        raise StartError(f"'{settings.key.value}' is no key of Zenoh's: {short(error)}") from error
+        raise StartError(f"'{settings.key.value}' is not a valid Zenoh key: {short(error)}") from error
     try:
         config = library_config(settings.config)
     except zenoh.ZError as error:  # a file that has changed since it was checked
@@ -59,7 +59,7 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
         try:
             config.insert_json5(name, json.dumps(value))
         except zenoh.ZError as error:
-            raise StartError(f"Zenoh does not take {value!r} for {name}: {short(error)}") from error
+            raise StartError(f"Zenoh rejects {value!r} for {name}: {short(error)}") from error
     return config
 
 
@@ -90,7 +90,7 @@ def short(error: object) -> str:
 def _refused(settings: ZenohSettings, error: object) -> str:
     if settings.config is None:
         return f"Zenoh needs a `config` for this: {reason(error)}"
-    return f"{settings.config.span}: Zenoh does not take this `config`: {reason(error)}"
+    return f"{settings.config.span}: Zenoh rejects this `config`: {reason(error)}"
 
 
 class Owner(NamedTuple):
