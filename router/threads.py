@@ -152,7 +152,7 @@ class DaemonThread(Executor):
         done: Future[T] = Future()
         with self._lock:
             if self._is_shut_down:
-                raise RuntimeError(f"the thread '{self._name}' takes no more")
+                raise RuntimeError(f"the thread '{self._name}' was shut down")
             if self._thread is None:
                 thread = Thread(self._run, self._name)
                 thread.start()
@@ -183,7 +183,7 @@ def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
     """Wait for the end of a daemon thread. If it is stuck, log that, leave it, and return False."""
     thread.join(timeout)
     if thread.is_alive():
-        logger.error("a thread is stuck, and is left", thread=thread.name)
+        logger.error("thread did not stop in time; continuing", thread=thread.name)
     return not thread.is_alive()
 
 
@@ -226,7 +226,7 @@ class _Steps:
         if call.done.done():
             call.done.result()
         else:
-            logger.error("a step of the stop is stuck, and is left", step=name)
+            logger.error("shutdown step did not finish in time; continuing", step=name)
 
     def _started(self, call: _Call, name: str) -> Thread | None:
         if self._has_threads:

@@ -46,7 +46,7 @@ class ThreadCounts:
     def make_room(self, counters: Counters) -> None:
         """Add the counts of `counters`, which continue the present ones. Raises StartError."""
         if counters.size > MOST_COUNTERS:
-            raise StartError(f"the table has {counters.size} counters, and there is room for {MOST_COUNTERS}")
+            raise StartError(f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}")
         new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             counters.grow(counts)

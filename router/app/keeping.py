@@ -48,6 +48,6 @@ class Keeper:
                 logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
             self._has_failed = True
         except Exception as error:  # noqa: BLE001 - a bug, which is logged: the router runs all the same
-            fault(error, "kept it from keeping the compiled program").log()
+            fault(error, "prevented it from keeping the compiled program").log()
         else:
             self._kept = read

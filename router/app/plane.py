@@ -149,7 +149,7 @@ class Plane:
             deadman = self._deadmen.kept(plan, program.counters, senders, state)
             sent_to = self._head_start.sent[plan.route] if self._head_start else deadman.start(boottime_ns())
             if sent_to:
-                what = "the deadman has sent its payload, since the router starts"
+                what = "the deadman has sent its payload at startup"
                 logger.info(what, route=plan.route, to=sent_to)
 
     def build(self, program: Program, opened: Opened) -> Built:
@@ -208,7 +208,7 @@ class Plane:
             return
         for plan in now.program.client_deadmen:
             if topic in dict(plan.datagrams) and now.client_deadmen[plan.route].greet(boottime_ns()):
-                what = "the deadman publishes its payload to a new subscriber, since the router starts"
+                what = "the deadman publishes its payload to a new subscriber after startup"
                 logger.info(what, route=plan.route, topic=topic)
 
     # running it
@@ -257,7 +257,7 @@ class Plane:
         until = monotonic() + _PATIENCE_S
         late = [name for name, wait_for in waits.items() if not wait_for(generation, max(until - monotonic(), _TURN_S))]
         if late:
-            logger.error("a thread is stuck, and what it uses stays open", threads=late)
+            logger.error("thread still uses the old program after the timeout; nothing it uses is closed", threads=late)
             return False
         if not self._has_turned() or not all(thread.has_passed for thread in self._from_ros):
             return False
@@ -314,7 +314,7 @@ class Plane:
         threads: list[PublishThread | FromRosThread] = [self._publishing, *self._from_ros]
         stuck = [thread.name for thread in threads if not thread.stop()]
         if stuck:
-            logger.error("a thread is stuck, and the router ends without it", threads=stuck)
+            logger.error("thread did not stop in time; the router exits without it", threads=stuck)
         self.has_stopped = True
         return not stuck
 
@@ -326,7 +326,7 @@ class Plane:
         self._deadmen.end()
         has_ended = self._client_deadmen.stop()
         if not has_ended:
-            logger.error("a thread is stuck, and the router ends without it", threads=["client deadmen"])
+            logger.error("thread did not stop in time; the router exits without it", threads=["client deadmen"])
         if self.has_stopped:  # else `stop` is stuck, and its threads use what would be freed
             self._events.close()
             self._carrier.close()
@@ -351,7 +351,7 @@ def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
     functions = None if library.rcl_types_differ() else publish_functions()
     if functions is None:
         raise StartError(
-            "rcl, by which ROS publishes, has other structures than the carrier expects",
-            "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
+            "the struct layout of rcl differs from what the carrier expects",
+            "run the router with ROS 2 Jazzy, and run 'make setup' after each upgrade of ROS",
         )
     return functions

@@ -24,7 +24,7 @@ _CHECKS = 4
 NOTIFY_TIMEOUT = 5.0
 """Seconds for which a notification waits for a busy service manager, and so the longest delay of a reload or stop."""
 
-_REMEDY = "ListenDatagram= in rover-router.socket says something else than the table: install the service anew"
+_REMEDY = "ListenDatagram= in rover-router.socket differs from the table: reinstall the service"
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[N
     shows where each thread stood.
     """
     for address in unclaimed():
-        logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
+        logger.warning("no listener of the table uses this inherited socket", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
         notify("READY=1")
         if (limit := _watchdog_ns()) is not None and (notifying := _notify_socket()) is not None:

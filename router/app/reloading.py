@@ -73,7 +73,7 @@ class Reloader:
             drop_idle_code()
             seconds = round((monotonic_ns() - began) / 1e9, 3)
         log = logger.info if result.ok else logger.error
-        event = "table reloaded" if result.ok else "the table was not taken over, and nothing has changed"
+        event = "table reloaded" if result.ok else "reload rejected; the old table is still running"
         log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
         return result
 
@@ -87,10 +87,10 @@ class Reloader:
             try:
                 self._runtime.take_over(self._runtime.prepare(program))
             except (StartError, StuckError, OSError) as error:  # the watcher calls again
-                logger.warning("a listener cannot be opened on its network", why=str(error))
+                logger.warning("a listener cannot be reopened", why=str(error))
             else:
                 names = [each.name for each in replaceable]
-                logger.info("these listeners receive now: their networks are there", listeners=names)
+                logger.info("these listeners now receive: their networks are up", listeners=names)
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""
@@ -107,13 +107,13 @@ class Reloader:
             text = _changes(now, then)
             self._runtime.take_over(self._runtime.prepare(then))
             if moved := _all_moved(now.table, then.table):
-                logger.warning("the reload has moved every endpoint to another address", endpoints=moved)
+                logger.warning("the reload has changed the address of every endpoint", endpoints=moved)
         except (StartError, StuckError) as error:
             why = str(error)
         except OSError as error:  # files come and go while they are read, and descriptors may be short
             why = f"the table cannot be read or opened now: {error}"
         except Exception as error:  # noqa: BLE001 a bug of the router, which is logged, must not end the caller
-            found = fault(error, "kept it from reloading")
+            found = fault(error, "prevented the reload")
             found.log()
             why = f"{found.event}: {error!r}"
         else:
@@ -136,7 +136,7 @@ class Reloader:
         try:
             self._replaced()
         except Exception as error:  # noqa: BLE001 as above; the new table runs already
-            fault(error, "came after a reload").log()
+            fault(error, "occurred after a reload").log()
 
     def _count(self, kind: str) -> None:
         self._counts.own[self._counts.counters.index("config_reloads", kind)] += 1
@@ -164,7 +164,10 @@ def _unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
     }
     return [
         Diagnostic(
-            span or top, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
+            span or top,
+            Code.BAD_VALUE,
+            f"'{key}' cannot change while the router runs",
+            "restart it, or undo the change",
         )
         for key, (before, after, span) in settings.items()
         if not are_same(before, after)

@@ -167,7 +167,7 @@ class Runtime:
         try:
             self.finish(change, earlier)
         except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
-            fault(error, "kept it from closing what it does not use").log()
+            fault(error, "prevented it from closing unused sockets and topics").log()
 
     def _close_passed(self, change: Change, earlier: Built | None) -> None:
         """Close what all threads have passed, in this reload and in those before."""

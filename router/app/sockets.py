@@ -37,8 +37,8 @@ class SocketChange:
 
 def _log_absence(listener: model.Listener) -> None:
     host = listener.address.value._replace(port=0)  # the port may be taken, by an inherited socket
-    why, remedy = absence(host, listener.interface) or ("its network has gone", "")
-    what = "this listener receives nothing until its network is there; the others work"
+    why, remedy = absence(host, listener.interface) or ("its network is gone", "")
+    what = "this listener receives nothing until its network is up; the others work"
     logger.warning(what, listener=listener.name, address=listener.bound_to, why=why, remedy=remedy)
 
 
@@ -53,7 +53,7 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         found = error.what, error.hint
     if found:
         why, remedy = found
-        what = "nothing can be sent to this endpoint now; the router tries again with every datagram"
+        what = "nothing can be sent to this endpoint now; the router retries with every datagram"
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 
@@ -63,11 +63,11 @@ def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
     if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
         return
     logger.warning(
-        "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them",
+        "datagrams to this endpoint have another network's source address; firewalls may drop them",
         endpoint=endpoint.name,
         address=own,
         route=usual,
-        remedy="`send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
+        remedy="use `send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
     )
 
 

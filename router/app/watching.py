@@ -50,7 +50,7 @@ class Watcher:
         while not self._stopped.wait(PERIOD):
             now = self._snapshot()
             if now is not None and now == before and now != self._handled:
-                logger.info("files of the table have changed: it is read again")
+                logger.info("files of the table have changed; reloading")
                 self._changed()
                 self._handled = now
                 after = self._snapshot() or now  # of other files, if the table names others now
@@ -91,12 +91,12 @@ class InterfaceWatcher:
             lost = [each for each in self._listeners() if each.lacks_network()]
             for each in lost:
                 if each not in reported and not each.is_waiting:
-                    what = "a network interface" if each.has_lost_interface() else "the address of a listener"
-                    logger.error(f"{what} has gone: nothing comes in by it", listener=each.name)
+                    what = "the network interface" if each.has_lost_interface() else "the address"
+                    logger.error(f"{what} is gone: the listener receives nothing", listener=each.name)
             if any(each.is_waiting or each.has_lost_interface() for each in lost):
                 self._reopen()
             if back := [each.name for each in reported if each in self._listeners() and each not in lost]:
-                logger.info("these listeners receive now: their networks are there", listeners=back)
+                logger.info("these listeners now receive: their networks are up", listeners=back)
             reported = lost
 
 

@@ -97,7 +97,7 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
     The module that it goes with is made first, and also without a compiler. Raises BuildError.
     """
     if sys.maxsize < 2**32:
-        raise BuildError("the carrier is for 64-bit processors only, and this Python is one for 32 bits")
+        raise BuildError("the carrier is for 64-bit processors only, but this Python is for 32-bit ones")
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
         made, checks = Path(folder) / output.name, _declare(output, Path(folder))
         files = [*map(str, sources()), str(checks), f"-I{NATIVE}"]

@@ -83,7 +83,7 @@ class FromRosThread(NativeThread):
         """Log how often the middleware has refused to hand out a message since the last call."""
         failures = self.failures
         if failures > self._reported:
-            logger.error("the middleware has not handed out messages that it has", times=failures - self._reported)
+            logger.error("the middleware did not deliver messages that it holds", times=failures - self._reported)
         self._reported = failures
 
     def leave(self, messages: NativeFromRos) -> None:
@@ -107,7 +107,7 @@ class FromRosThread(NativeThread):
         try:
             self.serve(messages)
         except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
-            logger.error("messages from ROS are not served as the table says until it is reloaded", why=str(error))
+            logger.error("messages from ROS are still routed by the old table; reload the table again", why=str(error))
             self.has_passed = False
         else:
             self._adopted = messages

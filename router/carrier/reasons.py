@@ -81,7 +81,7 @@ def _result(refusal: NativeRefusal, _: bytes) -> str:
 
 def _no_integer(refusal: NativeRefusal, _: bytes) -> str:
     value = _real(refusal)
-    return f"{value} does not fit 64 bits" if abs(value) < float("inf") else f"{value} is no integer"
+    return f"{value} does not fit 64 bits" if abs(value) < float("inf") else f"{value} is not an integer"
 
 
 def _counted(words: str, refusal: NativeRefusal, _: bytes) -> str:
@@ -97,12 +97,12 @@ def _quoted(refusal: NativeRefusal, text: bytes) -> str:
 
 
 def _no_utf8(refusal: NativeRefusal, text: bytes) -> str:
-    return f"{_quoted(refusal, text)} is not UTF-8: correct its publisher"
+    return f"{_quoted(refusal, text)} is not UTF-8: fix its publisher"
 
 
 def _nul(refusal: NativeRefusal, text: bytes) -> str:
     size = refusal.values[0]
-    return f"the text of {size} bytes has a NUL behind '{text.decode(errors='replace')}': strip(...) takes off padding"
+    return f"the text of {size} bytes has a NUL after '{text.decode(errors='replace')}': strip it with strip(...)"
 
 
 def _no_name(refusal: NativeRefusal, text: bytes) -> str:

@@ -67,7 +67,7 @@ class _UnusableError(Exception):
     """The text says why a file is not used."""
 
 
-_OF_ANOTHER = "it is of another command line, folder or Python"
+_OF_ANOTHER = "it belongs to another command line, folder or Python"
 
 
 def find() -> tuple[Kept | None, str]:
@@ -144,7 +144,7 @@ def count_try() -> str:
             if abs(time.time() - status.st_mtime) > _STALE:
                 os.ftruncate(descriptor, 0)
             elif status.st_size >= _MOST_TRIES:
-                return f"the last {_MOST_TRIES} routers that began with it did not start"
+                return f"the last {_MOST_TRIES} starts that used it failed"
             os.write(descriptor, b".")
         finally:
             os.close(descriptor)
@@ -193,12 +193,12 @@ def _read(path: str) -> Kept:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise _UnusableError("it is a link") from None
+            raise _UnusableError("it is a symbolic link") from None
         raise
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise _UnusableError("it is no ordinary file")
+            raise _UnusableError("it is not a regular file")
         _check_owner(status, "it")
         _check_owner(os.stat(os.path.dirname(path)), "its folder")
         kept = _parsed(descriptor, status)
@@ -235,14 +235,14 @@ def _check_owner(status: os.stat_result, what: str) -> None:
 def _sizes(head: bytes, size: int) -> tuple[int, int]:
     """The sizes of values and image in a file of this size. Raises _UnusableError."""
     if not head.startswith(_MAGIC[: len(head)]):
-        raise _UnusableError("it is no kept program")
+        raise _UnusableError("it is not a kept program")
     if len(head) < _HEAD.size:
         raise _UnusableError("it is truncated")
     _, form, version, values, image = _HEAD.unpack(head)
     if form != _FORMAT:
         raise _UnusableError("it has another format")
     if version != sys.hexversion:
-        raise _UnusableError("another version of Python has written it")
+        raise _UnusableError("it was written by another version of Python")
     if size != (whole := _HEAD.size + _CHECKSUM.size + values + image):
         raise _UnusableError("it is truncated" if size < whole else "it is damaged")
     return values, image

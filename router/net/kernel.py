@@ -49,7 +49,7 @@ def send_arrivals(opened: socket.socket) -> None:
     except OSError as error:
         if error.errno != errno.ENOPROTOOPT:
             raise
-        _warn_once("the kernel sends no arrival times with datagrams: each takes one more system call")
+        _warn_once("the kernel does not send arrival times with datagrams: each datagram costs one more system call")
         arrivals(opened)
 
 
@@ -72,7 +72,7 @@ def arrivals(opened: socket.socket) -> Callable[[], int]:
     except FileNotFoundError:  # nothing was received; stamping begins all the same
         pass
     except OSError:
-        _warn_once("the kernel has no arrival times: 'ttl' does not see how long datagrams wait in the receive buffer")
+        _warn_once("the kernel provides no arrival times: 'ttl' ignores the time spent in the receive buffer")
         return wall_ns
     return arrived_at
 

@@ -81,9 +81,12 @@ def _inherited_descriptors(environment: MutableMapping[str, str]) -> list[int]:
 
 
 ABSENT = {
-    errno.ENODEV: ("there is no such network interface", "`ip link` lists those that there are"),
-    errno.EADDRNOTAVAIL: ("no network interface of this computer has that address", "0.0.0.0 listens on all of them"),
-    errno.ENETDOWN: ("the network is down", "`ip link` shows which interface is"),
+    errno.ENODEV: ("there is no such network interface", "run `ip link` to list the interfaces"),
+    errno.EADDRNOTAVAIL: (
+        "no network interface of this computer has that address",
+        "use 0.0.0.0 to listen on all of them",
+    ),
+    errno.ENETDOWN: ("the network is down", "run `ip link` to see which interface is"),
 }
 """Errors of binding that pass when the network comes up, each with a remedy for one that does not."""
 

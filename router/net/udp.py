@@ -117,7 +117,7 @@ class Listener:
         asked, granted = self._settings.receive_buffer, self.opened.receive_buffer
         if granted < asked:
             logger.warning(
-                "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
+                "receive buffer is smaller than the table requests: the kernel may drop bursts",
                 listener=self.name,
                 asked=asked,
                 granted=granted,
@@ -149,7 +149,7 @@ def why_not_sent(error: OSError, address: Address) -> str:
         case errno.EPERM:
             return f"a firewall of this computer forbids sending to {address}: `nft list ruleset`"
         case errno.ENETUNREACH | errno.EHOSTUNREACH:
-            return f"no route leads to {address.host}, or nobody there answers: {ask}"
+            return f"no route leads to {address.host}, or it does not answer: {ask}"
         case errno.EINVAL:
             return f"the routes of this computer discard what is sent to {address.host}: {ask}"
     return error.strerror or str(error)
@@ -167,9 +167,12 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
             if error.errno == errno.EACCES and _is_broadcast(address):
                 raise not_one_machine(address) from error
             if error.errno == errno.ENETUNREACH:
-                return "no network leads there", "does `ip address` show an interface in its network? is the cable in?"
+                return (
+                    "no route leads there",
+                    "check the cable, and that `ip address` shows an interface in its network",
+                )
             why = error.strerror.lower() if error.strerror else str(error)
-            return f"the kernel refuses it: {why}", f"`ip route get {address.host}` shows the route that refuses it"
+            return f"the kernel refuses it: {why}", f"run `ip route get {address.host}` to see which route refuses it"
     return None
 
 
@@ -199,7 +202,7 @@ def open_sending(
             return sockets.open_sending(source.opened, listening, is_board=is_board)
         except OSError as error:
             logger.warning(
-                "datagrams to this endpoint leave from a port that is not its listener's; answers to them are lost",
+                "datagrams to this endpoint do not leave from its listener's port; replies to them are lost",
                 endpoint=endpoint.name,
                 listener=source.name,
                 why=error.strerror,

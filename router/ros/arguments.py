@@ -87,12 +87,12 @@ def without_effect(ros_args: Sequence[str], program: Program, asked: Collection[
             yield f"-r {rule.text}", "the table has neither topics nor gateways, so no ROS node"
         elif rule.match not in _NODE_RULES or not _is_for(rule.node, program.table.node):
             if not _is_for(rule.node, node):
-                yield f"-r {rule.text}", f"it is for the node '{rule.node}', and this one is '{node.name}'"
+                yield f"-r {rule.text}", f"it is for the node '{rule.node}', but this one is '{node.name}'"
             elif resolved(rule.match.removeprefix("rostopic://"), node) not in topics:
                 yield f"-r {rule.text}", _for_rule(rule.match, topics, node)
     for option in ros_args:
         if option in _LOGGING or option.removeprefix("--enable-").removeprefix("--disable-") in _SWITCHES:
-            yield option, "the router has a log of its own: `router run --log-level LEVEL`, before `--ros-args`"
+            yield option, "the router has its own log: use `router run --log-level LEVEL`, before `--ros-args`"
 
 
 def _for_parameter(name: str, read: Collection[str], variables: Sequence[str]) -> str:

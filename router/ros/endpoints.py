@@ -123,7 +123,7 @@ class Publication:
                 break
             sleep(_POLL_S)
         else:
-            logger.error("the middleware is stuck, and this publisher stays open", topic=self.plan.label)
+            logger.error("a publish call is stuck in the middleware; the publisher stays open", topic=self.plan.label)
             return False
         self._open.close()
         return True
@@ -192,8 +192,8 @@ def opened_beside(
     for plan in plans:
         if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
             kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
-            what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
-            raise StartError(f"{spans[plan.label]}: {what} while it runs", "restart it, or take another name")
+            what = f"topic '{plan.label}' has the type {kept}, which cannot change to {plan.type_name}"
+            raise StartError(f"{spans[plan.label]}: {what} while the router runs", "restart it, or use another name")
         if plan.type_name not in classes:
             classes[plan.type_name] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []

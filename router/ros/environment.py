@@ -42,14 +42,14 @@ def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str
         yield f"RMW_IMPLEMENTATION is '{middleware}', which is not installed here", remedy
     limit = address_space()
     if limit is not None and limit < ADDRESS_SPACE:
-        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), and ROS 2 needs {ADDRESS_SPACE >> 20}"
-        yield what, "start it with `ulimit -v unlimited`; to bound what it uses take systemd's MemoryMax"
+        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), but ROS 2 needs {ADDRESS_SPACE >> 20}"
+        yield what, "start it with `ulimit -v unlimited`; to limit its memory, use systemd's MemoryMax"
     needed, free = shared_memory(environ, shm)
     if free < needed:
-        remedy = "remove what nobody uses there (`fastdds shm clean`), or make it larger"
+        remedy = "remove unused files there (`fastdds shm clean`), or make it larger"
         if needed > _TRACING:
             remedy += "; with FASTDDS_BUILTIN_TRANSPORTS=UDPv4, ROS needs almost nothing there"
-        yield f"{shm} has {free >> 10} KiB free, and ROS 2 needs {needed >> 10}", remedy
+        yield f"{shm} has {free >> 10} KiB free, but ROS 2 needs {needed >> 10}", remedy
 
 
 def ros_remedy() -> str:

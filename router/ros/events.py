@@ -62,11 +62,12 @@ class PeerEvents:
                 self._subscriber_joined(plan.label)
 
         def on_incompatible_qos(status: Any) -> None:
-            problem = "a subscriber asks for a QoS that the table does not offer, and gets nothing"
+            problem = "a subscriber requests a QoS that the table does not offer: it receives nothing"
             self._on_incompatible_qos(problem, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a subscriber expects another type, and gets nothing", topic=plan.label, type=plan.type_name)
+            what = "a subscriber expects another type: it receives nothing"
+            logger.warning(what, topic=plan.label, type=plan.type_name)
 
         return PublisherEventCallbacks(
             matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
@@ -89,11 +90,12 @@ class PeerEvents:
 
     def of_subscription(self, plan: TopicPlan) -> SubscriptionEventCallbacks:
         def on_incompatible_qos(status: Any) -> None:
-            problem = "a publisher offers less than the QoS that the table asks for, and is not heard"
+            problem = "a publisher offers a weaker QoS than the table requests: its messages are not received"
             self._on_incompatible_qos(problem, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a publisher has another type, and is not heard", topic=plan.label, type=plan.type_name)
+            what = "a publisher has another type: its messages are not received"
+            logger.warning(what, topic=plan.label, type=plan.type_name)
 
         return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
 
@@ -202,7 +204,7 @@ class EventThread:
         while not self._stopping:
             self._waited_for.wait(max(0, check_at - monotonic_ns()))
             if not self._context.ok():
-                logger.critical("ROS was shut down from outside the router: nothing can be published any more")
+                logger.critical("ROS was shut down from outside the router: restart the router to publish again")
                 return
             self._serve(self._waited_for)
             if (now := monotonic_ns()) >= check_at:

@@ -66,7 +66,7 @@ def _ignore_sim_time(node: Node) -> None:
     """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
     if node.get_parameter(_SIM_TIME).value:
         logger.warning(
-            f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",
+            f"{_SIM_TIME} is ignored: the router uses real time (stamps, ttl, deadmen)",
             remedy=f"leave {_SIM_TIME} out for this node, or set it to false (docs/guides/ros-workspace.md)",
         )
         node.set_parameters([Parameter(_SIM_TIME, value=False)])
@@ -89,9 +89,9 @@ def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
         return {}
     if taken := next((name for name in _PROFILES if variables.get(name)), None):
         logger.warning(
-            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory although "
+            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory even though "
             "FASTDDS_BUILTIN_TRANSPORTS is UDPv4",
-            remedy=f"unset {taken}, or make it what {UDP_ON_LOCALHOST} is and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+            remedy=f"unset {taken}, or set it to {UDP_ON_LOCALHOST} and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
         )
         return {}
     chosen = {_PROFILES[0]: str(UDP_ON_LOCALHOST), "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}

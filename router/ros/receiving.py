@@ -94,7 +94,7 @@ class RawSubscription:
         # rmw_fastrtps counts what is there, then begins to listen: only a second call counts what comes in between.
         for _ in range(1 if eventfd is None else 2):
             if _set_callback(self.handle.pointer, callback, eventfd):
-                raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
+                raise rclpy_implementation.RCLError("the middleware does not report new messages")
 
     def close(self) -> None:
         """To be called when nothing is announced, and no thread takes from it."""

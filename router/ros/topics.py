@@ -97,10 +97,10 @@ class RosTopics:
             others = self._our_types(topic) - {type_name}
             if (renamed := self.resolved(topic)) != topic:
                 raise StartError(
-                    f"a remap of this router makes '{renamed}' of '{topic}'", "remap relative names instead"
+                    f"a remap of this router changes '{topic}' to '{renamed}'", "remap relative names instead"
                 )
             if others:  # DDS has one type for a topic in a process
-                raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
+                raise StartError(f"topic '{topic}' is {others.pop()} in this router, so it cannot be {type_name}")
             return TopicTap(
                 self._node, topic, message_class, tap_qos(is_reliable=is_reliable, keeps=keeps, depth=depth)
             )
@@ -166,7 +166,7 @@ class TopicListener:
         self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = (), patience: float = math.inf
     ) -> None:
         if type_name is not None and type_name.count("/") != 2:
-            raise StartError(f"'{type_name}' is no message type", "they are written like std_msgs/msg/String")
+            raise StartError(f"'{type_name}' is not a message type", "write it like std_msgs/msg/String")
         with ExitStack() as opening:
             node = open_node("router_tap", ros_args=ros_args)
             opening.callback(close_node, node)

@@ -70,7 +70,7 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
             raise StartError(
-                f"{part} as installed is not what the table was compiled for; {_remedy(part)}\n"
+                f"the installed {part} is not the one the table was compiled for; {_remedy(part)}\n"
                 f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
             )
     return loaded_class(name)
@@ -111,7 +111,7 @@ def _parts(name: str) -> tuple[str, ...]:
     """Package, kind and short name. Raises StartError."""
     parts = _NAME.fullmatch(name)
     if parts is None:
-        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
+        raise StartError(f"{name} is not installed (it is not the name of a ROS message)")
     return parts.groups()
 
 
