@@ -1,4 +1,4 @@
-"""Reloads: the table is read and compiled again beside the running program, and replaces it when all is ready."""
+"""Reloads: compiles the table again while the old program runs, and replaces it once everything is ready."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from router.table.model import NodeSettings, RouteTable
 from router.threads import StuckError, background_threads
 
 _MOST_NAMED = 12
-"""Changes that the summary of a reload names."""
+"""Most changes that the summary of a reload lists."""
 
 
 class Reloader:
     """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `replaced` is called when another program runs, and everything of the one before is closed. `keeper` keeps it.
+    `replaced` is called once another program runs and the earlier one is closed. `keeper` saves the new program.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class Reloader:
         drop_idle_code()
 
     def close(self) -> None:
-        """Wait for a reload that is running; refuse any other."""
+        """Wait for a running reload; reject later ones."""
         with self._one_at_a_time:
             self._is_open = False
 
     def reload(self) -> ReloadResult:
-        """Reload the table. If it is invalid or something cannot be opened, nothing changes; the result says why."""
+        """Reload the table. If it is invalid or cannot be opened, nothing changes, and the result says why."""
         with self._one_at_a_time:
             if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
@@ -78,7 +78,7 @@ class Reloader:
         return result
 
     def reopen(self) -> None:
-        """Reopen the listeners whose address or network interface is there now, if there are any."""
+        """Reopen the listeners whose address or network interface has appeared, if any."""
         with self._one_at_a_time:
             program = self._runtime.program
             replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
@@ -110,9 +110,9 @@ class Reloader:
                 logger.warning("the reload has changed the address of every endpoint", endpoints=moved)
         except (StartError, StuckError) as error:
             why = str(error)
-        except OSError as error:  # files come and go while they are read, and descriptors may be short
+        except OSError as error:  # files may change while they are read, or descriptors run out
             why = f"the table cannot be read or opened now: {error}"
-        except Exception as error:  # noqa: BLE001 a bug of the router, which is logged, must not end the caller
+        except Exception as error:  # noqa: BLE001 a bug of the router is logged; it must not end the caller
             found = fault(error, "prevented the reload")
             found.log()
             why = f"{found.event}: {error!r}"
@@ -130,7 +130,7 @@ class Reloader:
         while True:
             checked = check_table(now.table.path, self._environ, Definitions(now.protos))
             if checked.table is None or not wait_until_unchanged(watched_files(checked.table), until):
-                return checked  # else it was read while it was written
+                return checked  # else the files changed while they were read
 
     def _notify_replaced(self) -> None:
         try:

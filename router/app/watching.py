@@ -16,7 +16,7 @@ from router.threads import Thread
 from router.types.proto_files import walk
 
 PERIOD = 0.5
-"""Seconds between two checks. A change is acted on once the next check finds the same: editors write in pieces."""
+"""Seconds between two checks. A reload waits until two checks in a row find the same: editors write in pieces."""
 
 UNCHANGED_TIMEOUT = 5.0
 """Seconds for which a reload waits for files that are being written."""
@@ -53,7 +53,7 @@ class Watcher:
                 logger.info("files of the table have changed; reloading")
                 self._changed()
                 self._handled = now
-                after = self._snapshot() or now  # of other files, if the table names others now
+                after = self._snapshot() or now  # of other files, if the reloaded table names others
                 if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
                     self._handled = after
                 before = after
@@ -71,9 +71,9 @@ class Watcher:
 class InterfaceWatcher:
     """Checks once a second whether `listeners` have their addresses and network interfaces.
 
-    A socket stays bound to the old interface when a tunnel is set up again or an adapter plugged in again, and receives
-    nothing; one that is waiting was never bound. Then `reopen` is called in the watcher's thread until it does. One
-    whose address has gone receives again when that comes back. `close` does not wait.
+    After a tunnel or an adapter was removed and is back, a socket stays bound to the old interface and receives
+    nothing; a waiting socket was never bound. `reopen` is called in the watcher's thread until both receive. A socket
+    whose address is gone receives again when the address comes back. `close` does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
