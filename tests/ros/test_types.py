@@ -92,11 +92,11 @@ def test_a_part_of_an_action_is_found_which_its_package_does_not_show(write: Wri
         ("no_such_msgs/msg/Thing", r"there is no Python package 'no_such_msgs\.msg'\); run 'make setup'"),
         ("std_msgs/action/Wait_Feedback", r"there is no Python package 'std_msgs\.action'"),
         ("rcl_interfaces/srv/GetParameters", r"'rcl_interfaces\.srv' has no such message"),
-        ("std_msgs/msg/_string", "it is no name of a ROS message"),
-        ("some::Idl_", "it is no name of a ROS message"),
-        ("os/path/Join", "it is no name of a ROS message"),
-        ("a.b/msg/C", "it is no name of a ROS message"),
-        ("__main__/msg/C", "it is no name of a ROS message"),
+        ("std_msgs/msg/_string", "it is not the name of a ROS message"),
+        ("some::Idl_", "it is not the name of a ROS message"),
+        ("os/path/Join", "it is not the name of a ROS message"),
+        ("a.b/msg/C", "it is not the name of a ROS message"),
+        ("__main__/msg/C", "it is not the name of a ROS message"),
     ],
 )
 def test_what_is_not_installed_is_refused(name: str, why: str) -> None:
