@@ -1,4 +1,4 @@
-"""Events of publishers and subscriptions: who subscribes, which peers are incompatible, and the thread that waits."""
+"""Events of publishers and subscriptions (new subscribers, incompatible peers), and the thread that waits for them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from router.ros.endpoints import Publication, Subscription
 
 CHECK_INTERVAL_NS = 1_000_000_000
-"""The longest delay of what ends no wait: events of subscriptions, incompatible peers that have left, and a shutdown of
-ROS from outside."""
+"""The longest delay of changes that are polled: events of subscriptions, incompatible peers that leave, and a shutdown
+of ROS from outside."""
 
 Incompatible = Callable[[str, str, int], None]
-"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it keeps from matching."""
+"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and the number of peers that mismatch."""
 
 SubscriberJoined = Callable[[str], None]
 
@@ -39,7 +39,7 @@ graph."""
 
 
 WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
-"""One byte, not 0 while a topic has subscribers or serves late joiners. Native threads read it by its address."""
+"""One byte, nonzero while a topic has subscribers or serves late joiners. Native threads read it by its address."""
 
 
 class PeerEvents:
@@ -51,10 +51,10 @@ class PeerEvents:
     def __init__(self, incompatible: Incompatible, subscriber_joined: SubscriberJoined) -> None:
         self._subscriber_joined = subscriber_joined
         self._incompatible = incompatible
-        self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: how many checks are left
+        self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: remaining checks
 
     def of_publisher(self, plan: TopicPlan, wanted: WantedFlag) -> PublisherEventCallbacks:
-        """Callbacks that also keep `wanted` up to date: whether there are subscribers."""
+        """Callbacks that also set `wanted`: whether there are subscribers."""
 
         def on_matched(status: Any) -> None:
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
@@ -76,12 +76,12 @@ class PeerEvents:
     def check(
         self, node: Node, publishers: Mapping[str, Publication], subscriptions: Mapping[str, Subscription]
     ) -> None:
-        """Report how many incompatible peers each topic has now, if an event has named one. Arguments by topic.
+        """Report the number of incompatible peers of each topic that had such an event. Arguments by topic.
 
-        Events report peers that come, but not those that go; the graph has those that are there.
+        Events report peers that join, but not those that leave; the graph has the present ones.
         """
         for topic, checks in list(self._checks.items()):
-            del self._checks[topic]  # if `incompatible` raises, checks end until the next event
+            del self._checks[topic]  # if `incompatible` raises, checks stop until the next event
             mismatches = Counter(_mismatches(node, publishers.get(topic), subscriptions.get(topic)))
             for policy in QOS_POLICIES:
                 self._incompatible(topic, policy, mismatches[policy])
@@ -100,7 +100,7 @@ class PeerEvents:
         return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
 
     def _on_incompatible_qos(self, problem: str, plan: TopicPlan, status: Any) -> None:
-        """The middleware names only the last policy of the last peer."""
+        """Log the problem. The middleware names only the last policy of the last peer."""
         policy = qos_policy_name_from_kind(status.last_policy_kind).lower()
         self._checks[plan.label] = _MORE_CHECKS
         logger.warning(problem, topic=plan.label, policy=policy)
@@ -132,7 +132,7 @@ def _peers(
 
 
 class WaitSet:
-    """Waits until one of the events has happened. For one thread; others may call `wake`.
+    """Waits until one of the events happens. For one thread; others may call `wake`.
 
     Unlike the wait set of rclpy's executor, it is made only once.
     """
@@ -145,7 +145,7 @@ class WaitSet:
     def wait(self, timeout_ns: int) -> None:
         """Wait until an event happens or `wake` is called, at most `timeout_ns`. No signal handler runs meanwhile."""
         waiting = self._set
-        waiting.clear_entities()  # waiting removes what is not ready
+        waiting.clear_entities()  # waiting removes the entities that are not ready
         waiting.add_guard_condition(self._guard_condition.handle)
         for event in self._events:
             event.add_to_wait_set(waiting)
@@ -158,7 +158,7 @@ class WaitSet:
                 yield event, event.take_data()
 
     def wake(self) -> None:
-        """End the present wait, or the next one."""
+        """End the current wait, or the next one."""
         self._guard_condition.trigger()
 
     def close(self) -> None:
@@ -169,9 +169,9 @@ class WaitSet:
 class EventThread:
     """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
 
-    The latter are polled, because Fast DDS would end a wait for each message, and at once while a message is not taken:
-    this thread would compete with the receiving one for the interpreter. Events have a thread of their own because they
-    need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
+    Events of subscriptions are polled, because Fast DDS would end a wait for each message, and at once while a message
+    is not taken: this thread would compete with the receiving one for the interpreter. Events have their own thread
+    because they need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
     """
 
     def __init__(
@@ -220,5 +220,5 @@ class EventThread:
     def _call(self, callback: Callable[[], None]) -> None:
         try:
             callback()
-        except Exception as error:  # noqa: BLE001 a bug, which is logged; the next events are served
+        except Exception as error:  # noqa: BLE001 a bug is logged; later events are still handled
             fault(error, "lost an event").log()

@@ -215,7 +215,7 @@ def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> N
         port = station.getsockname()[1]
         table.write_text(re.sub(r"(basestation: {address: \"127.0.0.1:)\d+", rf"\g<1>{port}", text))
         code, said = ended("run", table, "--ros-args", "--bad")
-        assert (code, said) == (78, ["router run: ROS does not take these arguments: ['--bad']"])
+        assert (code, said) == (78, ["router run: ROS rejects these arguments: ['--bad']"])
         with pytest.raises(TimeoutError):
             station.recv(100)
 
