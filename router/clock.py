@@ -1,8 +1,8 @@
 """Clocks in ns: `boottime_ns` for ages, deadlines and rates, `monotonic_ns` for waits, `wall_ns` for time stamps.
 
-While the computer is suspended the monotonic clock stands still, and the boot clock goes on: a command from before the
-suspend is as old afterwards as it is, and a deadman whose time has passed meanwhile trips at once. Waits stop with the
-computer anyway.
+While the computer is suspended, the monotonic clock stops and the boot clock continues: afterwards, a command from
+before the suspend has its true age, and a deadman whose timeout has passed trips at once. Waits are suspended in any
+case.
 """
 
 import time

@@ -1,7 +1,7 @@
-"""What a compile reads: files, folders, links and variables. While a recording is open, each is noted with its value.
+"""The inputs of a compile: files, folders, links and variables. An open recording notes each with its value.
 
-Whatever a compile reads, it reads by the functions here. A kept program is used if all of its inputs still have the
-same values (`changed`). A start looks at them before it imports anything large, so this module imports small ones.
+A compile reads its inputs only through the functions here. A kept program is used if all of its inputs still have the
+same values (`changed`). A start checks them before it imports large modules, so this module imports only small ones.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     Plain: TypeAlias = tuple[tuple[str, str, object], ...]
-    """(kind, name, value) of each input, sorted. A value that cannot be had is the number of the error."""
+    """(kind, name, value) of each input, sorted. If the value cannot be read, it is the errno."""
     Listing: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
     """The folders and the other files in a folder, sorted."""
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
 _ASSETS = "_assets"
 _SCHEMAS = [os.path.join(place, "schemas") for place in (os.path.join(_PACKAGE, _ASSETS), os.path.dirname(_PACKAGE))]
-"""In an installation or a checkout; those of tables are read once, like the code."""
+"""In an installation or a checkout. The schemas of tables are read once, like the code."""
 _ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
 _CODE = (".py", ".so", ".json", ".html", ".xml")
 _OF_ROS = ("AMENT_", "RMW_", "ROS_")
 _UNSTEADY = "changed while it was read"
 _HAS_FOLDER_OF_COMMAND = not (sys.flags.isolated or getattr(sys.flags, "safe_path", False))
-"""Whether the first of `sys.path` is that folder. It follows from command line and folder, and differs among verbs."""
+"""Whether `sys.path` starts with the command's folder, which depends on how the command was started."""
 
 
 class Inputs:
-    """What was read, and what it was."""
+    """The inputs that were read, with their values."""
 
     def __init__(self) -> None:
         self._values: dict[tuple[str, str], object] = {}
         try:
             self._folder = os.getcwd()
-        except FileNotFoundError:  # it was deleted; no relative path leads anywhere
+        except FileNotFoundError:  # the folder was deleted: no relative path can be resolved
             self._folder = ""
 
     def plain(self) -> Plain:
-        """All inputs, as values that `marshal` takes. Equal for compiles that have read the same."""
+        """All inputs as plain values for `marshal`. Equal for compiles that have read the same."""
         return tuple((kind, name, value) for (kind, name), value in sorted(self._values.items(), key=_key))
 
     def note(self, kind: str, name: str, value: object) -> None:
-        """Note a value. An input that had another one earlier in the recording gets one that is never found again."""
+        """Note a value. An input whose value changed during the recording is noted with one that never matches."""
         if kind in _OF_FILES:
             name = os.path.join(self._folder, name)
         before = self._values.setdefault((kind, name), value)
@@ -64,7 +64,7 @@ class Inputs:
             self.note(kind, name, value)
 
     def read_again(self) -> bool:
-        """Read everything again. Return whether all is the same; only then it is noted in the open recording."""
+        """Read everything again. If all is the same, note it in the open recording and return true."""
         if any(_PROBES[kind](name) != value for (kind, name), value in self._values.items()):
             return False
         if (outer := _open.get()) is not None:
@@ -81,7 +81,7 @@ _open: ContextVar[Inputs | None] = ContextVar("inputs", default=None)
 
 @contextmanager
 def noted() -> Iterator[Inputs]:
-    """Note what this thread reads, also in the recording around this one."""
+    """Note what this thread reads, here and in the enclosing recording."""
     outer, inner = _open.get(), Inputs()
     token = _open.set(inner)
     try:
@@ -94,7 +94,7 @@ def noted() -> Iterator[Inputs]:
 
 @contextmanager
 def recording(before: Inputs | None = None) -> Iterator[Inputs]:
-    """Note what this thread reads, what was read `before`, and what runs it: the installation and variables of ROS."""
+    """Note what this thread reads, what was read `before`, the installation, and the variables of ROS."""
     with noted() as inputs:
         for name, value in _process().items():
             inputs.note("process", name, value)
@@ -104,7 +104,7 @@ def recording(before: Inputs | None = None) -> Iterator[Inputs]:
 
 
 def changed(plain: Plain) -> str:
-    """Which input has another value now, in words; "" if none has."""
+    """The first input whose value has changed, in words; "" if none has."""
     for kind, name, value in plain:
         if _PROBES[kind](name) != value:
             return _WORDS[kind].format(name)
@@ -112,7 +112,7 @@ def changed(plain: Plain) -> str:
 
 
 def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
-    """The content of a file, or its first bytes. Raises OSError, and ValueError for what can be no path."""
+    """The content of a file, or its first bytes. Raises OSError, or ValueError for an impossible path."""
     name = os.fspath(path)
     try:
         with open(name, "rb") as stream:
@@ -125,22 +125,22 @@ def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file with ends of lines as in Python. Raises OSError, and UnicodeDecodeError if it is not UTF-8."""
+    """The text of a file with line ends as in Python. Raises OSError, or UnicodeDecodeError if it is not UTF-8."""
     return read_bytes(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether there is an ordinary file. Raises OSError where that cannot be seen."""
+    """Whether the path is a regular file. Raises OSError if it cannot be examined."""
     return _noted_kind(path) == "file"
 
 
 def is_dir(path: str | os.PathLike[str]) -> bool:
-    """Whether there is a folder. Raises OSError where that cannot be seen."""
+    """Whether the path is a folder. Raises OSError if it cannot be examined."""
     return _noted_kind(path) == "folder"
 
 
 def exists(path: str | os.PathLike[str]) -> bool:
-    """Whether there is anything. Raises OSError where that cannot be seen."""
+    """Whether the path exists. Raises OSError if it cannot be examined."""
     return _noted_kind(path) != ""
 
 
@@ -154,7 +154,7 @@ def _noted_kind(path: str | os.PathLike[str]) -> str:
 
 
 def listing(path: str | os.PathLike[str]) -> Listing:
-    """The folders in a folder, and all else in it, without hidden ones. Nothing where it cannot be read."""
+    """The folders and the other files in a folder, without hidden ones. Empty if it cannot be read."""
     name = os.fspath(path)
     found = _listing(name)
     _note("folder", name, found)
@@ -162,7 +162,7 @@ def listing(path: str | os.PathLike[str]) -> Listing:
 
 
 def real_path(path: str | os.PathLike[str]) -> str:
-    """The absolute path without links, whether it exists or not."""
+    """The absolute path without links; it need not exist."""
     name = os.fspath(path)
     real = os.path.realpath(name)
     _note("link", name, real)
@@ -198,7 +198,7 @@ def _note(kind: str, name: str, value: object) -> None:
 
 
 def _content(path: str) -> bytes | int | None:
-    """None for what is no ordinary file, which may give its content only once, or never."""
+    """The content or errno; None unless it is a regular file, as others can be read only once or block."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         try:
@@ -217,7 +217,7 @@ def _kind(path: str) -> str | int:
         mode = os.stat(path).st_mode
     except OSError as error:
         return "" if error.errno in _ABSENT else error.errno or 0
-    except ValueError:  # no file system takes such a path
+    except ValueError:  # no file system accepts such a path
         return ""
     return "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "other"
 
@@ -234,7 +234,7 @@ def _listing(path: str) -> Listing | int:
 
 @cache
 def _process() -> Mapping[str, object]:
-    """What this process runs, as it was when it started: it imports its modules once."""
+    """The code that this process runs, as of its start: it imports each module once."""
     from router.declared import CHECKSUM
 
     packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -248,7 +248,7 @@ def _process() -> Mapping[str, object]:
 
 
 def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """The files of code below a folder, each with what changes when it is written."""
+    """The code files below a folder, each with properties that change when it is written."""
     try:
         entries = [*os.scandir(folder)]
     except OSError:
@@ -258,7 +258,7 @@ def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
             if entry.name not in ("__pycache__", _ASSETS):
                 yield from _stamps(entry.path)
         elif entry.name.endswith(_CODE):
-            with suppress(FileNotFoundError):  # it has just been removed
+            with suppress(FileNotFoundError):  # it was just removed
                 yield entry.path, _stamp(entry.stat(follow_symlinks=False))
 
 

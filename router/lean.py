@@ -1,4 +1,4 @@
-"""Imports that a library makes and the router does not need: large modules that are loaded later, or not at all."""
+"""Delays or skips large modules that a library imports and the router does not need."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
 
 
 class _Postponed(ModuleType):
-    """Takes the place of a module, and imports it when one of its attributes is read."""
+    """A stand-in for a module, which imports it when one of its attributes is first read."""
 
     def __getattr__(self, attribute: str) -> Any:
         if sys.modules.get(self.__name__) is self:
             del sys.modules[self.__name__]
         value = getattr(importlib.import_module(self.__name__), attribute)
-        setattr(self, attribute, value)  # the next time it is found without this method
+        setattr(self, attribute, value)  # so that this method is not called again
         return value
 
 
 @contextmanager
 def postponed(*names: str) -> Iterator[None]:
-    """Have modules that are imported inside import these, which are no parts of packages, when they first use them.
+    """Delay the import of these top-level modules, by modules imported inside, until their first use.
 
-    What has been imported before stays as it is.
+    Modules that are already imported are not affected.
     """
     standing = {name: _Postponed(name) for name in names if name not in sys.modules}
     sys.modules.update(standing)
@@ -42,9 +42,9 @@ def postponed(*names: str) -> Iterator[None]:
 
 @contextmanager
 def left_out(*names: str) -> Iterator[None]:
-    """Have imports of these modules fail inside, for libraries that work without them.
+    """Make imports of these modules fail inside, for libraries that work without them.
 
-    What has been imported before stays as it is.
+    Modules that are already imported are not affected.
     """
     absent = [name for name in names if name not in sys.modules]
     for name in absent:

@@ -31,18 +31,18 @@ MOST_KEYS = 1000
 
 
 NO_THREAD = "can't start new thread"
-"""What Python says where the kernel refuses one."""
+"""Python's message when the kernel refuses a thread."""
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether memory, threads or descriptors have run out: no fault of the router, and it may pass."""
+    """Whether memory, threads or descriptors have run out: not a bug of the router, and perhaps temporary."""
     if isinstance(error, OSError):
         return error.errno in {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error) == NO_THREAD)
 
 
 ADDRESS_SPACE = 1 << 30
-"""Bytes that a router with a few topics maps, of which it uses a tenth; without ROS a fifth of that is enough."""
+"""Bytes that a router with a few topics maps (it uses a tenth of them); without ROS, a fifth is enough."""
 
 
 def address_space() -> int | None:
@@ -52,7 +52,7 @@ def address_space() -> int | None:
 
 
 class Fault:
-    """What to log of an exception that nobody expected. `error` has the traceback."""
+    """The log entry for an unexpected exception. `error` has the traceback."""
 
     __slots__ = ("emit", "error", "event")
 
@@ -66,7 +66,7 @@ class Fault:
 
 
 def fault(error: BaseException, what: str, within: str = "the router itself") -> Fault:
-    """Describe an exception that nobody expected, and `what` it did, such as "lost a message"."""
+    """Describe an unexpected exception, and `what` it did, for example "lost a message"."""
     if is_shortage(error):
         why = str(error) or "no memory"
         return Fault(logger.error, f"memory, threads or descriptors have run out, which {what}: {why}", None)
@@ -74,7 +74,7 @@ def fault(error: BaseException, what: str, within: str = "the router itself") ->
 
 
 class LazyLogger:
-    """structlog's logger of this name, which is imported and set up with the first line."""
+    """A structlog logger that imports and configures structlog when the first line is logged."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -82,7 +82,7 @@ class LazyLogger:
         self._logger: FilteringBoundLogger | None = None
 
     def configure(self, configure: Callable[[ModuleType], None]) -> None:
-        """Have `configure` set up structlog, which it gets, before the next line."""
+        """Call `configure` with structlog before the next line is logged."""
         self._configure, self._logger = configure, None
 
     def __getattr__(self, method: str) -> Any:
@@ -98,7 +98,7 @@ logger: FilteringBoundLogger = LazyLogger("router")
 
 
 def _import_structlog() -> ModuleType:
-    """Without rich, which it imports for tracebacks that are not used here, and asyncio, for methods that are not."""
+    """Import structlog without rich and asyncio, which serve tracebacks and methods that are not used here."""
     from router.lean import left_out, postponed
 
     with left_out("rich"), postponed("asyncio"):
@@ -140,8 +140,8 @@ def _configure(structlog: Any, level: str, *, coloured: bool) -> None:
 class _NonBlockingStream:
     """A stream that drops lines if its reader is gone or slow, or its disk is full; it never blocks or raises.
 
-    The counters have what the lines would have said. Lines are written whole, when flushed. They bypass the stream's
-    buffer, which would keep a line that cannot be written until Python exits, and fails because of it (code 120).
+    What dropped lines report is also counted. `flush` writes whole lines, past the stream's own buffer: that would keep
+    a line that cannot be written, and make Python exit with code 120.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -187,9 +187,9 @@ class _Flood:
 
 
 class FloodLog:
-    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their number.
+    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and the number.
 
-    Thread-safe. `flush()` has to be called regularly, for the last events of a flood. Kinds beyond `MOST_KEYS` share
+    Thread-safe. Call `flush()` regularly, or the last events of a flood are not logged. Kinds beyond `MOST_KEYS` share
     a summary.
     """
 

@@ -1,4 +1,4 @@
-"""Threads that never delay the end of the process; wake-up events, and stops with deadlines."""
+"""Threads that never delay the end of the process, wake-up events, and a shutdown with timeouts."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ T = TypeVar("T")
 _LONGEST_WAIT_MS = 3_600_000
 
 START_S = 2.0
-"""Seconds within which a started thread has to run."""
+"""Timeout in seconds for a started thread to run."""
 
 REST_S = 0.1
-"""Seconds for which a thread rests when something has run out, before it tries again."""
+"""Seconds before a thread retries after a shortage."""
 
 
 class Thread(threading.Thread):
-    """A daemon thread. `target` is called again after a rest if something has run out (`is_shortage`)."""
+    """A daemon thread. `target` is called again after a shortage (`is_shortage`)."""
 
     def __init__(self, target: Callable[..., object], name: str, args: tuple[object, ...] = ()) -> None:
         super().__init__(name=name, daemon=True)
         self._call = target
         self._arguments = args
-        self._first = threading.Lock()  # taken by the thread when it runs, or by the starter that gives it up
+        self._first = threading.Lock()  # acquired by the thread when it runs, or by the starter when it gives up
         self._started: threading.Event = _Started()
 
     def start(self) -> None:
-        """Raises RuntimeError or MemoryError; then the target is not called.
+        """Start the thread. Raises RuntimeError or MemoryError; then the target is not called.
 
-        Python waits without end for a thread that dies before it says that it runs, for lack of memory.
+        Python's own `start` waits for ever if the thread dies, for lack of memory, before it signals that it runs.
         """
         try:
             super().start()
@@ -67,7 +67,7 @@ class _NotInTimeError(Exception):
 
 
 class _Started(threading.Event):
-    """What `threading.Thread.start` waits for, with a timeout."""
+    """The event that `threading.Thread.start` waits for, with a timeout."""
 
     def wait(self, timeout: float | None = None) -> bool:
         if not super().wait(START_S if timeout is None else timeout):
@@ -78,8 +78,8 @@ class _Started(threading.Event):
 class WakeEvent:
     """An event with a monotonic timeout, for one waiting thread.
 
-    `threading.Condition` measures its timeout by the wall clock where Python was built for a C library older than glibc
-    2.30, as many portable builds are: when that clock is set back by an hour, the wait lasts an hour longer.
+    In a Python built for a glibc older than 2.30, as many portable builds are, `threading.Condition` measures its
+    timeout by the wall clock: if that is set back by an hour, the wait lasts an hour longer.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class WakeEvent:
         self._poll.register(self._event, select.POLLIN)
 
     def wait(self, nanoseconds: int) -> None:
-        """Return when the event is set, or was since the last wait; at the latest after `nanoseconds` or an hour."""
+        """Wait until the event is set, or was since the last wait, but at most `nanoseconds` or an hour."""
         if self._poll.poll(min(max(0, nanoseconds) / 1e6, _LONGEST_WAIT_MS)):
             self._event.read(8)
 
@@ -102,11 +102,11 @@ class WakeEvent:
 
 @contextmanager
 def background_threads() -> Iterator[None]:
-    """Threads started inside, by any library, do not preempt other threads when they wake up.
+    """Keep threads that any library starts inside from preempting other threads when they wake up.
 
-    They inherit Linux's batch scheduling: the same share of the processor without wake-up preemption. Fast DDS wakes a
-    thread of its own several times per reliable message; on a processor shared with the receive thread, that cost half
-    of all context switches and about a tenth of the time. A policy other than the default is left as it is.
+    They inherit Linux's batch scheduling: the same share of the processor without wake-up preemption. Fast DDS wakes
+    one of its threads several times per reliable message; on a processor shared with the receive thread, that caused
+    half of all context switches and took about a tenth of the time. A policy other than the default is not changed.
     """
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         yield
@@ -134,7 +134,7 @@ class _Call(NamedTuple):
 
 
 class DaemonThread(Executor):
-    """An executor with one daemon thread, for calls that may block without end.
+    """An executor with one daemon thread, for calls that may block for ever.
 
     The interpreter waits at exit for all threads of a ThreadPoolExecutor, but not for this one. The thread starts with
     the first call.
@@ -148,11 +148,11 @@ class DaemonThread(Executor):
         self._lock = threading.Lock()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Raises RuntimeError after `shutdown`, and where the thread cannot be started: the next call tries again."""
+        """Raises RuntimeError after `shutdown`, or if the thread cannot be started; the next call tries again."""
         done: Future[T] = Future()
         with self._lock:
             if self._is_shut_down:
-                raise RuntimeError(f"the thread '{self._name}' takes no more")
+                raise RuntimeError(f"the thread '{self._name}' was shut down")
             if self._thread is None:
                 thread = Thread(self._run, self._name)
                 thread.start()
@@ -161,7 +161,7 @@ class DaemonThread(Executor):
         return done
 
     def shutdown(self, wait: bool = False, *, cancel_futures: bool = True) -> None:
-        """Cancel all calls that have not started. Never waits for the one that runs, whatever the arguments."""
+        """Cancel all calls that have not started. Whatever the arguments, never wait for a running call."""
         with self._lock:
             self._is_shut_down = True
             while not self._calls.empty():
@@ -172,25 +172,25 @@ class DaemonThread(Executor):
     def _run(self) -> None:
         while (call := self._calls.get()) is not None:
             call.run()
-            del call  # or its arguments and result would live until the next call
+            del call  # else its arguments and result would live until the next call
 
 
 LEAVING_S = 1.0
-"""Seconds for which a reload or a stop waits for a thread that may be stuck in the middleware."""
+"""Timeout in seconds of a reload or a stop for a thread that may be stuck in the middleware."""
 
 
 def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
-    """Wait for the end of a daemon thread. If it is stuck, log that, leave it, and return False."""
+    """Wait for the end of a daemon thread. On timeout, log that and return False."""
     thread.join(timeout)
     if thread.is_alive():
-        logger.error("a thread is stuck, and is left", thread=thread.name)
+        logger.error("thread did not stop in time; continuing", thread=thread.name)
     return not thread.is_alive()
 
 
 class StopStack(ExitStack):
-    """An ExitStack whose callbacks have deadlines: one that is stuck is logged and left, and the others follow.
+    """An ExitStack whose callbacks have timeouts: after one, a line is logged and the next callback is called.
 
-    Each callback is called in a thread of its own; once none can be had, without one and without a deadline.
+    Each callback has its own thread; if no thread can be started, it is called without one, and without a timeout.
     `outer` is a stack with which this one shares its time.
     """
 
@@ -205,11 +205,11 @@ class StopStack(ExitStack):
 
 
 STEP_S, STEPS_S, LEAST_S = 3.0, 6.0, 0.2
-"""Seconds for a step of a stop, for all together, and for each of those that are left then: a unit kills after 10 s."""
+"""Timeouts in seconds of a step, of all steps, and of each step after that; systemd kills the router after 10 s."""
 
 
 class _Steps:
-    """The steps of one stop, in sequence."""
+    """The steps of one shutdown, in sequence."""
 
     def __init__(self) -> None:
         self._until: float | None = None
@@ -226,7 +226,7 @@ class _Steps:
         if call.done.done():
             call.done.result()
         else:
-            logger.error("a step of the stop is stuck, and is left", step=name)
+            logger.error("shutdown step did not finish in time; continuing", step=name)
 
     def _started(self, call: _Call, name: str) -> Thread | None:
         if self._has_threads:
@@ -241,4 +241,4 @@ class _Steps:
 
 
 class StuckError(RuntimeError):
-    """A thread did not answer in time, and nothing was changed."""
+    """A thread did not answer in time; nothing was changed."""

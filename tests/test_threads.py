@@ -82,7 +82,7 @@ def test_what_has_not_begun_is_given_up_and_the_thread_ends_after_what_has() -> 
     assert begun.wait(TIMEOUT_S)
     thread.shutdown()
     assert waiting.cancelled()
-    with pytest.raises(RuntimeError, match="'calls' takes no more"):
+    with pytest.raises(RuntimeError, match="'calls' was shut down"):
         thread.submit(wait)
     go_on.set()
     ended = running.result(TIMEOUT_S)
@@ -173,7 +173,7 @@ def test_a_step_of_a_stop_that_is_stuck_is_left_and_the_others_follow(monkeypatc
         stack.callback(steps.append, "first")
     never.set()
     assert steps == ["first", "second", "last"]
-    left = "a step of the stop is stuck, and is left"
+    left = "shutdown step did not finish in time; continuing"
     assert [each["step"].rpartition(".")[2] for each in logs if each["event"] == left] == ["stuck", "stuck"]
 
 

@@ -1,4 +1,4 @@
-"""The running router: opens what a program needs, reloads the table, and stops in good order."""
+"""The running router: opens what a program needs, reloads the table, and shuts down cleanly."""
 
 from router.app.process import tune_interpreter
 from router.app.router import Router

@@ -1,4 +1,4 @@
-"""What all threads have counted, whatever tables the router has had."""
+"""The counts of all threads, kept across reloads."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from router.errors import StartError
 
 
 class ThreadCounts:
-    """What was counted since the start, whatever tables the router has had: a list of counts for each thread or lock.
+    """All counts since the start, kept across reloads: a list of counts for each thread or lock.
 
-    `counters` are those of the running program and say what is counted at which index.
+    `counters` belongs to the running program and assigns the indexes.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -26,7 +26,7 @@ class ThreadCounts:
         self.gateways, self.events, self.own = self.lists
 
     def add_thread(self, thread: NativeThread) -> None:
-        """Count what a native thread counts, by copies that balance."""
+        """Include the counts of a native thread, in consistent copies."""
         self._add(cast("list[int]", thread.counts), thread.counters)  # the array is only indexed and sliced
 
     def _add(self, counts: list[int], copy: Callable[[int], list[int]] | None) -> None:
@@ -35,7 +35,7 @@ class ThreadCounts:
         self._copies.append(copy or (lambda size: counts[:size]))
 
     def copies(self, size: int) -> list[list[int]]:
-        """Return the first `size` counts, each list at one instant: between two messages, as far as that is known."""
+        """Return the first `size` counts of each list; those of a thread are a snapshot, if it supports that."""
         return [copy(size) for copy in self._copies]
 
     def total(self, metric: str) -> int:
@@ -44,9 +44,9 @@ class ThreadCounts:
         return sum(counts[index] for counts in self.lists for index in indexes)
 
     def make_room(self, counters: Counters) -> None:
-        """Add the counts of `counters`, which continue the present ones. Raises StartError."""
+        """Make room for the counts of `counters`, which extend the present ones. Raises StartError."""
         if counters.size > MOST_COUNTERS:
-            raise StartError(f"the table has {counters.size} counters, and there is room for {MOST_COUNTERS}")
+            raise StartError(f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}")
         new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             counters.grow(counts)
@@ -54,10 +54,10 @@ class ThreadCounts:
                 counts[run] = [0] * (run.stop - run.start)
 
     def replace(self, counters: Counters) -> None:
-        """Adopt `counters`, once no thread counts by the earlier ones."""
+        """Adopt `counters`, once no thread uses the earlier ones."""
         counters.settle(self.lists)
         self.adopt(counters)
 
     def adopt(self, counters: Counters) -> None:
-        """As `replace`, while a thread may still count by the earlier ones, whose indexes stay taken."""
+        """As `replace`, while a thread may still use the earlier counters, whose indexes stay reserved."""
         self.counters = counters  # from here on read by other threads, and no longer changed

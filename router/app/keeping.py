@@ -1,4 +1,4 @@
-"""Keeps what was compiled for the head start of the next process."""
+"""Saves the compiled program for the head start of the next process."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class Keeper:
-    """Keeps programs, in a thread of its own.
+    """Saves compiled programs, in a thread of its own.
 
-    `asked` is what was read to know which table to compile, `read` what the first program was made of, and `kept` are
-    the inputs of the program that is kept already, if one is.
+    `asked` are the inputs that selected the table, `read` those of the first program, and `kept` those of the program
+    that is already on disk, if any.
     """
 
     def __init__(self, library: ctypes.CDLL, asked: Inputs, read: Inputs, kept: Plain | None) -> None:
@@ -31,7 +31,7 @@ class Keeper:
         self._has_failed = False
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
-        """Begin to keep a program that runs, and was made of what was read, with counters of its own."""
+        """Start to save the running program, compiled from the inputs `read`, with counters of its own."""
         if read.plain() != self._kept:
             self._thread.submit(self._keep, program, read.plain())
         else:
@@ -48,6 +48,6 @@ class Keeper:
                 logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
             self._has_failed = True
         except Exception as error:  # noqa: BLE001 - a bug, which is logged: the router runs all the same
-            fault(error, "kept it from keeping the compiled program").log()
+            fault(error, "prevented it from keeping the compiled program").log()
         else:
             self._kept = read

@@ -1,4 +1,4 @@
-"""Code that a running router does not use, and that need not be in its memory."""
+"""Drops code that a running router does not use from its memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NamedTuple
 _MAPS = Path("/proc/self/maps")
 
 _IDLE = ("_protoc_compiler.", "_foxglove_py.")
-"""How the names of libraries begin that a router uses at reloads only, or once a client has come: 14 MB together."""
+"""Prefixes of libraries that are used only at reloads or once a client connects: 14 MB together."""
 
 
 class Mapping(NamedTuple):
@@ -23,7 +23,7 @@ class Mapping(NamedTuple):
 
 
 def drop_idle_code() -> None:
-    """Take code that is idle out of this process. What is used again comes from the kernel's cache of the file."""
+    """Unload idle code from memory. Code that is used again is read from the kernel's page cache."""
     try:
         maps = _MAPS.read_text()
     except OSError:  # it may not be readable; the code then stays
@@ -35,10 +35,10 @@ def drop_idle_code() -> None:
 
 
 def read_only(maps: str) -> Iterator[Mapping]:
-    """The mappings that nobody can have written to: code, and what precedes it in a library.
+    """The mappings that cannot have been modified: code, and the part of a library before it.
 
-    `maps` is the text of /proc/PID/maps. Constants behind the code are left out, which include what the loader has
-    written to and protected afterwards.
+    `maps` is the text of /proc/PID/maps. Constants after the code are left out: they include pages that the loader
+    has written and then protected.
     """
     for line in maps.splitlines():
         place, permissions, offset, _, _, *path = line.split(maxsplit=5)

@@ -1,8 +1,8 @@
 """The native threads, and the program that they execute.
 
-`build` makes arrays of a compiled program and of what is open for it; `adopt` has each thread change to them between
-two messages. What a thread has received before, it serves by the earlier program. What a program keeps from one message
-to the next goes along by key.
+`build` makes arrays from a compiled program and its open sockets and topics; `adopt` switches each thread to them
+between two messages. Messages received before are handled by the earlier program. State that lasts from one message to
+the next is passed on by key.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _TURN_S = 0.002
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """What is open for a program, and what it keeps. Publications and subscriptions are by topic."""
+    """The open sockets and topics of a program, and its state. Publications and subscriptions are by topic."""
 
     listeners: Mapping[str, Listener]
     senders: Mapping[str, NativeSender]
@@ -59,9 +59,9 @@ class Opened:
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """A program as the threads execute it. `deadmen` are those of routes, others those of clients, by name.
+    """A program as the threads execute it. `deadmen` are of routes, `client_deadmen` of gateway clients, by name.
 
-    `adopted` is what holds messages back, and collects them.
+    `adopted` are its deferrals, pacers and collectors.
     """
 
     program: Program
@@ -73,7 +73,7 @@ class Built:
     client_deadmen: Mapping[str, ClientDeadman]
 
     def timers(self, earlier: Built | None, *, of_topics: bool) -> c.TimerChange:
-        """What changes in the timers of topics, or in those of endpoints: what only `earlier` had delivers the rest."""
+        """Changes to the timers of topics or of endpoints. Those that only `earlier` had deliver what they hold."""
         now, before = (
             [each for each in adopted if each.is_topic is of_topics]
             for adopted in (self.adopted, earlier.adopted if earlier else ())
@@ -93,7 +93,7 @@ class Plane:
         head_start: HeadStart | None = None,
     ) -> None:
         self.now: Built | None = None
-        """What runs, beside a head start."""
+        """The running program; None before the first one, also during a head start."""
         self.library = library = forwarding.library
         self.counts = counts
         self._head_start = head_start
@@ -108,7 +108,7 @@ class Plane:
             FromRosThread(library, self._deadmen.address, *counts_and_events(library, size), is_urgent=is_urgent)
             for is_urgent in (True, False)
         ]
-        # The publish thread before the receive thread: what was published was received, so no less than 0 waits.
+        # Copy the publish thread's counts before the receive thread's, so that `messages_waiting` is never negative.
         threads = self._deadmen, self._client_deadmen, self._publishing, self._carrier, *self._from_ros
         for thread in threads:
             counts.add_thread(thread)
@@ -118,15 +118,15 @@ class Plane:
 
     @property
     def turns(self) -> int:
-        """A number that grows unless the receive thread is stuck, even if nothing comes."""
+        """A number that grows unless the receive thread is stuck, even without traffic."""
         return self._carrier.turns
 
     def stalled(self) -> Iterator[tuple[str, float]]:
-        """The topics in whose publishers native threads are now, each with seconds."""
+        """The topics on which native threads are publishing now, each with the seconds since they began."""
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
     def tell(self) -> None:
-        """Begin to report events, and that Python is alive. Whoever is told of them is complete by now."""
+        """Start to report events, and that Python is alive. All receivers of events must be complete."""
         self._events.start()
 
     def _pulse(self) -> None:
@@ -137,19 +137,19 @@ class Plane:
     # a program
 
     def first_state(self) -> State:
-        """The state of the first program, which takes over what a head start has opened for it."""
+        """The state of the first program, which includes what a head start has opened."""
         return State(self.library, opened=self._head_start.opened if self._head_start else None)
 
     def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
         """Have deadmen send at the start of the router, unless they did so in a head start.
 
-        That needs sockets only: ROS takes seconds to open.
+        This needs only sockets, so it does not wait for ROS, which takes seconds to open.
         """
         for plan in program.deadmen:
             deadman = self._deadmen.kept(plan, program.counters, senders, state)
             sent_to = self._head_start.sent[plan.route] if self._head_start else deadman.start(boottime_ns())
             if sent_to:
-                what = "the deadman has sent its payload, since the router starts"
+                what = "the deadman has sent its payload at startup"
                 logger.info(what, route=plan.route, to=sent_to)
 
     def build(self, program: Program, opened: Opened) -> Built:
@@ -184,7 +184,7 @@ class Plane:
         return Built(program, state, native, from_ros, adopted, deadmen, clients)
 
     def _start_threads(self, program: Program, from_ros: NativeFromRos, clients: Mapping[str, ClientDeadman]) -> None:
-        """Start those that the program needs. Raises StartError.
+        """Start the threads that the program needs. Raises StartError.
 
         Deadmen of clients are served from now on: clients may publish before the program runs.
         """
@@ -193,7 +193,7 @@ class Plane:
             self._publishing.start(_functions_of_rcl(self.library), first)
         for thread in self._from_ros:
             if from_ros.only(urgent=thread.is_urgent).topics:
-                from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
+                from router.ros.receiving import RESET, TAKE  # rclpy is loaded: the topics are open
 
                 thread.start(TAKE, RESET)
         if clients:
@@ -203,27 +203,27 @@ class Plane:
                 deadman.await_subscribers(boottime_ns())
 
     def subscriber_joined(self, topic: str) -> None:
-        """Shortly after the start, have deadmen of the topic publish to a subscriber that was discovered."""
+        """Shortly after the start, have deadmen of the topic publish to a newly discovered subscriber."""
         if (now := self.now) is None:
             return
         for plan in now.program.client_deadmen:
             if topic in dict(plan.datagrams) and now.client_deadmen[plan.route].greet(boottime_ns()):
-                what = "the deadman publishes its payload to a new subscriber, since the router starts"
+                what = "the deadman publishes its payload to a new subscriber after startup"
                 logger.info(what, route=plan.route, topic=topic)
 
     # running it
 
     def adopt(self, built: Built, left: Sequence[Listener] = ()) -> None:
-        """Execute a program from now on; the first one starts the threads. Listeners that are `left` are emptied.
+        """Switch to a program; the first one starts the threads. Listeners in `left` are drained and closed to input.
 
-        Raises StuckError or StartError, with nothing changed. Until `has_passed`, threads may use the earlier program.
+        Raises StuckError or StartError with nothing changed. Until `has_passed`, threads may use the earlier program.
         """
         earlier, generation = self.now, built.native.generation
         with ExitStack() as undo:
             for thread in self._from_ros:
                 thread.leave(built.from_ros)
                 undo.callback(thread.stay)
-            # Before the publish thread gets a message of this program.
+            # Before the publish thread receives a message of this program.
             topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
             built.native.arrays.keep(topics)
             self._publishing.change(topics)
@@ -232,7 +232,7 @@ class Plane:
                 self._is_running = True
             undo.pop_all()
         if earlier is None:
-            if self._head_start is not None:  # it keeps the same: nothing ends, and no deadman is replaced
+            if self._head_start is not None:  # it has the same state: no timer ends, and no deadman is replaced
                 self._carrier.change(change_to(built.native, built.timers(None, of_topics=False)), built.native)
         else:
             for listener in left:
@@ -242,14 +242,14 @@ class Plane:
             self._carrier.change(change, built.native)
         self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)
         self._publishing.advance(generation)
-        # After deadmen were replaced: a feed of the earlier ones acts on the next ones.
+        # After deadmen were replaced: feeding an earlier one now feeds its replacement.
         for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
             thread.follow(other)
             thread.adopt(built.from_ros)
         self.now = built
 
     def has_passed(self) -> bool:
-        """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
+        """Wait until nothing of an earlier program is in use. Return False if that takes longer than a second."""
         if not self._is_running or self.now is None:
             return True
         generation = self.now.native.generation
@@ -257,7 +257,7 @@ class Plane:
         until = monotonic() + _PATIENCE_S
         late = [name for name, wait_for in waits.items() if not wait_for(generation, max(until - monotonic(), _TURN_S))]
         if late:
-            logger.error("a thread is stuck, and what it uses stays open", threads=late)
+            logger.error("thread did not leave the old program in time; what it uses stays open", threads=late)
             return False
         if not self._has_turned() or not all(thread.has_passed for thread in self._from_ros):
             return False
@@ -265,7 +265,7 @@ class Plane:
         return True
 
     def _has_turned(self) -> bool:
-        """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
+        """Wait until the receive thread has finished its present turn, in which it may drop an earlier message."""
         turns = self._carrier.turns
         for _ in range(int(_PATIENCE_S / _TURN_S)):
             if self._carrier.turns != turns:
@@ -274,7 +274,7 @@ class Plane:
         return False
 
     def end(self, earlier: Built) -> None:
-        """End the deadmen that only an earlier program had, once no thread feeds them any more: they send if armed."""
+        """End the deadmen that only an earlier program had, once no thread feeds them; armed ones send."""
         kept = self.now.deadmen.values() if self.now else ()
         for deadman in earlier.deadmen.values():
             if deadman not in kept:
@@ -283,29 +283,29 @@ class Plane:
     # received datagrams, for the mirror
 
     def observe(self, *, is_observed: bool) -> None:
-        """Begin or cease to keep received datagrams for `take`."""
+        """Start or stop mirroring received datagrams for `take`."""
         self._forwarding.mirror(self.counts.counters.index("mirror_dropped") if is_observed else None)
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
-        """What was received since the last call, as `recording.mirror.Mirrored`. For one thread."""
+        """The datagrams received since the last call, as `recording.mirror.Mirrored`. For one thread."""
         return self._mirrored.take()
 
     @property
     def lost(self) -> int:
-        """Datagrams that had no room to be kept."""
+        """Datagrams that the full mirror dropped."""
         return self.counts.total("mirror_dropped")
 
     def feed_watchdog(self, notify: int, interval: int) -> None:
-        """Feed a watchdog by a connected socket, every `interval` ns; -1 for none."""
+        """Feed a watchdog through the connected socket `notify` every `interval` ns; -1 ends that."""
         self._carrier.watchdog(notify, interval)
 
     # the end
 
     def stop(self, listeners: Sequence[Listener]) -> bool:
-        """End all input, serve what the kernel holds and what waits, and end the threads; deadmen go on.
+        """End all input, handle what is still queued, and end the threads; deadmen keep running.
 
-        What is in an inherited socket stays there, for the next process. Return False if a thread is stuck in the
-        middleware: then subscriptions and publishers have to stay open.
+        Datagrams in an inherited socket stay there for the next process. Return False if a thread is stuck in the
+        middleware: then subscriptions and publishers must stay open.
         """
         for listener in listeners:
             listener.end_input()
@@ -314,19 +314,19 @@ class Plane:
         threads: list[PublishThread | FromRosThread] = [self._publishing, *self._from_ros]
         stuck = [thread.name for thread in threads if not thread.stop()]
         if stuck:
-            logger.error("a thread is stuck, and the router ends without it", threads=stuck)
+            logger.error("thread did not stop in time; the router exits without it", threads=stuck)
         self.has_stopped = True
         return not stuck
 
     def close(self) -> bool:
-        """Send what waits, then have deadmen send a last time. Nothing is sent afterwards.
+        """Send what is held back, then have deadmen send a last time. Nothing is sent afterwards.
 
-        Return False if the thread of clients' deadmen is stuck in the middleware: then publishers have to stay open.
+        Return False if the thread `client deadmen` is stuck in the middleware: then publishers must stay open.
         """
         self._deadmen.end()
         has_ended = self._client_deadmen.stop()
         if not has_ended:
-            logger.error("a thread is stuck, and the router ends without it", threads=["client deadmen"])
+            logger.error("thread did not stop in time; the router exits without it", threads=["client deadmen"])
         if self.has_stopped:  # else `stop` is stuck, and its threads use what would be freed
             self._events.close()
             self._carrier.close()
@@ -338,20 +338,20 @@ class Plane:
         return why_rejected(self.now.program, listener, data, length) if self.now else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
-        """Nothing if the message was not refused by the program that runs."""
+        """The place in the table; "" if an earlier program refused the message."""
         if self.now is None or self.now.native.generation != generation:
             return ""
         return where_refused(self.now.program.lowered, route, topic, target, place)
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
-    """Addresses of what publishes, and of what says and forgets why it could not. Raises StartError."""
-    from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
+    """Addresses of rcl's functions that publish, and that return and reset its error. Raises StartError."""
+    from router.ros.rcl import publish_functions  # rclpy is loaded: the topics are open
 
     functions = None if library.rcl_types_differ() else publish_functions()
     if functions is None:
         raise StartError(
-            "rcl, by which ROS publishes, has other structures than the carrier expects",
-            "run the router with ROS 2 Jazzy, and 'make setup' after each upgrade of ROS",
+            "the struct layout of rcl differs from what the carrier expects",
+            "run the router with ROS 2 Jazzy, and run 'make setup' after each upgrade of ROS",
         )
     return functions

@@ -19,24 +19,24 @@ from router.log import logger
 from router.net.udp import unclaimed
 
 _CHECKS = 4
-"""How often progress is checked within the watchdog's time."""
+"""Progress checks per watchdog interval."""
 
 NOTIFY_TIMEOUT = 5.0
 """Seconds for which a notification waits for a busy service manager, and so the longest delay of a reload or stop."""
 
-_REMEDY = "ListenDatagram= in rover-router.socket says something else than the table: install the service anew"
+_REMEDY = "ListenDatagram= in rover-router.socket differs from the table: reinstall the service"
 
 
 @contextmanager
 def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[None]:
-    """Notify that the router is ready inside, and stops at the end.
+    """Notify the service manager that the router is ready, and at the end that it stops.
 
-    `feed(socket, interval)` has native threads feed the service manager's watchdog every `interval` ns, while they make
-    progress; a socket of -1 ends that. If the router is stuck, the service manager ends it with SIGABRT, and the log
-    shows where each thread stood.
+    `feed(socket, interval)` has native threads feed the service manager's watchdog every `interval` ns while they make
+    progress; a socket of -1 ends that. If the router is stuck, the service manager kills it with SIGABRT, and the log
+    shows a traceback of each thread.
     """
     for address in unclaimed():
-        logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
+        logger.warning("no listener of the table uses this inherited socket", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
         notify("READY=1")
         if (limit := _watchdog_ns()) is not None and (notifying := _notify_socket()) is not None:
@@ -49,7 +49,7 @@ def supervised(feed: Callable[[int, int], None] = lambda *_: None) -> Iterator[N
 
 @contextmanager
 def reloading() -> Iterator[None]:
-    """Notify that a reload begins and ends."""
+    """Notify the service manager that a reload begins, and that it ends."""
     notify("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
     try:
         yield
@@ -85,17 +85,17 @@ def _notify_socket() -> socket.socket | None:
 
 
 def _watchdog_ns() -> int | None:
-    """The watchdog's time in ns, or None without a watchdog."""
+    """The watchdog's timeout in ns, or None without a watchdog."""
     microseconds = os.environ.get("WATCHDOG_USEC", "")
     is_ours = os.environ.get("WATCHDOG_PID") in (None, str(os.getpid()))
     return int(microseconds) * 1000 if is_ours and microseconds.isdecimal() and int(microseconds) else None
 
 
 def tune_interpreter() -> None:
-    """Set up the process for low latency. To be called once, by the owner of the process, after start-up."""
+    """Set up the process for low latency. Call it once, from the main program, after start-up."""
     gc.freeze()  # objects made at start-up live as long as the process and need no scan
     may_open, may_request = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few for as many clients of a gateway
+    if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few: each client of a gateway needs one
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
     sys.setswitchinterval(0.0005)  # the longest that gateways wait for a busy thread
     gc.enable()  # it may have been paused until here

@@ -1,4 +1,4 @@
-"""Reloads: the table is read and compiled again beside the running program, and replaces it when all is ready."""
+"""Reloads: compiles the table again while the old program runs, and replaces it once everything is ready."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from router.table.model import NodeSettings, RouteTable
 from router.threads import StuckError, background_threads
 
 _MOST_NAMED = 12
-"""Changes that the summary of a reload names."""
+"""Most changes that the summary of a reload lists."""
 
 
 class Reloader:
     """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `replaced` is called when another program runs, and everything of the one before is closed. `keeper` keeps it.
+    `replaced` is called once another program runs and the earlier one is closed. `keeper` saves the new program.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class Reloader:
         drop_idle_code()
 
     def close(self) -> None:
-        """Wait for a reload that is running; refuse any other."""
+        """Wait for a running reload; reject later ones."""
         with self._one_at_a_time:
             self._is_open = False
 
     def reload(self) -> ReloadResult:
-        """Reload the table. If it is invalid or something cannot be opened, nothing changes; the result says why."""
+        """Reload the table. If it is invalid or cannot be opened, nothing changes, and the result says why."""
         with self._one_at_a_time:
             if not self._is_open or self._runtime.program is None:
                 return ReloadResult(False, (), "the router is not running")
@@ -73,12 +73,12 @@ class Reloader:
             drop_idle_code()
             seconds = round((monotonic_ns() - began) / 1e9, 3)
         log = logger.info if result.ok else logger.error
-        event = "table reloaded" if result.ok else "the table was not taken over, and nothing has changed"
+        event = "table reloaded" if result.ok else "reload rejected; the old table is still running"
         log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
         return result
 
     def reopen(self) -> None:
-        """Reopen the listeners whose address or network interface is there now, if there are any."""
+        """Reopen the listeners whose address or network interface has appeared, if any."""
         with self._one_at_a_time:
             program = self._runtime.program
             replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
@@ -87,10 +87,10 @@ class Reloader:
             try:
                 self._runtime.take_over(self._runtime.prepare(program))
             except (StartError, StuckError, OSError) as error:  # the watcher calls again
-                logger.warning("a listener cannot be opened on its network", why=str(error))
+                logger.warning("a listener cannot be reopened", why=str(error))
             else:
                 names = [each.name for each in replaceable]
-                logger.info("these listeners receive now: their networks are there", listeners=names)
+                logger.info("these listeners now receive: their networks are up", listeners=names)
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""
@@ -107,13 +107,13 @@ class Reloader:
             text = _changes(now, then)
             self._runtime.take_over(self._runtime.prepare(then))
             if moved := _all_moved(now.table, then.table):
-                logger.warning("the reload has moved every endpoint to another address", endpoints=moved)
+                logger.warning("the reload has changed the address of every endpoint", endpoints=moved)
         except (StartError, StuckError) as error:
             why = str(error)
-        except OSError as error:  # files come and go while they are read, and descriptors may be short
+        except OSError as error:  # files may change while they are read, or descriptors run out
             why = f"the table cannot be read or opened now: {error}"
-        except Exception as error:  # noqa: BLE001 a bug of the router, which is logged, must not end the caller
-            found = fault(error, "kept it from reloading")
+        except Exception as error:  # noqa: BLE001 a bug of the router is logged; it must not end the caller
+            found = fault(error, "prevented the reload")
             found.log()
             why = f"{found.event}: {error!r}"
         else:
@@ -130,13 +130,13 @@ class Reloader:
         while True:
             checked = check_table(now.table.path, self._environ, Definitions(now.protos))
             if checked.table is None or not wait_until_unchanged(watched_files(checked.table), until):
-                return checked  # else it was read while it was written
+                return checked  # else the files changed while they were read
 
     def _notify_replaced(self) -> None:
         try:
             self._replaced()
         except Exception as error:  # noqa: BLE001 as above; the new table runs already
-            fault(error, "came after a reload").log()
+            fault(error, "occurred after a reload").log()
 
     def _count(self, kind: str) -> None:
         self._counts.own[self._counts.counters.index("config_reloads", kind)] += 1
@@ -164,7 +164,10 @@ def _unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
     }
     return [
         Diagnostic(
-            span or top, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
+            span or top,
+            Code.BAD_VALUE,
+            f"'{key}' cannot change while the router runs",
+            "restart it, or undo the change",
         )
         for key, (before, after, span) in settings.items()
         if not are_same(before, after)

@@ -1,4 +1,4 @@
-"""The router as a whole: what routes (`runtime`), the services beside it, reloads, and the order of start and stop."""
+"""The whole router: routing (`runtime`), other services, reloads, and the order of start and stop."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, StopStack, background_threads
 
-if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
+if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time until the ports are bound
     from prometheus_client.metrics_core import Metric as Family
 
     from router.gateway.clients import ClientQueue
@@ -51,9 +51,9 @@ _TOTALS = (
 class Router:
     """A running program: `with Router(program): ...`, which may be entered once.
 
-    Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, such as `["--ros-args", "-r",
-    "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
-    `head_start` runs the same program already, and is taken over; `keeper` keeps what runs for the next start. `start`
+    Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, for example `["--ros-args",
+    "-r", "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
+    The router adopts `head_start`, which runs the same program; `keeper` saves the program for the next start. `start`
     is one of STARTS.
     """
 
@@ -147,7 +147,7 @@ class Router:
         return self._services.http_address
 
     def total(self, metric: str) -> int:
-        """The sum of a counter since the start over all its labels."""
+        """The sum of a counter over all its labels, since the start."""
         return self._counts.total(metric)
 
     def totals(self) -> dict[str, int]:
@@ -162,7 +162,7 @@ class Router:
         return self._runtime.plane.turns + self.total("datagrams_received")
 
     def feed_watchdog(self, notify: int, interval: int) -> None:
-        """Feed a watchdog by a connected socket, every `interval` ns; -1 for none."""
+        """Feed a watchdog through the connected socket `notify` every `interval` ns; -1 ends that."""
         self._runtime.plane.feed_watchdog(notify, interval)
 
     def collect(self) -> Iterator[Family]:
@@ -176,7 +176,7 @@ class Router:
         return self._reloader.reload()
 
     def save_recording(self, reason: str) -> None:
-        """Start to save the last datagrams, if the table keeps them; the result is logged."""
+        """Start to save the last datagrams, if the table records them; the result is logged."""
         self._services.save_recording(reason)
 
     def _open_services(self, change: Change, opening: ExitStack) -> None:
@@ -191,7 +191,7 @@ class Router:
             self._services.deadman_tripped(route)
 
     def _watch(self) -> None:
-        """Watch the table's files if it says so, and the network interfaces that it names."""
+        """Watch the network interfaces of listeners, and the table's files if the table says so."""
         listeners = self.listeners.values()
         may_change = any(each.interface or each.is_waiting or each.address.host != "0.0.0.0" for each in listeners)
         if self._interfaces is None and may_change:
@@ -212,7 +212,7 @@ class Router:
             self._interfaces.close()
 
     def _asked(self) -> dict[str, Asked]:
-        """Series without a counter: their values are read when they are asked for."""
+        """Series without a counter, whose values are computed at each scrape."""
 
         def of_clients(value: Callable[[ClientQueue], float]) -> Asked:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
@@ -236,13 +236,13 @@ class Router:
             "protos_sha256": program.protos_sha256,
             "start": self._start,
         }
-        # Of this program, whose counters are there before those of the running one are adopted, once nothing is stuck.
+        # Use this program's counters: those of the running program are adopted only once no thread is stuck.
         copies = partial(self._counts.copies, program.counters.size)
         return CountersCollector(program.counters, copies, self._asked(), build)
 
 
 class Services:
-    """The services beside routing that the table asks for: recorder, Foxglove, diagnostics, HTTP."""
+    """The services of the table besides routing: recorder, Foxglove, diagnostics, HTTP."""
 
     def __init__(self, running: Running) -> None:
         self.http_address: Address | None = None
@@ -300,14 +300,14 @@ class Services:
                 yield (endpoint.name, endpoint.kind.value), endpoint.stale_after / 1e9
 
     def deadman_tripped(self, route: str) -> None:
-        """Called by the deadman's thread: returns at once."""
+        """Save the last datagrams. Called when a deadman trips; returns at once."""
         if self._recorder is not None:
             self._recorder.deadman_tripped(route)
 
     def save_recording(self, reason: str) -> None:
-        """Start to save, and return at once; the result is logged. To be called by one thread.
+        """Start to save, and return at once; the result is logged. For one thread.
 
-        A second request before the first one has begun is the same one.
+        A request is ignored while an earlier one has not begun.
         """
         if self._recorder is None:
             logger.warning("nothing to save: the table has no 'record: {last: ...}'")

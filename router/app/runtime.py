@@ -1,4 +1,4 @@
-"""Everything that is open for the running program, and how another program takes over.
+"""The open sockets, topics and gateways of the running program, and the change to another program.
 
 A reload has three steps: prepare (open what the program needs in addition; may fail), adopt (each thread changes to it
 between two messages), finish (close what is no longer used). The first program starts the same way.
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from router.ros.router_node import RouterNode
 
 _STALLED_S = 0.01
-"""A call that publishes usually takes less."""
+"""Publish calls that have taken less are reported as 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Runtime:
 
     @property
     def program(self) -> Program | None:
-        """What runs."""
+        """The running program."""
         return self.plane.now.program if self.plane.now else None
 
     @property
@@ -72,7 +72,7 @@ class Runtime:
         return self._ros.name if self._ros else ""
 
     def stalled(self) -> dict[str, float]:
-        """For how many seconds a call that publishes on a topic has been in the middleware, by topic; 0 if in none."""
+        """For how many seconds a publish call has been in the middleware, by topic; 0 if no call is running."""
         stalled = dict.fromkeys((plan.label for plan in self.program.publishers) if self.program else (), 0.0)
         for topic, seconds in (*(self._ros.stalled() if self._ros else ()), *self.plane.stalled()):
             if seconds >= _STALLED_S:
@@ -80,7 +80,7 @@ class Runtime:
         return stalled
 
     def start(self, change: Change) -> None:
-        """Run the prepared program, then open its gateways. Raises StartError; then the program runs all the same."""
+        """Run the prepared program, then open its gateways. Raises StartError; then the program runs without them."""
         self.adopt(change)
         with background_threads(), ExitStack() as undo:
             gateways = self._prepare_gateways(change.built, undo)
@@ -102,13 +102,13 @@ class Runtime:
     # a reload
 
     def prepare(self, program: Program) -> Change:
-        """Open what `program` needs and is not open yet. Raises StartError, with nothing changed.
+        """Open what `program` needs and is not open yet. Raises StartError with nothing changed.
 
-        For the first program, deadmen send their payload of the start here, and gateways are opened by `start`: they
-        take longer than to receive, forward and publish.
+        For the first program, deadmen send here, and gateways are opened later, by `start`, because they take longer to
+        open than sockets and topics.
         """
         if self._unfinished and self.plane.has_passed():
-            self._close_unfinished()  # first: it may be opened again
+            self._close_unfinished()  # first, as it may be opened again
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
@@ -133,7 +133,7 @@ class Runtime:
             return Change(sockets, topics, built, gateways, undo.pop_all())
 
     def adopt(self, change: Change) -> None:
-        """Have all threads change to the prepared program. Raises StuckError or StartError, with nothing changed."""
+        """Switch all threads to the prepared program. Raises StuckError or StartError with nothing changed."""
         try:
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
@@ -149,8 +149,7 @@ class Runtime:
     def finish(self, change: Change, earlier: Built | None) -> None:
         """Watch the peers of new topics, and close what only the earlier program used.
 
-        If a thread is stuck there, as in the middleware, that stays open until it goes on. All of it is done even if
-        one step raises.
+        What a stuck thread still uses stays open until the thread goes on. All steps run even if one raises.
         """
         with ExitStack() as last_first:
             last_first.callback(self._close_passed, change, earlier)
@@ -158,19 +157,19 @@ class Runtime:
                 self._ros.watch(change.ros)
 
     def take_over(self, change: Change) -> None:
-        """Adopt the prepared program, and finish. Raises StuckError or StartError, with nothing changed.
+        """Adopt the prepared program, and finish. Raises StuckError or StartError with nothing changed.
 
-        A failure after the adoption is a bug, and logged.
+        A failure after the adoption is a bug and is logged.
         """
         earlier = self.plane.now
         self.adopt(change)
         try:
             self.finish(change, earlier)
-        except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
-            fault(error, "kept it from closing what it does not use").log()
+        except Exception as error:  # noqa: BLE001 a bug is logged; the program keeps running
+            fault(error, "prevented it from closing unused sockets and topics").log()
 
     def _close_passed(self, change: Change, earlier: Built | None) -> None:
-        """Close what all threads have passed, in this reload and in those before."""
+        """Close what no thread uses any more, of this reload and earlier ones."""
         self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
             is_first = earlier is None and not change.sockets.moves  # a head start sends by what those leave
@@ -184,7 +183,7 @@ class Runtime:
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
 
     def _close_unfinished(self) -> None:
-        """Close what was left at reloads, the newest first. Each is tried once."""
+        """Close what earlier reloads could not close, the newest first. Try each once."""
         with ExitStack() as last_first:
             for close in self._unfinished:
                 last_first.callback(close)
@@ -270,7 +269,7 @@ def _needs_ros(program: Program) -> bool:
 
 
 def _check_ros_arguments(program: Program, ros_args: Sequence[str]) -> None:
-    """Raises StartError. Without arguments ROS is not loaded for it, which takes a while."""
+    """Check the arguments. Raises StartError. Without arguments, ROS is not loaded, which would take a while."""
     if len(ros_args) > 1:
         try:
             from router.ros.node import check_arguments

@@ -1,4 +1,4 @@
-"""The UDP sockets of the running program; those that the next program uses as well stay open."""
+"""The UDP sockets of the running program; sockets that the next program also uses stay open."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from router.table.addresses import Address, BadAddressError
 class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
-    `moves` are the sockets by which senders that stay are to send, with that of the listener whose port each has.
-    `opened` closes the sockets opened for it; `left`, once it is applied, those that it does not use.
+    `moves` are new sockets for senders that stay, each with the listener whose port it uses. `opened` closes the
+    sockets opened for the change; `left` closes, once it is applied, the sockets that it does not use.
     """
 
     program: Program
@@ -37,13 +37,13 @@ class SocketChange:
 
 def _log_absence(listener: model.Listener) -> None:
     host = listener.address.value._replace(port=0)  # the port may be taken, by an inherited socket
-    why, remedy = absence(host, listener.interface) or ("its network has gone", "")
-    what = "this listener receives nothing until its network is there; the others work"
+    why, remedy = absence(host, listener.interface) or ("its network is gone", "")
+    what = "this listener receives nothing until its network is up; the others work"
     logger.warning(what, listener=listener.name, address=listener.bound_to, why=why, remedy=remedy)
 
 
 def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
-    """Log why nothing can be sent to an endpoint now. Raises StartError if it is new, and a broadcast address."""
+    """Log why nothing can be sent to an endpoint now. Raises StartError for a new one with a broadcast address."""
     address = endpoint.address.value
     try:
         found = why_unreachable(address)
@@ -53,26 +53,26 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         found = error.what, error.hint
     if found:
         why, remedy = found
-        what = "nothing can be sent to this endpoint now; the router tries again with every datagram"
+        what = "nothing can be sent to this endpoint now; the router retries with every datagram"
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 
 def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
-    """Warn of datagrams that are sent from an address which their route does not lead back to."""
+    """Warn if datagrams leave with a source address other than that of the route to the endpoint."""
     own, usual = sender.leaves_from, usual_source(endpoint.address.value)
     if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
         return
     logger.warning(
-        "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them",
+        "datagrams to this endpoint have another network's source address; firewalls may drop them",
         endpoint=endpoint.name,
         address=own,
         route=usual,
-        remedy="`send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
+        remedy="use `send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
     )
 
 
 def _source(name: str | None, listeners: Mapping[str, Listener]) -> Listener | None:
-    """The listener of that name, or while it is waiting another one with the same address and port."""
+    """The listener of that name; while it is waiting, another one with the same address and port."""
     named = listeners.get(name) if name is not None else None
     if named is None or not named.is_waiting:
         return named
@@ -83,12 +83,12 @@ _Destination = tuple[Address, model.EndpointKind]
 
 
 def _destination(endpoint: model.Endpoint) -> _Destination:
-    """What a sender depends on."""
+    """The settings of an endpoint that its sender depends on."""
     return endpoint.address.value, endpoint.kind
 
 
 class KernelDrops:
-    """Datagrams that the kernel dropped, by listener and by receiving gateway, including closed sockets."""
+    """Datagrams dropped by the kernel, by listener and by receiving gateway, including closed sockets."""
 
     def __init__(self) -> None:
         self._now: dict[str, tuple[Callable[[], int], int]] = {}
@@ -128,7 +128,7 @@ class Sockets:
     def take_over(
         self, program: Program, listening: Mapping[str, ListeningSocket], senders: Mapping[str, NativeSender]
     ) -> None:
-        """Own what a head start has opened for a program."""
+        """Adopt the sockets that a head start has opened for a program."""
         plans = {plan.name: plan for plan in program.listeners}
         self.listeners = {name: Listener(plans[name], opened=opened) for name, opened in listening.items()}
         self._bound = {plans[name].bound_to: listener for name, listener in self.listeners.items()}
@@ -137,7 +137,7 @@ class Sockets:
             self._drops.follow(name, listener.kernel_drops)
 
     def prepare(self, program: Program) -> SocketChange:
-        """Open the sockets of `program` that are not open yet. Raises StartError or OSError, with nothing changed."""
+        """Open the sockets of `program` that are not open yet. Raises StartError or OSError with nothing changed."""
         with ExitStack() as opening:
             listeners = {}
             for plan in program.listeners:
@@ -170,7 +170,7 @@ class Sockets:
             return SocketChange(program, listeners, senders, moves, opening.pop_all())
 
     def _sending_ports(self) -> set[int]:
-        """The ports of listeners that senders are bound to as well."""
+        """The ports that a listener and a sender share."""
         senders = [sender for _, sender in self._senders.values()]
         return {sender.source.address[1] for sender in senders if sender.source is not None and sender.is_bound}
 
@@ -179,7 +179,7 @@ class Sockets:
         return [each for each in self._bound.values() if each not in change.listeners.values()]
 
     def apply(self, change: SocketChange) -> None:
-        """Replace the sockets by those of the change."""
+        """Replace the sockets with those of the change."""
         for listener in self.left(change):
             change.left.callback(listener.close)
         for endpoint, (_, sender) in self._senders.items():

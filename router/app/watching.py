@@ -16,7 +16,7 @@ from router.threads import Thread
 from router.types.proto_files import walk
 
 PERIOD = 0.5
-"""Seconds between two checks. A change is acted on once the next check finds the same: editors write in pieces."""
+"""Seconds between two checks. A reload waits until two checks in a row find the same: editors write in pieces."""
 
 UNCHANGED_TIMEOUT = 5.0
 """Seconds for which a reload waits for files that are being written."""
@@ -50,10 +50,10 @@ class Watcher:
         while not self._stopped.wait(PERIOD):
             now = self._snapshot()
             if now is not None and now == before and now != self._handled:
-                logger.info("files of the table have changed: it is read again")
+                logger.info("files of the table have changed; reloading")
                 self._changed()
                 self._handled = now
-                after = self._snapshot() or now  # of other files, if the table names others now
+                after = self._snapshot() or now  # of other files, if the reloaded table names others
                 if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
                     self._handled = after
                 before = after
@@ -71,9 +71,9 @@ class Watcher:
 class InterfaceWatcher:
     """Checks once a second whether `listeners` have their addresses and network interfaces.
 
-    A socket stays bound to the old interface when a tunnel is set up again or an adapter plugged in again, and receives
-    nothing; one that is waiting was never bound. Then `reopen` is called in the watcher's thread until it does. One
-    whose address has gone receives again when that comes back. `close` does not wait.
+    After a tunnel or an adapter was removed and is back, a socket stays bound to the old interface and receives
+    nothing; a waiting socket was never bound. `reopen` is called in the watcher's thread until both receive. A socket
+    whose address is gone receives again when the address comes back. `close` does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
@@ -91,12 +91,12 @@ class InterfaceWatcher:
             lost = [each for each in self._listeners() if each.lacks_network()]
             for each in lost:
                 if each not in reported and not each.is_waiting:
-                    what = "a network interface" if each.has_lost_interface() else "the address of a listener"
-                    logger.error(f"{what} has gone: nothing comes in by it", listener=each.name)
+                    what = "the network interface" if each.has_lost_interface() else "the address"
+                    logger.error(f"{what} is gone: the listener receives nothing", listener=each.name)
             if any(each.is_waiting or each.has_lost_interface() for each in lost):
                 self._reopen()
             if back := [each.name for each in reported if each in self._listeners() and each not in lost]:
-                logger.info("these listeners receive now: their networks are there", listeners=back)
+                logger.info("these listeners now receive: their networks are up", listeners=back)
             reported = lost
 
 

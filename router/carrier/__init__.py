@@ -1,1 +1,1 @@
-"""The carrier: a C library that receives, forwards and brakes, and the threads of Python that it works with."""
+"""The carrier: a C library that receives, forwards and brakes, and its Python interface."""

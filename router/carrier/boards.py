@@ -1,4 +1,4 @@
-"""What boards can take, as the arrays that `board_takes` checks by."""
+"""The limits of boards, as arrays for `board_takes`."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class NativeBoards:
             self._boards[name] = self.arrays.add(board)
 
     def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
-        """The board that an endpoint is; None for another kind of endpoint."""
+        """The limits of an endpoint; None if it is not a board."""
         board = self._boards.get(endpoint)
         return ctypes.pointer(board) if board is not None else None
 
 
 class _Tree:
-    """The tree of messages that an envelope is, flattened: each place has an index, and a run of counters."""
+    """The flattened message tree of an envelope: each place has an index and a range of counters."""
 
     def __init__(self, envelope: BoardMessage, arrays: Arrays) -> None:
         self._messages: list[c.BoardMessage] = []

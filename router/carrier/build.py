@@ -1,12 +1,12 @@
-"""Compiles the carrier's library, and makes `router/declared.py` of its headers.
+"""Compiles the carrier's library, and generates `router/declared.py` from its headers.
 
-Needs a C compiler and nothing else, not even the router's dependencies:
+Needs only a C compiler, not even the router's dependencies:
 
-python router/carrier/build.py              compile it; `$CC` is the compiler, `cc` unless set
+python router/carrier/build.py              compile with `$CC`, by default `cc`
 python router/carrier/build.py --output F   to another file, with `declared.py` beside it
-python router/carrier/build.py --rcl        fail without headers of rcl to check rcl_types.h with
-python router/carrier/build.py --check      exit with 0 if it is up to date, else with 1
-python router/carrier/build.py --lint       exit with 0 if the compiler has nothing to warn of
+python router/carrier/build.py --rcl        fail without the rcl headers that check rcl_types.h
+python router/carrier/build.py --check      exit with 0 if the library is up to date, else 1
+python router/carrier/build.py --lint       only check for compiler warnings; exit with 0 if none
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 NATIVE = Path(__file__).parent / "native"
 LIBRARY = NATIVE / "libcarrier.so"
 DECLARED = NATIVE.parents[1] / "declared.py"
-"""What the headers declare, for Python."""
+"""The declarations of the headers, for Python."""
 
 _OPTIMIZED = (
     "-O2",
@@ -35,18 +35,18 @@ _OPTIMIZED = (
     "-D_FORTIFY_SOURCE=2",
 )
 _LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,defs", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
-"""All functions are exported, for ctypes; among themselves they need no symbol table."""
+"""All functions are exported for ctypes; calls among them bypass the symbol table."""
 
 _RCL = ("rcl", "rcutils", "rmw", "rosidl_runtime_c", "rosidl_typesupport_interface", "rosidl_dynamic_typesupport",
         "rcl_yaml_param_parser", "type_description_interfaces", "service_msgs", "builtin_interfaces")  # fmt: skip
-"""Packages whose headers those of rcl include."""
+"""Packages whose headers rcl includes."""
 
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Werror")
-"""For developers: other compilers than theirs may warn of more."""
+"""For developers only: other compilers may warn about more."""
 
 
 class BuildError(Exception):
-    """There is no compiler, or it refuses the sources, and says what it said; or the processor has no 64 bits."""
+    """There is no compiler, the sources do not compile (with the compiler's output), or Python has 32 bits."""
 
 
 def sources() -> list[Path]:
@@ -55,9 +55,9 @@ def sources() -> list[Path]:
 
 
 def rcl_headers() -> list[str]:
-    """Options by which the compiler finds the headers of rcl: of the wheels in this environment, or of ROS from apt.
+    """Compiler options for the headers of rcl, from the wheels in this environment or from ROS packages of apt.
 
-    None where there is no rcl.
+    Empty without rcl.
     """
     folders = [Path(prefix, "include", package) for prefix in _prefixes() for package in _RCL]
     is_there = any((folder / "rcl" / "types.h").exists() for folder in folders)
@@ -69,9 +69,9 @@ def _prefixes() -> list[str]:
 
 
 def checksum() -> str:
-    """The SHA-256 of all that the library is made of: sources, headers, what reads them, and for which processor.
+    """The SHA-256 of everything that determines the library: processor, sources, headers, and the build scripts.
 
-    `carrier_checksum` returns it, and `router.declared` has it.
+    `carrier_checksum` returns it, and `router.declared` contains it.
     """
     digest = sha256(platform.machine().encode())
     for path in [*sorted(NATIVE.glob("*.[ch]")), Path(__file__), Path(__file__).with_name("headers.py")]:
@@ -81,23 +81,23 @@ def checksum() -> str:
 
 
 def is_current(library: Path = LIBRARY) -> bool:
-    """Whether the library was made of the files that are there now. It is not loaded for that."""
+    """Whether the library was built from the present files. Does not load it."""
     current = checksum().encode()
     return all(made.exists() and current in made.read_bytes() for made in (library, declared_by(library)))
 
 
 def declared_by(library: Path) -> Path:
-    """The Python module that is made together with a library."""
+    """The Python module that is generated together with a library."""
     return DECLARED if library == LIBRARY else library.with_name(DECLARED.name)
 
 
 def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, compiler: str | None = None) -> Path:
-    """Compile the library and put it in place of `output` at once: a running router keeps the one that it has loaded.
+    """Compile the library and replace `output` atomically: a running router keeps the one that it has loaded.
 
-    The module that it goes with is made first, and also without a compiler. Raises BuildError.
+    The Python module is generated first, even without a compiler. Raises BuildError.
     """
     if sys.maxsize < 2**32:
-        raise BuildError("the carrier is for 64-bit processors only, and this Python is one for 32 bits")
+        raise BuildError("the carrier is for 64-bit processors only, but this Python is for 32-bit ones")
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
         made, checks = Path(folder) / output.name, _declare(output, Path(folder))
         files = [*map(str, sources()), str(checks), f"-I{NATIVE}"]
@@ -107,7 +107,7 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 
 
 def _declare(library: Path, folder: Path) -> Path:
-    """Make the module of a library. Return C in that folder with which only what was read correctly compiles."""
+    """Generate the module of a library. Return a C file in `folder` that checks at compile time that it is right."""
     from router.carrier.headers import HeaderError, checks, declarations
 
     made = folder / DECLARED.name
@@ -116,7 +116,7 @@ def _declare(library: Path, folder: Path) -> Path:
     except HeaderError as error:
         raise BuildError(str(error)) from None
     spec = spec_from_file_location("declared", made)
-    assert spec is not None and spec.loader is not None  # noqa: S101, PT018 - it is a file of Python
+    assert spec is not None and spec.loader is not None  # noqa: S101, PT018 - it is a Python file
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     checked = folder / "declared.c"
@@ -126,7 +126,7 @@ def _declare(library: Path, folder: Path) -> Path:
 
 
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
-    """Run the C compiler on sources of the carrier, and of those who call it. Raises BuildError."""
+    """Run the C compiler on sources of the carrier or of its callers. Raises BuildError."""
     language = ("-std=c11", "-D_GNU_SOURCE", "-pthread", f'-DCARRIER_CHECKSUM="{checksum()}"')
     libraries = () if {"-fsyntax-only", "-c"} & {*arguments} else ("-lm",)
     command = [compiler or os.environ.get("CC") or "cc", *language, *arguments, *libraries]
@@ -141,9 +141,9 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile the carrier's library.")
     parser.add_argument("--output", type=Path, default=LIBRARY)
-    parser.add_argument("--rcl", action="store_true", help="fail without headers of rcl to check rcl_types.h with")
-    parser.add_argument("--check", action="store_true", help="only say by the exit code whether it is up to date")
-    parser.add_argument("--lint", action="store_true", help="only compile, with warnings as errors")
+    parser.add_argument("--rcl", action="store_true", help="fail without the rcl headers that check rcl_types.h")
+    parser.add_argument("--check", action="store_true", help="only report by the exit code whether it is up to date")
+    parser.add_argument("--lint", action="store_true", help="only check for compiler warnings")
     args = parser.parse_args()
     if args.check:
         return 0 if is_current(args.output) else 1

@@ -13,8 +13,8 @@ from router.carrier.threads import NativeThread
 class Carrier(NativeThread):
     """Receives datagrams and executes programs, in native threads that never wait for Python.
 
-    `counts` is the array of the receive thread, which writes losses and rejections to `events`, and what topics get to
-    `published`. Deadmen are served when they are due.
+    `counts` is the array of the receive thread, which writes losses and rejections to `events`, and messages for topics
+    to `published`. Deadmen are served when they are due.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Carrier(NativeThread):
             return int(self._library.carrier_turns(self._address)) if self._address else 0
 
     def start(self, change: c.Change, *used: object) -> None:
-        """Start the threads with a program, which needs what is `used` as well. Raises StartError."""
+        """Start the threads with a program. `used` is kept alive for it. Raises StartError."""
         if error := self._library.carrier_start(self._address, ctypes.byref(change)):
             from router.errors import StartError
 
@@ -48,14 +48,14 @@ class Carrier(NativeThread):
         self._running = change, used
 
     def change(self, change: c.Change, *used: object) -> None:
-        """Execute another program from the next datagram on. Listeners that it does not have are emptied before."""
+        """Execute another program from the next datagram on. Listeners that it does not have are drained before."""
         self._library.carrier_change(self._address, ctypes.byref(change))
         self._running = change, used
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
-        """Write what is received to `ring` from now on. `lost` is the counter of what had no room there.
+        """Mirror received datagrams to `ring` from now on. `lost` is the counter of those that found it full.
 
-        After `close`, nothing is received.
+        Does nothing after `close`.
         """
         with self._in_use:
             if not self._address:
@@ -63,15 +63,15 @@ class Carrier(NativeThread):
             self._library.carrier_mirror(self._address, ring.address if ring else None, lost)
 
     def watchdog(self, notify: int, interval: int) -> None:
-        """Feed a watchdog by a connected socket every `interval` ns, while receiving makes progress and `pulse` is
-        called every few seconds."""
+        """Feed a watchdog through the connected socket `notify` every `interval` ns, while receiving makes progress and
+        `pulse` is called every few seconds."""
         self._library.carrier_watchdog(self._address, notify, interval)
 
     def pulse(self) -> None:
         self._library.carrier_pulse(self._address)
 
     def stop_receiving(self) -> None:
-        """Handle what the kernel holds, and end the receive thread. Brakes go on."""
+        """Handle the datagrams queued in the kernel, and end the receive thread. Deadmen keep running."""
         self._library.carrier_stop_receiving(self._address)
 
     def close(self) -> None:

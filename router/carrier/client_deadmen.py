@@ -1,4 +1,4 @@
-"""Deadmen of gateway clients, which publish. A native thread of their own serves them, as publishing may block."""
+"""Deadmen of gateway clients. They have a native thread of their own, because they publish, which may block."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ class ClientDeadman(NativeDeadman):
     """
 
     def feed(self, now: int) -> None:
-        """Called when a client's message was published; `now` is a time before that."""
+        """Feed the deadman when a client's message was published; `now` is a time before that."""
         self._library.deadman_feed(self._deadmen, self.address, now)
 
     def await_subscribers(self, now: int) -> None:
-        """Publish to each subscriber that is discovered shortly after the start, unless the table says otherwise."""
+        """Publish to each subscriber discovered shortly after the start, unless the table says otherwise."""
         self._library.deadman_await_subscribers(self._deadmen, self.address, now)
 
     def greet(self, now: int) -> bool:
-        """A subscriber was discovered: return whether it is published to, as no client has published yet."""
+        """Handle a new subscriber. Return whether the deadman publishes to it, because no client has published yet."""
         return bool(self._library.deadman_greet(self._deadmen, self.address, now))
 
     def end(self) -> None:
-        """Have the thread publish a last time, if armed or tripped."""
+        """Have the thread publish a last time if the deadman is armed or tripped."""
         self._library.deadman_end_by_thread(self._deadmen, self.address)
 
 
 class ClientDeadmen(NativeThread):
-    """All deadmen of gateway clients, and their thread; never closed. They write to `events` what they do."""
+    """All deadmen of gateway clients, and their thread; never closed. They report to `events`."""
 
     def __init__(self, library: ctypes.CDLL, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names) -> None:
         """Raises MemoryError."""
@@ -58,7 +58,7 @@ class ClientDeadmen(NativeThread):
         self._has_started = False
 
     def start(self, functions: tuple[int, int, int]) -> None:
-        """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
+        """Start the thread if it is not running. `functions` are the addresses in `ros.rcl.PublishFunctions`.
 
         Raises StartError.
         """
@@ -71,7 +71,7 @@ class ClientDeadmen(NativeThread):
     def kept(
         self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
     ) -> ClientDeadman:
-        """The deadman of a topic, which lives as long as programs have it with this publisher. Raises MemoryError."""
+        """The deadman of a topic, shared by programs that have it with the same publisher. Raises MemoryError."""
         topics = [topic for topic, _ in plan.datagrams]
         used = [publications[topic] for topic in topics]
         return state.open(
@@ -85,9 +85,9 @@ class ClientDeadmen(NativeThread):
         )
 
     def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
-        """Go on from the deadmen of a program to those of the next one, which has that generation. By name.
+        """Replace the deadmen of one program with those of the next, which has that generation. By name.
 
-        Those with other settings inherit the state of earlier ones.
+        A deadman with changed settings inherits the state of the earlier one.
         """
         for name in before.keys() - now.keys():
             before[name].end()
@@ -104,7 +104,7 @@ class ClientDeadmen(NativeThread):
         return False
 
     def stalled(self) -> tuple[str, float] | None:
-        """The topic in whose publisher the thread is now, and for how many seconds; None if in none."""
+        """The topic on which the thread is publishing now, and for how many seconds; None if there is none."""
         topic = ctypes.c_uint32()
         since = self._library.client_deadmen_since(self._address, ctypes.byref(topic))
         return (self._names.name(topic.value), (monotonic_ns() - since) / 1e9) if since else None
@@ -112,7 +112,7 @@ class ClientDeadmen(NativeThread):
     def stop(self) -> bool:
         """Have armed deadmen publish a last time, and end the thread.
 
-        Return False if it is stuck in the middleware after 1 s: then it is left, and publishers must stay open.
+        Return False if it is stuck in the middleware after 1 s: then it keeps running, and publishers must stay open.
         Idempotent.
         """
         return bool(self._library.client_deadmen_stop(self._address))

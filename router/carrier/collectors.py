@@ -11,7 +11,7 @@ from router.compiler.lowering import LoweredCollect
 
 
 def native_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:
-    """Without a collector. `senders` are numbers of names, by column. The routines are those of the route."""
+    """Make the structure, without a collector. `senders` are numbers of names by column, `routines` the route's."""
     numbers = routines.arrays.array(ctypes.c_uint32, senders)
     return c.Collect(
         by=routines.routine(lowered.by),

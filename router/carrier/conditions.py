@@ -1,4 +1,4 @@
-"""Conditions on payloads by themselves, evaluated as `when` of a route is."""
+"""Stand-alone conditions on payloads, evaluated like `when` of a route."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class NativeCondition:
         self._holds = library.condition_holds
 
     def holds(self, payload: bytes, source: str, received_at: int) -> bool | None:
-        """Whether it holds for a payload, from whom, received when (wall clock, ns); None where it has no value.
+        """Whether it holds for a payload from `source`, received then (wall clock, ns); None if it has no value.
 
         Raises MemoryError.
         """

@@ -1,4 +1,4 @@
-"""Deadmen of the carrier: native code sends commands and brakes under one lock."""
+"""Deadmen of the carrier: native code sends commands and deadman payloads under one lock."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class NativeDeadman:
         self._successor: NativeDeadman | None = None
 
     def start(self, now: int) -> list[str]:
-        """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached."""
+        """Send the payload at router start, unless the table says otherwise. Return the endpoints reached."""
         reached = self._library.deadman_start(self._deadmen, self.address, now)
         return [endpoint for bit, endpoint in enumerate(self._endpoints) if reached >> bit & 1]
 
     def succeeds(self, earlier: NativeDeadman) -> None:
-        """Live as long as `earlier`, whose feeds act on this one once the carrier has replaced it."""
+        """Keep `earlier` alive: once the carrier has replaced it, feeding it feeds this one."""
         earlier._successor = self
 
     def end(self) -> None:
-        """Send a last time, if armed or tripped."""
+        """Send a last time if armed or tripped."""
         self._library.timer_end(self._deadmen, self.address)
 
     def __del__(self) -> None:
@@ -53,7 +53,7 @@ class NativeDeadman:
 
 
 class DeadmanGroup:
-    """Deadmen of routes that one thread serves. `address` is that of its `struct timers`."""
+    """Deadmen of routes, served by one thread. `address` is that of their `struct timers`."""
 
     def __init__(self, library: ctypes.CDLL, address: int, names: Names) -> None:
         self._library = library
@@ -63,7 +63,7 @@ class DeadmanGroup:
     def kept(
         self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
     ) -> NativeDeadman:
-        """The deadman of a route, which lives as long as programs have it with these senders. Raises MemoryError."""
+        """The deadman of a route, shared by programs that have it with the same senders. Raises MemoryError."""
         endpoints = [endpoint for endpoint, _ in plan.datagrams]
         used = [senders[endpoint] for endpoint in endpoints]
         return state.open(
@@ -78,7 +78,7 @@ class DeadmanGroup:
 
 
 class Deadmen(NativeThread, DeadmanGroup):
-    """All deadmen of routes. They write to `events` what they do; never closed."""
+    """All deadmen of routes; never closed. They report to `events`."""
 
     def __init__(self, library: ctypes.CDLL, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names) -> None:
         """Raises MemoryError."""
@@ -88,12 +88,12 @@ class Deadmen(NativeThread, DeadmanGroup):
             raise MemoryError("the deadmen of the carrier cannot be opened")
 
     def end(self) -> None:
-        """Send what waits, then have deadmen send a last time. Nothing waits afterwards."""
+        """Send what is held back, then have deadmen send a last time. Nothing is held back afterwards."""
         self._library.timers_end(self.address)
 
 
 def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
-    """The deadmen of a program that go on from other ones of an earlier program, by route, each with that one."""
+    """Pairs of a deadman that replaces one of an earlier program, and that one, matched by route."""
     pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
     for each, earlier in pairs:
         each.succeeds(earlier)
@@ -101,7 +101,7 @@ def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[
 
 
 def settings(plan: DeadmanPlan, counters: Counters, names: Names) -> tuple[int, int, bool, int, int, int]:
-    """What `deadman_open` gets between the group and the destinations."""
+    """The arguments of `deadman_open` between the group and the destinations."""
     active, trips = counters.index("deadman_active", plan.route), counters.index("deadman_trips", plan.route)
     return plan.timeout, plan.repeat, plan.at_start, active, trips, names.number(plan.route)
 
@@ -109,7 +109,7 @@ def settings(plan: DeadmanPlan, counters: Counters, names: Names) -> tuple[int, 
 def destinations_of(
     plan: DeadmanPlan, counters: Counters, names: Names, outlets: Iterable[Addressed], kind: str = "sender"
 ) -> tuple[ctypes.Array[c.DeadmanDestination], int]:
-    """What a deadman sends to its outlets, senders or publishers (`kind`), as `deadman_open` gets it."""
+    """The payloads of a deadman for its outlets, senders or publishers (`kind`), as an argument of `deadman_open`."""
     made = [
         c.DeadmanDestination(
             datagram=datagram,

@@ -1,4 +1,4 @@
-"""What holds messages back between two messages and two programs: deferrals of targets, and pacers of endpoints."""
+"""Deferrals of targets and pacers of endpoints, which hold messages back, also across a reload."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Adoption:
-    """A timer, and what it delivers to from now on: `struct adoption` in native/timers.h."""
+    """A timer and its new target: `struct adoption` in native/timers.h."""
 
     def __init__(
         self, timer: int, is_topic: bool = False, targets: int | None = None, target: int | None = None
@@ -23,9 +23,9 @@ class Adoption:
 def timer_change(
     now: Collection[Adoption], before: Iterable[Adoption] = (), ended: Iterable[int] = ()
 ) -> c.TimerChange:
-    """What a reload does to timers. Those that only the earlier program had end, then others that are `ended`.
+    """The changes of timers at a reload. Timers that only the earlier program had end first, then those in `ended`.
 
-    A pacer goes before its deferrals, and deadmen last.
+    A pacer ends before its deferrals, and deadmen end last.
     """
     adopted = [
         c.Adoption(timer=_at(c.Timer, each.timer), to=_at(c.Targets, each.targets), target=_at(c.Target, each.target))

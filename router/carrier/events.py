@@ -1,4 +1,4 @@
-"""Reads the events of native threads: rejected datagrams, lost messages, and what deadmen do."""
+"""Reads the events of native threads: rejected datagrams, lost messages, and changes of deadmen."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PULSE_MS = 5000
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """The deadman of a route has tripped, or was released."""
+    """The deadman of a route has tripped or was released."""
 
     route: str
     is_tripped: bool
@@ -30,17 +30,17 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A loss, by the counter of such losses."""
+    """A loss, and the counter of such losses."""
 
     counter: int
     report: Report
 
 
 class EventReader:
-    """Puts records of `native/events.h` into words.
+    """Converts records of `native/events.h` to reports.
 
-    `detail(listener, data, length)` returns in words why a datagram was rejected. `place(route, topic, target,
-    generation, place)` returns which place of the table refused a message of `topic`, None of a datagram; or "".
+    `detail(listener, data, length)` describes why a datagram was rejected. `place(route, topic, target, generation,
+    place)` returns the place of the table that refused a message of `topic` (None: a datagram), or "".
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class EventReader:
         route, target = self._name(event.route), self._name(event.target)
         text = bytes(record[ctypes.sizeof(event) :]).partition(b"\0")[0]
         detail = why_refused(event.refusal, text) if event.refusal.kind else text.decode(errors="replace")
-        if event.generation:  # a program of the table refused the message
+        if event.generation:  # the table's program refused the message
             topic = self._name(event.topic) if event.topic != NO_NAME else None
             place = self._place(route, topic, target, event.generation, event.place)
             detail = ": ".join(filter(None, (place, detail)))
@@ -88,10 +88,10 @@ class EventReader:
 
 
 class EventThread:
-    """Reads the events of native threads, and calls `pulse` every few seconds to say that Python is alive.
+    """Reads the events of native threads, and calls `pulse` every few seconds to signal that Python is alive.
 
-    Of many losses of a kind, few are events; by the counter that an event names, `report` is told of all of them.
-    `changed` gets a route and whether its deadman has tripped.
+    Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
+    that the event names. `changed` gets a route and whether its deadman has tripped.
     """
 
     def __init__(
@@ -109,16 +109,16 @@ class EventThread:
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
-        """By thread and counter: how much of it was reported, and the last report."""
+        """By thread and counter: the reported number, and the last report."""
         self._wakes = [thread.events.watch() for thread in threads]
         self._thread = Thread(self._run, "carrier events")
 
     def start(self) -> None:
-        """Begin with what has been told by now, as by a head start."""
+        """Start the thread, which also reads earlier events, for example of a head start."""
         self._thread.start()
 
     def close(self) -> None:
-        """Read what has been told, and end."""
+        """Read the remaining events, and end the thread."""
         self._stopping = True
         os.eventfd_write(self._wakes[0], 1)
         if self._thread.ident is not None:
@@ -144,7 +144,7 @@ class EventThread:
                     head = EventHead.from_buffer(records, position)
                     self._tell(head.kind, records[position : position + head.size], counters, last)
                     position += head.size
-            for counter, (_, report) in list(last.items()):  # those for which no event was written
+            for counter, (_, report) in list(last.items()):  # losses without an event
                 self._count(counter, report, counters, last)
 
     def _tell(
@@ -159,10 +159,10 @@ class EventThread:
     def _count(
         self, counter: int, report: Report, counters: Sequence[int], last: dict[int, tuple[int, Report]]
     ) -> None:
-        """Report what was counted since the last report by this counter."""
+        """Report the losses that this counter has counted since the last report."""
         total = counters[counter]
         reported = last[counter][0] if counter in last else 0
-        if total < reported:  # the counter has gone with a table, and stands for something else
+        if total < reported:  # a reload has reassigned the counter
             reported = 0
         last[counter] = total, report
         if total > reported:

@@ -1,4 +1,4 @@
-"""The native threads that forward and brake, and what they write to. They need neither ROS nor the table."""
+"""The native threads that forward and brake, and their queues. They need neither ROS nor the table."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MOST_COUNTERS = 1 << 18
-"""Counters of each native thread: their addresses stay the same, so they cannot grow."""
+"""Counters of each native thread: a fixed number, because their addresses must not change."""
 
 _PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
-"""Bytes that may wait: messages for topics, received datagrams for observers, and events of a thread."""
+"""Bytes of the queues: messages for topics, received datagrams for observers, and events of a thread."""
 
 
 class Forwarding:
-    """The threads `receive` and `timers`, which run once `carrier` was started.
+    """The threads `receive` and `timers`, which run once `carrier` is started.
 
-    `published` gets the messages for topics, `mirrored` what is received while it is observed. `names` are those that
-    are known already, `counters` are how many the first program has.
+    `published` gets the messages for topics, `mirrored` the received datagrams while they are observed. `names` are the
+    names known already, `counters` is the number of counters of the first program.
     """
 
     def __init__(self, library: ctypes.CDLL, counters: int, names: Iterable[str] = ()) -> None:
@@ -37,14 +37,14 @@ class Forwarding:
         self.carrier = Carrier(library, self.deadmen.address, *counts_and_events(library, counters), self.published)
 
     def mirror(self, lost: int | None) -> None:
-        """Have what is received be mirrored, or no longer. `lost` is the counter of what had no room."""
+        """Mirror received datagrams from now on; `lost` counts those that found the ring full. None: stop."""
         self.carrier.mirror(None if lost is None else self.mirrored, lost or 0)
 
 
 def counts_and_events(library: ctypes.CDLL, counters: int) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:
-    """What a native thread counts in, and writes its events to. Raises MemoryError.
+    """Counters and an event ring for a native thread. Raises MemoryError.
 
-    The counts never move, and take memory only where something was counted, or will soon be.
+    The counters never move, and use memory only where something is counted.
     """
     pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
     counts = (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)

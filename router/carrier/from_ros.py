@@ -1,4 +1,4 @@
-"""A thread for messages from ROS: neither Python nor a publisher can hold it up."""
+"""The native threads for messages from ROS, which neither Python nor a publisher can block."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from router.log import logger
 from router.threads import StuckError
 
 _IN_TRANSIT_S = 0.01
-"""Within this time a message that one of two subscriptions has got reaches the other one as well."""
+"""Within this time, a message that has reached one of two subscriptions also reaches the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Served:
-    """What the thread serves, and the eventfd of each subscription. `structure` refers to `topics`."""
+    """The topics that the thread serves, and the eventfd of each subscription. `structure` points into `topics`."""
 
     messages: NativeFromRos
     eventfds: Mapping[Subscription, int]
@@ -36,10 +36,10 @@ class _Served:
 
 
 class FromRosThread(NativeThread):
-    """Takes the messages of subscriptions, and sends what routes make of them. It starts once, and stops once.
+    """Takes the messages of subscriptions and executes their routes. It starts once and stops once.
 
-    `deadmen` is the address of the carrier's. The thread for urgent messages runs before others. A thread that was not
-    started serves nothing.
+    `deadmen` is the address of the carrier's deadmen. The thread for urgent messages has priority over others. A thread
+    that was not started serves nothing.
     """
 
     def __init__(
@@ -55,16 +55,16 @@ class FromRosThread(NativeThread):
         self.name = "ros urgent" if is_urgent else "ros messages"
         self.is_urgent = is_urgent
         self.has_passed = True
-        """Whether the thread serves what it was last told to serve."""
+        """Whether the thread serves the topics that it was last given."""
         self._deadmen = deadmen
         self._adopted = NativeFromRos()
         self._served = _served(NativeFromRos(), {})
         self._reported = 0
 
     def start(self, take: int, reset: int) -> None:
-        """Start the thread unless it runs. `take` and `reset` are addresses of functions, as in `ros.receiving`.
+        """Start the thread if it is not running. `take` and `reset` are function addresses, as in `ros.receiving`.
 
-        Raises StartError for a lack of memory, descriptors or threads.
+        Raises StartError if memory, descriptors or threads run out.
         """
         if self._address:
             return
@@ -75,21 +75,21 @@ class FromRosThread(NativeThread):
 
     @property
     def failures(self) -> int:
-        """How often the middleware refused to hand out a message."""
+        """How often the middleware failed to deliver a message."""
         with self._in_use:
             return int(self._library.from_ros_failures(self._address)) if self._address else 0
 
     def report_failures(self) -> None:
-        """Log how often the middleware has refused to hand out a message since the last call."""
+        """Log how often the middleware failed to deliver a message since the last call."""
         failures = self.failures
         if failures > self._reported:
-            logger.error("the middleware has not handed out messages that it has", times=failures - self._reported)
+            logger.error("the middleware did not deliver messages that it holds", times=failures - self._reported)
         self._reported = failures
 
     def leave(self, messages: NativeFromRos) -> None:
-        """Cease to serve topics that `messages` leave to the other thread, once what has arrived on them is served.
+        """Stop serving the topics that `messages` assign to the other thread, after handling what has arrived on them.
 
-        Raises StuckError, with nothing changed, also where there are none.
+        Raises StuckError with nothing changed, even if there is no such topic.
         """
         then, now = messages.only(urgent=not self.is_urgent), self._adopted
         moved = now.topics.keys() & then.topics.keys()
@@ -102,21 +102,21 @@ class FromRosThread(NativeThread):
         self.adopt(self._adopted)
 
     def adopt(self, messages: NativeFromRos) -> None:
-        """Serve the messages of another program that are for this thread. If that fails, it goes on as before."""
+        """Serve this thread's messages of another program. If that fails, keep serving the earlier ones."""
         messages = messages.only(urgent=self.is_urgent)
         try:
             self.serve(messages)
-        except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
-            logger.error("messages from ROS are not served as the table says until it is reloaded", why=str(error))
+        except (StuckError, OSError, RuntimeError) as error:  # errors of rcl are RuntimeErrors
+            logger.error("messages from ROS are still routed by the old table; reload the table again", why=str(error))
             self.has_passed = False
         else:
             self._adopted = messages
             self.has_passed = True
 
     def serve(self, messages: NativeFromRos) -> None:
-        """Serve the topics of `messages`, and no others: between two messages.
+        """Switch to the topics of `messages` between two messages.
 
-        What has arrived on subscriptions that are left is served before; they may be closed afterwards. Raises
+        Messages that have arrived on other subscriptions are handled first; these may be closed afterwards. Raises
         StuckError after 1 s, OSError or one of `ros.node.RCL_ERRORS`, with nothing changed.
         """
         if not self._address:
@@ -138,16 +138,16 @@ class FromRosThread(NativeThread):
             self._leave(subscription, eventfds[subscription])
 
     def follow(self, other: FromRosThread) -> None:
-        """Go on where another thread has left subscriptions: what it has served is not served again."""
+        """Take over the positions of another thread in its subscriptions, so that no message is handled twice."""
         with self._in_use:
             if self._address and other._address:
                 self._library.from_ros_follow(self._address, other._address)
 
     def stop(self) -> bool:
-        """Serve what has arrived, and end.
+        """Handle what has arrived, and end the thread.
 
-        Return False if the thread is stuck in the middleware after 1 s: then it is left, and the subscriptions must
-        stay open. It feeds and sends nothing any more. Idempotent.
+        Return False if it is stuck in the middleware after 1 s: then it keeps running, but feeds and sends nothing, and
+        the subscriptions must stay open. Idempotent.
         """
         with self._in_use:
             address, self._address = self._address, 0
@@ -162,7 +162,7 @@ class FromRosThread(NativeThread):
         return True
 
     def _watched(self, subscription: Subscription) -> int:
-        """Return the eventfd by which the thread learns of new messages."""
+        """Return the eventfd that announces new messages to the thread."""
         with ExitStack() as opening:
             eventfd = os.eventfd(0, os.EFD_CLOEXEC)
             opening.callback(os.close, eventfd)
@@ -180,7 +180,7 @@ class FromRosThread(NativeThread):
 
 
 _left: list[FromRosThread] = []
-"""Those that are stuck: what they refer to has to live until the process ends."""
+"""Stuck threads: what they use must live until the process ends."""
 
 
 def _served(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _Served:
@@ -200,7 +200,7 @@ def _served(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _S
 
 
 def forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
-    """Take from subscriptions that replace others what the earlier ones have got as well, and serve."""
+    """Drop messages of new subscriptions that the replaced ones have also received, and serve."""
     replacing = [each for topic, each in later.items() if earlier.get(topic, each) is not each]
     for subscription in replacing:
         subscription.take_all()

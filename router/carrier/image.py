@@ -1,7 +1,7 @@
-"""The image of a compiled program: its memory as bytes that can be loaded at any address, and what to open for it.
+"""The image of a compiled program: its memory as relocatable bytes, and a list of the objects to open for it.
 
-Pointers within the image are offsets, and `relocations` lists where they are. Others are numbers of `symbols`, which
-say what was opened: `imports` lists where those are. A head start (`kept/head_start.py`) loads the image.
+Pointers within the image are stored as offsets, at the places in `relocations`. Pointers to opened objects are stored
+as numbers of `symbols`, at the places in `imports`. A head start (`kept/head_start.py`) loads the image.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from router.table.model import EndpointKind
 
 T = TypeVar("T")
 Parts = dict[str, Any]
-"""Plain values, as `marshal` takes them."""
+"""Plain values for `marshal`."""
 
 _FIRST = 1 << 56
-"""No address of a process is as high: it stands for the first symbol."""
+"""The first symbol: higher than any address of a process."""
 _WORD = 8
 _ALIGNMENT = 16
 
 
 def image_of(library: ctypes.CDLL, program: Program) -> tuple[Parts, bytes]:
-    """Return what a head start needs of a program with counters of its own, and the image.
+    """Return the parts of a program that a head start needs, and its image. The program has counters of its own.
 
     Equal programs have equal images.
     """
@@ -84,7 +84,7 @@ def image_of(library: ctypes.CDLL, program: Program) -> tuple[Parts, bytes]:
 
 
 class _Symbols:
-    """Stand-ins for addresses of what is open."""
+    """Stand-ins for the addresses of opened objects."""
 
     def __init__(self) -> None:
         self.names: list[tuple[str | None, ...]] = []
@@ -106,7 +106,7 @@ class _Symbol:
 
 
 class _Publication:
-    """As `ros.endpoints.Publication`. Whether it is wanted is a byte that the head start has."""
+    """As `ros.endpoints.Publication`. The head start provides the byte `wanted`."""
 
     def __init__(self, symbols: _Symbols, topic: str) -> None:
         self.address = symbols.address("publisher", topic)
@@ -114,11 +114,11 @@ class _Publication:
 
 
 _LISTENER = SimpleNamespace(is_inherited=False, socket=SimpleNamespace(fileno=lambda: -1))
-"""As `net.udp.Listener`: the head start fills in what it opens."""
+"""As `net.udp.Listener`: the head start fills in the socket."""
 
 
 class _Recorder(State):
-    """Opens nothing, and notes what is to be opened, in order: the place, the function, and plain arguments."""
+    """Opens nothing, but notes each object to open, in order: the place, the function, and plain arguments."""
 
     def __init__(self, library: ctypes.CDLL, symbols: _Symbols) -> None:
         super().__init__(library)
@@ -137,7 +137,7 @@ class _Recorder(State):
 
 
 def _plain(argument: object) -> object:
-    """An argument as the head start gets it: (number,) of a symbol, a list of a deadman's destinations, or itself."""
+    """An argument for the head start: (number,) of a symbol, a list of a deadman's destinations, or the value."""
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), ctypes.string_at(_address_in(each, "datagram"), each.size), each.sent,
@@ -150,12 +150,12 @@ def _plain(argument: object) -> object:
 
 
 def _address_in(structure: Any, field: str) -> int:
-    """The address that a pointer of a structure holds."""
+    """The address in a pointer field of a structure."""
     return ctypes.c_uint64.from_buffer(structure, getattr(type(structure), field).offset).value
 
 
 class _Memory:
-    """The blocks of a program, one behind the other in the order in which they were made."""
+    """The blocks of a program, in the order in which they were made."""
 
     def __init__(self, native: NativeProgram, symbols: _Symbols) -> None:
         self._symbols = symbols
@@ -170,7 +170,7 @@ class _Memory:
         self._ends = {ctypes.addressof(block): ctypes.addressof(block) + ctypes.sizeof(block) for block in self._blocks}
 
     def offset(self, address: int) -> int:
-        """Where in the image that is, which may be within a block. Raises LookupError for what is in none."""
+        """The offset in the image of an address in a block. Raises LookupError if it is in no block."""
         if address in self._offsets:
             return self._offsets[address]
         before = self._addresses[bisect_right(self._addresses, address) - 1]
@@ -179,12 +179,12 @@ class _Memory:
         return self._offsets[before] + address - before
 
     def adoption(self, adoption: Adoption) -> tuple[int, bool, int | None, int | None]:
-        """The symbol of a timer, whether it is of a topic, and the offsets of what it delivers to."""
+        """The symbol of a timer, whether it is for a topic, and the offsets of its targets."""
         to, target = (None if each is None else self.offset(each) for each in (adoption.targets, adoption.target))
         return adoption.timer - _FIRST, adoption.is_topic, to, target
 
     def image(self) -> tuple[bytes, list[int], list[tuple[int, int]]]:
-        """The bytes; the words that hold offsets; and the words that stand for symbols, each with its number."""
+        """The bytes; the places of words that hold offsets; and the places of symbols, each with its number."""
         image = bytearray(self._size)
         relocations, imports = [], []
         for block in self._blocks:
@@ -204,7 +204,7 @@ class _Memory:
         return bytes(image), relocations, imports
 
     def _pointers(self, block: Any, address: int) -> Iterator[int]:
-        """Where in a block pointers are."""
+        """The offsets of pointers in a block."""
         for at, is_certain in _pointers_in(cast("Hashable", type(block))):
             if is_certain or address + at in self._references:
                 yield at
@@ -212,7 +212,7 @@ class _Memory:
 
 @cache
 def _pointers_in(kind: Any) -> tuple[tuple[int, bool], ...]:
-    """Where pointers are in a type of C, and whether always: a `struct value` may hold something else there."""
+    """The offsets of pointers in a C type, each with whether it always is one: a `struct value` may hold a number."""
     if issubclass(kind, ctypes.Array):
         size, within = ctypes.sizeof(kind._type_), _pointers_in(kind._type_)
         return tuple(

@@ -1,7 +1,7 @@
 """Finds and loads the carrier's library, which `build.py` makes, and declares its functions.
 
-A library of other sources than those beside it is refused: its structures may differ from those in `router.declared`.
-A wheel has no sources.
+A library that was built from other sources is rejected, because its structures may differ from `router.declared`.
+A wheel contains no sources.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ LIBRARY = f"{NATIVE}/libcarrier.so"
 
 @cache
 def library() -> ctypes.CDLL:
-    """The library, loaded once. Raises StartError where it cannot be used."""
+    """The library, loaded once. Raises StartError if it cannot be used."""
     return load()
 
 
 def load(path: str | Path = LIBRARY) -> ctypes.CDLL:
-    """Load the library, without which nothing runs, and declare its functions. Raises StartError."""
+    """Load the library and declare its functions. Raises StartError."""
     try:
         built = os.stat(path).st_mtime_ns  # noqa: PTH116 - as above
     except FileNotFoundError:
@@ -40,7 +40,7 @@ def load(path: str | Path = LIBRARY) -> ctypes.CDLL:
     try:
         library = ctypes.CDLL(str(path))
         made_of = _text(library.carrier_checksum)
-    except (OSError, AttributeError) as error:  # of another architecture, or no such library at all
+    except (OSError, AttributeError) as error:  # for another architecture, or not a carrier library at all
         raise _refused(f"{path} cannot be loaded: {error}") from None
     if made_of != declared.CHECKSUM or (any(changed >= built for changed in _changes()) and made_of != _checksum()):
         raise _refused(f"{path} was built from other sources")
@@ -56,7 +56,7 @@ def _text(function: ctypes._NamedFuncPointer) -> str:
 
 
 def _changes() -> Iterator[int]:
-    """When each source was changed last: to read them all takes longer than the rest of a start."""
+    """The modification times of the sources, as reading all sources takes longer than the rest of a start."""
     for folder, endings in (NATIVE, (".c", ".h")), (_CARRIER, ("build.py", "headers.py")):
         with os.scandir(folder) as files:
             yield from (file.stat().st_mtime_ns for file in files if file.name.endswith(endings))
@@ -74,5 +74,5 @@ def _refused(what: str) -> StartError:
 
     hint = "run 'make setup'"
     if is_installed(asset("schemas")):
-        hint = "install the router again where there is a C compiler"
+        hint = "reinstall the router on a machine with a C compiler"
     return StartError(what, hint)

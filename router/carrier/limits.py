@@ -1,4 +1,4 @@
-"""Age and rate of messages that Python handles, checked by the functions that native threads use."""
+"""Age and rate limits for messages that Python handles, with the functions of the native threads."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _NS = 1_000_000_000
 
 
 class Born(NamedTuple):
-    """`struct born` in freshness.h: the earliest and the latest time that a stamp can mean, in ns of the boot clock."""
+    """`struct born` in freshness.h: the earliest and the latest possible time of a stamp, in ns of the boot clock."""
 
     oldest: int
     youngest: int
 
 
 class Freshness:
-    """`struct freshness`: follows the wall clock through its jumps. For one thread."""
+    """`struct freshness`: tracks the jumps of the wall clock. For one thread."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._structure = c.Freshness()
@@ -29,9 +29,9 @@ class Freshness:
         self._born = library.freshness_born
 
     def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
-        """Return when an event was that the wall clock stamped `stamp`; never after `now`.
+        """Return the possible times of an event with the wall-clock stamp `stamp`, never after `now`.
 
-        `now` and `received_at` are boot and wall clock in ns, read now in this order. The event was not before
+        `now` and `received_at` are boot and wall clock in ns, read now in this order. The event did not happen before
         `not_before` (boot clock), if that is known; else None.
         """
         found = self._born(self._at, stamp, received_at, now, _UNKNOWN if not_before is None else not_before)
@@ -47,7 +47,7 @@ class RateLimit:
         self._passes = library.limit_passes
 
     def may_pass(self, now: int) -> bool:
-        """Return whether a message may pass now (boot clock, ns); if so, it takes the place."""
+        """Return whether a message may pass now (boot clock, ns), and if so, count it against the limit."""
         return bool(self._passes(self._at, now))
 
     def __del__(self) -> None:
@@ -55,5 +55,5 @@ class RateLimit:
 
 
 def period(hertz: float) -> int:
-    """The time between two messages of `max_rate`, in ns."""
+    """The time between two messages at `max_rate`, in ns."""
     return ceil(_NS / hertz)

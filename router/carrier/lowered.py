@@ -15,7 +15,7 @@ from router.compiler.lowering.operations import Routine
 
 @dataclass(slots=True)
 class Routines:
-    """Makes the routines of one layout. `arrays` gets what has to live as long as they do."""
+    """Makes the routines of one layout. `arrays` owns their memory."""
 
     _layout: Layout
     arrays: Arrays
@@ -27,7 +27,7 @@ class Routines:
         made = self.arrays.add((c.Operation * len(routine))())
         for to, (kind, slot, flag, size, number, data) in zip(made, routine, strict=True):
             if data:
-                number = len(self._literals)  # noqa: PLW2901 - where the data stands
+                number = len(self._literals)  # noqa: PLW2901 - the position of the data
                 self._literals += data
             to.kind, to.flag, to.size = kind, flag, size
             to.slot = slot if isinstance(slot, int) else slot.index
@@ -38,7 +38,7 @@ class Routines:
         return c.Routine(operations=made, count=len(routine))
 
     def layout(self) -> Any:
-        """A pointer to the layout, once all routines were made: its literals are theirs."""
+        """A pointer to the layout. Call it once all routines are made, as it contains their literals."""
         layout = self._layout
         sections = [self._section(section) for section in layout.sections]
         closed = [self._closed(numbers) for numbers in layout.closed]
@@ -72,7 +72,7 @@ def _native_read(read: WantedField | ReadOperation) -> c.WantedField | c.ReadOpe
 
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) -> Any:
-    """What slots hold: for a list, which is empty, None."""
+    """The contents of slots; None is an empty list."""
     made = arrays.add((c.Value * len(values))())
     for to, value in zip(made, values, strict=True):
         if isinstance(value, bytes):

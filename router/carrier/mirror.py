@@ -1,4 +1,4 @@
-"""What the carrier shows of received datagrams, in the form in which observers get it."""
+"""Mirrored datagrams of the carrier, in the form that observers get."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _HEAD = ctypes.sizeof(MirrorRecord)
 
 
 class MirrorRing:
-    """Reads `ring`, which the receive thread writes while somebody observes."""
+    """Reads `ring`, to which the receive thread writes while there are observers."""
 
     def __init__(self, ring: Ring, names: Names) -> None:
         self.ring = ring
         self._name = names.name
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
-        """Return what was received since the last call, as `recording.mirror.Mirrored`. For one thread."""
+        """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. For one thread."""
         taken: list[tuple[int, str, Peer, str, str, bytes]] = []
         while records := self.ring.take():
             position = 0

@@ -1,4 +1,4 @@
-"""Numbers for the names of listeners, endpoints, routes and targets, which native threads have instead of the names."""
+"""Numbers that stand for the names of listeners, endpoints, routes and targets in native threads."""
 
 from __future__ import annotations
 
@@ -24,5 +24,5 @@ class Names:
         return self._names[number]
 
     def all(self) -> list[str]:
-        """By number."""
+        """All names, by number."""
         return [*self._names]

@@ -1,4 +1,4 @@
-"""What is open for a program, and what its targets keep from one message to the next, for the carrier's arrays."""
+"""The open sockets and topics of a program, and the state of its targets, for the carrier's arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from router.net.udp import Listener
 
 
 class Addressed(Protocol):
-    """What has a structure in C, at `address`: senders and deadmen. It equals itself alone."""
+    """An object with a C structure at `address`: a sender or deadman. Compared by identity."""
 
     def __hash__(self) -> int: ...
 
@@ -27,7 +27,7 @@ class Addressed(Protocol):
 
 
 class Publication(Addressed, Protocol):
-    """What `ros.endpoints.Publication` is. Several threads may publish at a time, until it is closed."""
+    """The protocol of `ros.endpoints.Publication`. Several threads may publish at once, until it is closed."""
 
     @property
     def wanted(self) -> ctypes.Array[Any]: ...
@@ -35,10 +35,10 @@ class Publication(Addressed, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outlets:
-    """What is open for a program. `state` has what its targets keep: the next program takes over what has the same key.
+    """The open sockets and topics of a program. `state` is that of its targets, passed on by key at a reload.
 
-    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` by route. Without `boards`, endpoints
-    that are boards get everything.
+    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` by route. Without `boards`, no limits
+    of boards are checked.
     """
 
     library: ctypes.CDLL
@@ -52,13 +52,13 @@ class Outlets:
     boards: NativeBoards | None = None
 
     def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
-        """The deadmen that commands of the route feed, which is its own, or disarm."""
+        """The deadmen that commands of the route feed (its own) or disarm."""
         return [c.Feed(deadman=self.deadmen[name].address, disarms=name != plan.route) for name in target.deadmen]
 
     def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
         """The limit of a target with `max_rate` for one source of its route."""
         rate = target.max_rate
-        assert rate is not None  # noqa: S101 - said by the caller
+        assert rate is not None  # noqa: S101 - checked by the caller
         place = "limit", plan.route, plan.topic, source, target.label
         return self.state.open(place, target, self._native("limit"), "limit_open", period(rate))
 
@@ -72,11 +72,11 @@ class Outlets:
         return self.state.open(place, rest, self._native("pacer"), "pacer_open", bandwidth)
 
     def _native(self, kind: str, keep: object = None) -> Callable[[int], Native]:
-        """Make what the library has opened an object."""
+        """Return a function that wraps the address of an opened structure."""
         return lambda address: Native(getattr(self.library, f"{kind}_close"), address, keep)
 
     def deferral(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
-        """What holds back the messages of one source for a target. They do not go to another sender or publisher."""
+        """The deferral that holds back the messages of one source for a target, for the same sender or publisher."""
         pacer = self._pacer(target.label) if not target.is_topic and target.label in self.bandwidths else None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
         place = "deferral", plan.route, plan.topic, source, target.label
@@ -84,8 +84,8 @@ class Outlets:
         return self.state.open(place, destination, self._native("deferral", pacer), "deferral_open", address)
 
     def collector(self, plan: RoutePlan) -> Native:
-        """What makes frames of the route's payload for its topics."""
+        """The collector that makes frames of the route's payload for its topics."""
         timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
-        assert timeout is not None  # noqa: S101 - said by the caller
+        assert timeout is not None  # noqa: S101 - checked by the caller
         rest = timeout, plan.case.message_class, targets
         return self.state.open(("collect", plan.route), rest, self._native("collector"), "collector_open", timeout)

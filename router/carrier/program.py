@@ -1,6 +1,6 @@
 """Turns a compiled table into the arrays that the carrier executes.
 
-The compiler has decided everything; here names become indexes, and addresses of what is open.
+The compiler has decided everything; here names become indexes and addresses of open objects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from router.table.model import Framing
 
 @dataclass(slots=True)
 class NativeProgram:
-    """`struct program` with all that it refers to."""
+    """`struct program` with everything that it points to."""
 
     generation: int
     states: TargetStates = field(default_factory=TargetStates)
@@ -60,7 +60,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
 def change_to(
     program: NativeProgram, timers: c.TimerChange, deadmen: Sequence[tuple[NativeDeadman, NativeDeadman]] = ()
 ) -> c.Change:
-    """What the receive thread is told. `deadmen` go on from others, each from the second of its pair."""
+    """The change for the receive thread. `deadmen` are pairs of a deadman and the earlier one that it replaces."""
     addresses = [deadman.address for pair in deadmen for deadman in pair]
     return c.Change(
         program=ctypes.pointer(program.structure),
@@ -77,9 +77,9 @@ class _Writer:
     outlets: Outlets
     targets: TargetWriter
     numbers: Mapping[str, int]
-    """Of the routes."""
+    """Numbers of the routes."""
     columns: Mapping[str, int]
-    """Of the endpoints; strangers have one more."""
+    """Columns of the endpoints; unknown senders have the column after the last one."""
 
     @property
     def counters(self) -> Counters:
@@ -123,7 +123,7 @@ class _Writer:
         )
 
     def _peers(self, listener: str) -> Iterator[c.Peer]:
-        """By address; those with a port first, as they are preferred."""
+        """The peers by address; those with a port come first, as they have priority."""
         by_host, by_address = recognisers(self.program.table.endpoints, listener)
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
@@ -133,7 +133,7 @@ class _Writer:
             yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen, id=number)
 
     def _choices(self) -> Iterator[c.Choice]:
-        """Row by row, as in `cases`: a column for each endpoint, and the last one for strangers."""
+        """The choices row by row, as in `cases`: a column for each endpoint, and a last one for unknown senders."""
         for plans in self.program.inbound.values():
             by_source = {source: plan for plan in plans for source in plan.sources}
             stranger = self._choice(by_source.get(STRANGER), STRANGER)

@@ -1,4 +1,4 @@
-"""The native thread that publishes on topics what their routes make of datagrams."""
+"""The native thread that publishes datagrams on topics."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _POLL_S = 0.002
 
 
 class PublishThread(NativeThread):
-    """Delivers the messages of `ring` to topics. It starts once, and stops once; before, nothing waits for it.
+    """Delivers the messages of `ring` to topics. It starts once and stops once; other calls need no running thread.
 
-    It counts what was delivered, and writes losses to `events`.
+    It counts deliveries, and writes losses to `events`.
     """
 
     def __init__(
@@ -30,10 +30,10 @@ class PublishThread(NativeThread):
         self._names = names
 
     def start(self, functions: tuple[int, int, int], first: c.PublishChange | None = None) -> None:
-        """Start the thread unless it runs. `functions` are the addresses in `ros.rcl.PublishFunctions`.
+        """Start the thread if it is not running. `functions` are the addresses in `ros.rcl.PublishFunctions`.
 
-        `first` is a change of which messages wait already; it stays the caller's until its generation has passed.
-        Raises StartError for a lack of memory, descriptors or threads.
+        `first` is a change whose messages are already waiting; it belongs to the caller until its generation has
+        passed. Raises StartError if memory, descriptors or threads run out.
         """
         if self._address:
             return
@@ -49,16 +49,16 @@ class PublishThread(NativeThread):
             raise StartError("the thread that publishes cannot be started")
 
     def change(self, change: c.PublishChange) -> None:
-        """Make a change of timers when its generation is reached: to be called before a message of that comes.
+        """Change timers when the generation is reached. Call it before the first message of that generation.
 
-        It stays the caller's until then.
+        The change belongs to the caller until then.
         """
         with self._in_use:
             if self._address:
                 self._library.publish_change(self._address, ctypes.byref(change))
 
     def advance(self, generation: int) -> None:
-        """Go on to that generation once all earlier messages are served: none of them can come any more."""
+        """Go on to that generation once all earlier messages are handled. No more of them may be added."""
         with self._in_use:
             if self._address:
                 self._library.publish_advance(self._address, generation)
@@ -73,16 +73,16 @@ class PublishThread(NativeThread):
         return False
 
     def stalled(self) -> tuple[str, float] | None:
-        """The topic in whose publisher the thread is now, and for how many seconds; None if in none."""
+        """The topic on which the thread is publishing now, and for how many seconds; None if there is none."""
         topic = ctypes.c_uint32()
         with self._in_use:
             since = self._library.publish_since(self._address, ctypes.byref(topic)) if self._address else 0
         return (self._names.name(topic.value), (monotonic_ns() - since) / 1e9) if since else None
 
     def stop(self) -> bool:
-        """Serve what waits, and end.
+        """Handle the waiting messages, and end the thread.
 
-        Return False if the thread is stuck in the middleware after 1 s: then it is left, and publishers must stay open.
+        Return False if it is stuck in the middleware after 1 s: then it keeps running, and publishers must stay open.
         Idempotent.
         """
         with self._in_use:
@@ -96,4 +96,4 @@ class PublishThread(NativeThread):
 
 
 _left: list[PublishThread] = []
-"""Those that were stuck when they were to end: they use their ring and their counters."""
+"""Threads that were stuck at their end: they still use their ring and their counters."""

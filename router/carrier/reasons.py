@@ -1,4 +1,4 @@
-"""Why native threads rejected a datagram, and what of the table refused a message, in words."""
+"""Messages for reasons of native threads: why a datagram was rejected, and what in the table refused a message."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOSSES = tuple(loss.name.lower() for loss in Loss)
 
 
 def why_rejected(program: Program, listener: str, data: bytes, length: int) -> str:
-    """Say why a datagram of `length` bytes was rejected, of which `data` may be the beginning."""
+    """Describe why a datagram of `length` bytes was rejected; `data` is all of it or its beginning."""
     plan = program.table.listeners.get(listener)
     if plan is None:
         return ""
@@ -30,7 +30,7 @@ def why_rejected(program: Program, listener: str, data: bytes, length: int) -> s
 
 
 def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, place: int) -> str:
-    """Say which place of the table, an `enum place`, refused a message of `topic`; None for a datagram."""
+    """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
     if topic is not None:
         serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
     else:
@@ -38,17 +38,17 @@ def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, 
     return next(each.targets[target] for each in serving if target in each.targets).places[place]
 
 
-# ---- what shows that a loss is right
+# ---- details of a loss
 
 
 def why_refused(refusal: NativeRefusal, text: bytes) -> str:
-    """Put a `struct refusal` into words, or return "". `text` is the beginning of a text that was refused."""
+    """Describe a `struct refusal`, or return "". `text` is the beginning of a refused text."""
     words = _WORDS.get(Refused(refusal.kind))
     return words(refusal, text) if words else ""
 
 
 def _integers(refusal: NativeRefusal) -> list[int]:
-    """The values, of which flags say which are unsigned."""
+    """The values; the flags say which are unsigned."""
     signs = Sign.FIRST_UNSIGNED, Sign.SECOND_UNSIGNED, Sign.THIRD_UNSIGNED
     values: list[int] = list(refusal.values)
     return [value % (1 << 64) if refusal.flags & sign else value for sign, value in zip(signs, values, strict=True)]
@@ -81,11 +81,11 @@ def _result(refusal: NativeRefusal, _: bytes) -> str:
 
 def _no_integer(refusal: NativeRefusal, _: bytes) -> str:
     value = _real(refusal)
-    return f"{value} does not fit 64 bits" if abs(value) < float("inf") else f"{value} is no integer"
+    return f"{value} does not fit 64 bits" if abs(value) < float("inf") else f"{value} is not an integer"
 
 
 def _counted(words: str, refusal: NativeRefusal, _: bytes) -> str:
-    """Put the first two values into words, with the unit of the first one."""
+    """Format the first two values, with the unit of the first one."""
     first, second, _unused = refusal.values
     return words.format(first=first, second=second, s="" if first == 1 else "s")
 
@@ -97,12 +97,12 @@ def _quoted(refusal: NativeRefusal, text: bytes) -> str:
 
 
 def _no_utf8(refusal: NativeRefusal, text: bytes) -> str:
-    return f"{_quoted(refusal, text)} is not UTF-8: correct its publisher"
+    return f"{_quoted(refusal, text)} is not UTF-8: fix its publisher"
 
 
 def _nul(refusal: NativeRefusal, text: bytes) -> str:
     size = refusal.values[0]
-    return f"the text of {size} bytes has a NUL behind '{text.decode(errors='replace')}': strip(...) takes off padding"
+    return f"the text of {size} bytes has a NUL after '{text.decode(errors='replace')}': strip it with strip(...)"
 
 
 def _no_name(refusal: NativeRefusal, text: bytes) -> str:

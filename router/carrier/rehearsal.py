@@ -1,4 +1,4 @@
-"""The stage (`native/rehearsal.c`): programs without threads, sockets and ROS, on a clock that is told."""
+"""The stage (`native/rehearsal.c`): executes programs on a simulated clock, without threads, sockets or ROS."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ _MOST_COUNTERS = 1 << 18
 
 
 class Time(NamedTuple):
-    """What follows was at this time of the boot clock, ns."""
+    """The time (boot clock, ns) of the following records."""
 
     at: int
 
 
 class Counted(NamedTuple):
-    """A counter was added to."""
+    """An increment of a counter."""
 
     counter: int
     amount: int
 
 
 class Left(NamedTuple):
-    """A datagram for an endpoint, or a message for a topic; it is counted afterwards."""
+    """A datagram for an endpoint, or a message for a topic; its counter follows."""
 
     target: str
     data: bytes
@@ -54,9 +54,9 @@ Record = Union[Time, Counted, Left, Changed, Told]
 
 
 class Stage:
-    """Rehearses programs. `records` says what became of all that was handed in, and of what was due.
+    """Rehearses programs. `records` returns the outcome of every input and of timers that were due.
 
-    A wall clock is `ahead` of the boot clock, by 0 ns at first. All times in ns.
+    The wall clock is `ahead` of the boot clock, by 0 ns at first. All times in ns.
     """
 
     def __init__(self, library: ctypes.CDLL, now: int = 0) -> None:
@@ -67,7 +67,7 @@ class Stage:
         self._opened = _Opened(library, now)
         self._reader = EventReader(self._names, self._why_rejected, self._where_refused)
         self._generation = 0
-        # It keeps what is open out of the garbage, which would be freed in any order.
+        # Keep open objects out of garbage collection, which would free them in any order.
         finalize(self, self._opened.close)
 
     def counters(self, count: int) -> list[int]:
@@ -75,7 +75,7 @@ class Stage:
         return self._opened.counters[:count]
 
     def adopt(self, program: Program) -> None:
-        """Go on with a program, which takes over what has the same key, as at a reload. Raises MemoryError."""
+        """Switch to a program, with state passed on by key as at a reload. Raises MemoryError."""
         earlier, state = self._opened.running, State(self._library, self._opened.state)
         self._generation += 1
         running = self._built(program, state)
@@ -84,7 +84,7 @@ class Stage:
         state.forget_previous()
 
     def restart(self, now: int) -> None:
-        """Begin anew with the program in use, as a router that has just started. Raises MemoryError."""
+        """Restart the current program, like a router that has just started. Raises MemoryError."""
         running, state = self._in_use, State(self._library, self._opened.state)
         fixed = self._fixed(running.program, state, running.fixed.boards)
         state.forget_previous()
@@ -104,18 +104,18 @@ class Stage:
         self._library.rehearsal_adopt(address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
-        """Receive a datagram. `arrived_at` is of the wall clock. Raises KeyError for no listener."""
+        """Receive a datagram. `arrived_at` is wall-clock time. Raises KeyError for an unknown listener."""
         host, port = peer
         number = self._in_use.listeners[listener]
         self._library.rehearsal_datagram(self._opened.address, number, _number(host), port, data, len(data), arrived_at)
 
     def message(self, topic: str, data: bytes, sent_at: int) -> None:
-        """Take a message from ROS. `sent_at` is of the wall clock. Raises KeyError for a topic without a route."""
+        """Take a message from ROS. `sent_at` is wall-clock time. Raises KeyError for a topic without a route."""
         number = self._in_use.topic_numbers[topic]
         self._library.rehearsal_message(self._opened.address, number, data, len(data), sent_at)
 
     def advance(self, to: int) -> None:
-        """Let time pass, and serve what is due until then. Never goes back."""
+        """Advance the clock to that time, and serve timers that become due. Never goes back."""
         self._library.rehearsal_advance(self._opened.address, to)
         self.now = max(self.now, to)
 
@@ -128,11 +128,11 @@ class Stage:
         self._library.rehearsal_end(self._opened.address)
 
     def records(self) -> Iterator[Record]:
-        """What became of it since the last call. Raises MemoryError."""
+        """The records since the last call. Raises MemoryError."""
         size = ctypes.c_size_t()
         address = self._library.rehearsal_records(self._opened.address, ctypes.byref(size))
         if size.value and not address:
-            raise MemoryError("there is no room for what becomes of messages")
+            raise MemoryError("there is no room for the records of the stage")
         records = memoryview(bytearray(ctypes.string_at(address, size.value) if address else b""))
         at = 0
         while at < len(records):
@@ -161,7 +161,7 @@ class Stage:
         return why_rejected(self._in_use.program, listener, data, length)
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
-        """Nothing for what was held since an earlier program."""
+        """The place in the table; "" for messages held since an earlier program."""
         is_current = generation == self._generation
         return where_refused(self._in_use.program.lowered, route, topic, target, place) if is_current else ""
 
@@ -181,7 +181,7 @@ class Stage:
         return _Fixed({each.name: self._sender(each, state) for each in program.senders}, publications, boards)
 
     def _bound(self, program: Program, state: State, fixed: _Fixed) -> _Bound:
-        """Open what messages change, unless `state` has it."""
+        """Open mutable objects, unless `state` has them."""
         group = DeadmanGroup(self._library, self._opened.timers, self._names)
         deadmen = {plan.route: group.kept(plan, program.counters, fixed.senders, state) for plan in program.deadmen}
         outlets = Outlets(
@@ -202,7 +202,7 @@ class Stage:
 
 
 class _Opened:
-    """The stage in C, and what it executes."""
+    """The C stage, and the program that it executes."""
 
     def __init__(self, library: ctypes.CDLL, now: int) -> None:
         self.library = library
@@ -256,7 +256,7 @@ class _Listener:
 
 
 class _Publication:
-    """A topic that somebody subscribes to, as `ros.endpoints.Publication`."""
+    """A topic with a subscriber, as `ros.endpoints.Publication`."""
 
     def __init__(self) -> None:
         self.address = 0
@@ -264,7 +264,7 @@ class _Publication:
 
 
 class _Fixed(NamedTuple):
-    """What is open for a program, and no message changes: `senders` by endpoint, `publications` by topic."""
+    """The open objects of a program that messages do not change: `senders` by endpoint, `publications` by topic."""
 
     senders: Mapping[str, _Sender]
     publications: Mapping[str, _Publication]
@@ -272,7 +272,7 @@ class _Fixed(NamedTuple):
 
 
 class _Bound(NamedTuple):
-    """What is open for a program, and messages change; `deadmen` are by route."""
+    """The open objects of a program that messages change; `deadmen` are by route."""
 
     outlets: Outlets
     deadmen: Mapping[str, NativeDeadman]
@@ -280,7 +280,7 @@ class _Bound(NamedTuple):
 
 
 class _Running:
-    """A program as the stage executes it. Listeners and topics have numbers, which are indexes of its arrays."""
+    """A program as the stage executes it. Listeners and topics are numbered by their index in its arrays."""
 
     def __init__(
         self, program: Program, fixed: _Fixed, bound: _Bound, native: NativeProgram, from_ros: NativeFromRos
@@ -303,19 +303,19 @@ class _Running:
         return [*pacers, *self.native.states.adopted, *self._from_ros.states.adopted]
 
     def bind(self, bound: _Bound) -> None:
-        """Have the arrays refer to other state."""
+        """Point the arrays to other state."""
         self._bound = bound
         for states in (self.native.states, self._from_ros.states):
             states.bind(bound.outlets)
 
     def release(self) -> None:
-        """Let go of the state, before the stage is closed."""
+        """Release the state, before the stage is closed."""
         self._bound = None
         for states in (self.native.states, self._from_ros.states):
             states.release()
 
     def timers(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
-        """What timers are to do that hold messages back, for topics or for endpoints; `ended` end as well."""
+        """The changes of timers for topics or for endpoints; timers in `ended` also end."""
         now, before = (
             [each for each in adopted if each.is_topic is of_topics]
             for adopted in (self.adopted, earlier.adopted if earlier else ())

@@ -19,12 +19,14 @@ class Ring:
         self.address: int = library.ring_open(capacity)
         if not self.address:
             raise MemoryError("a queue of the carrier cannot be opened")
-        pages = mmap(-1, max(1 << 16, 2 * LONGEST_RECORD), flags=MAP_PRIVATE)  # used once something comes
+        pages = mmap(
+            -1, max(1 << 16, 2 * LONGEST_RECORD), flags=MAP_PRIVATE
+        )  # mapped memory is used once a record arrives
         self._records = (ctypes.c_char * len(pages)).from_buffer(pages)
         self._view = memoryview(self._records).cast("B")
 
     def take(self) -> memoryview:
-        """Return whole records, the oldest first. They are valid until the next call. For one thread."""
+        """Return whole records, the oldest first, valid until the next call. For one thread."""
         size = self._library.ring_take(self.address, self._records, len(self._records), 0)
         return self._view[:size]
 
@@ -33,5 +35,5 @@ class Ring:
         self._library.ring_wake(self.address)
 
     def watch(self) -> int:
-        """Return an eventfd that each new record makes readable, from now on."""
+        """Return an eventfd that becomes readable with each new record from now on."""
         return int(self._library.ring_watch(self.address))

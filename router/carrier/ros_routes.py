@@ -19,7 +19,7 @@ from router.declared import NONE
 
 
 class Subscription(Protocol):
-    """What `ros.receiving.RawSubscription` is. A message is taken by one thread alone."""
+    """The protocol of `ros.receiving.RawSubscription`. Only one thread takes its messages."""
 
     @property
     def address(self) -> int: ...
@@ -34,9 +34,9 @@ class Subscription(Protocol):
 
 @dataclass(slots=True)
 class NativeFromRos:
-    """The routes of each topic, an array of `struct ros_route`, with all that they refer to.
+    """The routes of each topic, an array of `struct ros_route`, with everything that they point to.
 
-    `urgent` are the topics that an urgent route takes messages from, `subscriptions` those of all topics.
+    `urgent` are the topics with an urgent route; `subscriptions` has the subscriptions of all topics.
     """
 
     topics: dict[str, ctypes.Array[c.RosRoute]] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class NativeFromRos:
     subscriptions: Mapping[str, Subscription] = field(default_factory=dict)
 
     def only(self, *, urgent: bool) -> NativeFromRos:
-        """Those for the thread of urgent messages, or those for the other one."""
+        """The part for the thread of urgent messages, or for the other thread."""
         return self.without({topic for topic in self.topics if (topic in self.urgent) is not urgent})
 
     def without(self, topics: Container[str]) -> NativeFromRos:
@@ -75,7 +75,7 @@ def native_from_ros(
 
 
 def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
-    assert plan.topic is not None  # noqa: S101 - of a route from ROS
+    assert plan.topic is not None  # noqa: S101 - a route from ROS has a topic
     counters, routines = writer.program.counters, Routines(feed.layout, writer.arrays)
     targets = writer.targets(plan, plan.targets, feed.targets, routines)
     for_each = native_for_each(feed.for_each, routines)
@@ -93,7 +93,7 @@ def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRou
 
 
 def native_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
-    """`for_each` of a route, None without."""
+    """`for_each` of a route; empty without it."""
     if elements is None:
         return c.ForEach()
     return c.ForEach(

@@ -16,7 +16,7 @@ from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, 
 
 
 def wire_kind(field: FieldDescriptor) -> WireKind:
-    """How a field is encoded, of a repeated one an element by itself."""
+    """The encoding of a field; of a repeated one, that of a single element."""
     return _BY_TYPE.get(field.type) or _BY_WIRE_TYPE[encoding_of(field).wire_type]
 
 
@@ -30,7 +30,7 @@ _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.
 
 
 def wire_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
-    """Make the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route."""
+    """Make the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
     flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
     indexes = all_types(descriptor)
@@ -61,5 +61,5 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
 
 def _kind(field: FieldDescriptor) -> WireKind:
     if field.type == FieldDescriptor.TYPE_STRING and not validates_text(field):
-        return WireKind.BYTES  # what is no UTF-8 is accepted; that depends on syntax and features
+        return WireKind.BYTES  # invalid UTF-8 is accepted, as that depends on syntax and features
     return wire_kind(field)

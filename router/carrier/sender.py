@@ -1,4 +1,4 @@
-"""Senders of the carrier: the sockets are those of `net.sockets`, the sending is native."""
+"""Senders of the carrier: native code sends through sockets of `net.sockets`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from router.net.sockets import ListeningSocket, address_beside, is_beside, leave
 
 
 class NativeSender:
-    """Sends to one address by a socket that `net.sockets.open_sending` has opened for `source`, and closes it.
+    """Sends to one address, through a socket that `net.sockets.open_sending` has opened for `source`. Owns the socket.
 
     `address` is that of its `struct sender`.
     """
@@ -34,13 +34,13 @@ class NativeSender:
             raise MemoryError("a sender of the carrier cannot be opened")
 
     def move(self, source: ListeningSocket | None, opened: socket.socket) -> socket.socket:
-        """Send by `opened` from now on. Return the earlier socket, for the caller to close when no thread uses it."""
+        """Send through `opened` from now on. Return the earlier socket; close it when no thread uses it."""
         left, self.socket, self.source = self.socket, opened, source
         self._library.sender_move(self.address, opened.fileno(), self._listening)
         return left
 
     def is_placed(self, source: ListeningSocket | None, listening: Collection[ListeningSocket]) -> bool:
-        """Whether it sends from where one that is opened now would."""
+        """Whether a newly opened socket would have the same source address and port."""
         if self.source is not source or source is None or not self.is_bound:
             return self.source is source
         return self.leaves_from == address_beside(source, listening)[0]

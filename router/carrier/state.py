@@ -1,4 +1,4 @@
-"""What a program keeps from one message to the next, and passes on to the next program."""
+"""The state that a program keeps between messages and passes on to the next program."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 class State:
-    """What a program keeps, by key; survives a reload.
+    """The state of a program, by key; survives a reload.
 
-    A program's state takes over from that of the `previous` program what has the same key: then both programs use the
-    same object, whichever of them runs. A key therefore has to contain everything that its object depends on.
+    Objects with the same key are taken from the state of the `previous` program: then both programs use the same
+    object, whichever of them runs. A key must therefore contain everything that its object depends on.
 
-    That of the first program takes over what a head start has opened for it, by place.
+    The first program takes objects that a head start has opened, by place.
     """
 
     def __init__(
@@ -36,9 +36,9 @@ class State:
         return self._kept[key]  # type: ignore[return-value]  # the key says what it is
 
     def open(self, place: Place, rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object) -> T:
-        """As `keep`, of what a function of the library opens; `wrap` gets its address. Raises MemoryError.
+        """As `keep`, for an object that a library function opens; `wrap` gets its address. Raises MemoryError.
 
-        `place` names it within its program, and is the key together with `rest`.
+        `place` identifies the object within its program; the key is `place` with `rest`.
         """
         return self.keep((place, rest), lambda: wrap(self._open(place, function, *arguments)))
 
@@ -50,9 +50,9 @@ class State:
 
 
 class Native:
-    """A structure of the carrier at `address`, which lives as long as this object, and as what it refers to (`keep`).
+    """A structure of the carrier at `address`, freed with this object. `keep` is kept alive for it.
 
-    `close` is the function of the library that frees it.
+    `close` is the library function that frees it.
     """
 
     def __init__(self, close: Callable[[int], None], address: int, keep: object = None) -> None:
@@ -66,8 +66,8 @@ class Native:
 
 
 def opened(library: ctypes.CDLL, function: str, *arguments: object) -> int:
-    """Return the address that a function of the library returns. Raises MemoryError where it is 0."""
+    """Return the address that a library function returns. Raises MemoryError if it is 0."""
     address = int(getattr(library, function)(*arguments) or 0)
     if not address:
-        raise MemoryError(f"{function} has no memory or descriptors")
+        raise MemoryError(f"{function} failed: no memory or descriptors")
     return address

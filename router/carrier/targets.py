@@ -21,12 +21,12 @@ from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, so
 from router.table.model import OnLimit
 
 Sources = Mapping[int, "str | None"]
-"""The sources of a route by `source_of` in native/deliver.h; all publishers of a topic together are None."""
+"""The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
 
 
 @dataclass(slots=True)
 class TargetStates:
-    """What targets refer to and messages change: limits, deferrals, deadmen, collectors.
+    """The mutable state of targets: limits, deferrals, deadmen, collectors.
 
     `adopted` are the deferrals and collectors, for a `struct timer_change`.
     """
@@ -47,12 +47,12 @@ class TargetStates:
         self._bind_collector(outlets, made, collect, plan)
 
     def release(self) -> None:
-        """Let go of the state. No message may come before `bind`."""
+        """Release the state. No message may be delivered before the next `bind`."""
         self.adopted.clear()
         self.bound.clear()
 
     def bind(self, outlets: Outlets) -> None:
-        """Have all targets refer to other state, that of `outlets`."""
+        """Point all targets to the state of `outlets`."""
         self.release()
         for targets in self._targets:
             self._bind(outlets, *targets)
@@ -91,7 +91,7 @@ class TargetStates:
 
 @dataclass(slots=True)
 class TargetWriter:
-    """Makes the targets of one program. `arrays` gets what has to live as long as they do."""
+    """Makes the targets of one program. `arrays` owns their memory."""
 
     program: Program
     outlets: Outlets
@@ -102,7 +102,7 @@ class TargetWriter:
     _sources: Any = None
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
-        """Targets that get datagrams; `lowered` are the routines of those that have some."""
+        """Targets that get datagrams; `lowered` are the routines of targets that have some."""
         if lowered is None:
             return self.targets(plan, targets, {}, None)
         routines = Routines(lowered.layout, self.arrays)
@@ -143,7 +143,7 @@ class TargetWriter:
         return self.arrays.add(together)
 
     def _complete(self, made: c.Target, plan: RoutePlan, target: TargetPlan) -> None:
-        """Add what all targets have."""
+        """Set the fields that all targets have."""
         counters, place = self.program.counters, (plan.route, target.label)
         made.id = self.outlets.names.number(target.label)
         made.waiting = counters.index("messages_waiting", *place)
@@ -180,19 +180,19 @@ class TargetWriter:
         return {column: sender for column, sender in enumerate(senders) if sender in plan.sources}
 
     def _ids_of_senders(self) -> list[int]:
-        """By column."""
+        """Numbers of the senders' names, by column."""
         return [self.outlets.names.number(label) for label in self._labels_of_senders()]
 
     def _labels_of_senders(self) -> list[str]:
         return [*self.program.table.endpoints, source_label(STRANGER)]
 
     def _names_of_senders(self) -> Any:
-        """By column."""
+        """Values with the senders' names, by column."""
         if self._sources is None:
             self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources
 
 
 def _held_period(target: TargetPlan) -> int:
-    """The time between two messages of a target with `on_limit: latest`, in ns; 0 without."""
+    """The time between two messages of a target with `on_limit: latest`, in ns; otherwise 0."""
     return period(target.max_rate) if target.max_rate is not None and target.on_limit is OnLimit.LATEST else 0

@@ -1,4 +1,4 @@
-"""What native threads have in common: an array that each counts in, and a ring for what it tells."""
+"""The common part of native threads: an array of counters, and a ring for events."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from router.carrier.ring import Ring
 class NativeThread:
     """A thread that counts in `counts` and writes to `events`.
 
-    `_address` is that of its structure, 0 while there is none; `copy` is the C function that copies counters of it.
+    `_address` is that of its structure, 0 while there is none; `copy` is the C function that copies its counters.
     """
 
     def __init__(
@@ -26,11 +26,11 @@ class NativeThread:
         self.events = events
         self._library = library
         self._copy = copy
-        self._in_use = Lock()  # for those who call while it may be stopped
+        self._in_use = Lock()  # for callers while another thread may stop it
         self._address = 0
 
     def counters(self, count: int) -> list[int]:
-        """Return the first counters, as they are between two messages."""
+        """Return the first counters, as a snapshot between two messages."""
         with self._in_use:
             if self._copy is None or not self._address:
                 return self.counts[:count]

@@ -1,1 +1,1 @@
-"""The compiled program of the last start, kept in a file, and the head start that it gives."""
+"""Kept programs: the compiled program of the last start, in a file, and the head start from it."""

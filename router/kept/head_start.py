@@ -1,8 +1,8 @@
-"""A head start: forwards and brakes by a kept program, before most of the router is imported.
+"""A head start: executes a kept program before most of the router is imported.
 
 `begin` finds the kept program of this command line, opens its sockets, has its deadmen send, and starts the threads
-that forward and brake. The router adopts them (`app/router.py`), with the program that it has compiled meanwhile, if
-that was made of the same inputs. Imports small modules only.
+that forward and brake. The router adopts them (`app/router.py`) if the program that it has compiled meanwhile comes
+from the same inputs. This module imports only small ones.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 _WORD = 8
 GENERATION = 1
-"""Of the kept program; that of the first one that is compiled is higher."""
+"""The generation of the kept program; compiled programs have higher ones."""
 
 
 class HeadStart:
-    """What runs by a kept program. `inputs` are those of the program.
+    """A running kept program, which was compiled from `inputs`.
 
-    `listening` and `senders` are by name, `opened` are addresses by place, as `State.open` has them. `sent` has the
+    `listening` and `senders` are by name; `opened` has addresses by place, as in `State.open`; `sent` has the
     endpoints that deadmen have sent to, by route.
     """
 
@@ -70,7 +70,7 @@ class HeadStart:
             undo.pop_all()
 
     def close(self) -> None:
-        """Stop as the router does: handle what has arrived, and have deadmen that are armed send."""
+        """Stop as the router does: handle what has arrived, and have armed deadmen send."""
         for each in self.listening.values():
             each.end_input()
         self.forwarding.carrier.stop_receiving()
@@ -79,12 +79,12 @@ class HeadStart:
         self._close_sockets()
 
     def is_of(self, parts: object, image: bytes) -> bool:
-        """Whether it runs the program that has these parts and this image. To be called once."""
+        """Whether it runs the program with these parts and this image. To be called once."""
         kept, self._kept = self._kept, None
         return kept == (parts, image)
 
     def bind_topic(self, topic: str, publisher: int) -> None:
-        """Have messages for a topic published by a publisher, before the thread that publishes runs."""
+        """Set the publisher of a topic, before the publish thread runs."""
         self._image.set(("publisher", topic), publisher)
 
     def _open_sockets(self, parts: Mapping[str, Any]) -> None:
@@ -95,18 +95,18 @@ class HeadStart:
             source = _placed(self.listening.get(source_name), every)
             try:
                 to_send = open_sending(source, every, is_board=is_board)
-            except OSError:  # as in `net.udp`, which says so when it adopts the sender
+            except OSError:  # as in `net.udp`, which logs it when it adopts the sender
                 source, to_send = None, open_sending(None, is_board=is_board)
             self.senders[name] = NativeSender(self.library, address, to_send, source)
 
     def _open_what_is_kept(self, parts: Mapping[str, Any]) -> None:
-        """Open limits, pacers, deferrals, collectors and deadmen, in order: each refers to earlier ones."""
+        """Open limits, pacers, deferrals, collectors and deadmen in this order: each refers to earlier ones."""
         for place, function, arguments in parts["openings"]:
             plain = [self._argument(each, parts) for each in arguments]
             self.opened[tuple(place)] = opened(self.library, function, *plain)
 
     def _argument(self, argument: object, parts: Mapping[str, Any]) -> object:
-        """An argument as `image._plain` wrote it."""
+        """An argument, decoded from the form that `image._plain` gives it."""
         if isinstance(argument, tuple):
             return self._address(parts["symbols"][argument[0]], parts)
         if not isinstance(argument, list):
@@ -168,7 +168,7 @@ class HeadStart:
 
 
 _WANTED, _UNWANTED = (ctypes.c_uint8 * 1)(1), (ctypes.c_uint8 * 1)(0)
-"""Topics that serve late subscribers get their messages later; of others no subscriber is known yet."""
+"""Topics that serve late joiners receive their messages later; the others have no known subscriber yet."""
 
 
 class _Image:
@@ -202,36 +202,36 @@ class _Image:
 
 
 def _placed(source: ListeningSocket | None, every: list[ListeningSocket]) -> ListeningSocket | None:
-    """The listener to send from; while it is waiting another one with the same address and port."""
+    """The listener to send from; while it is waiting, another one with the same address and port."""
     if source is None or not source.is_waiting:
         return source
     return next((each for each in every if each.address == source.address and not each.is_waiting), source)
 
 
 class Beginning:
-    """What became of looking for a kept program: a head start, or why there is none, in words; "" for none kept."""
+    """The result of the search for a kept program: a head start, or why there is none ("" if nothing is kept)."""
 
     def __init__(self, head_start: HeadStart | None = None, why: str = "") -> None:
         self.head_start = head_start
         self.why = why
 
     def take(self) -> HeadStart | None:
-        """The head start, for an owner who closes it."""
+        """Return the head start; the caller must close it."""
         taken, self.head_start = self.head_start, None
         return taken
 
     def close(self) -> None:
-        """Close the head start, unless it was taken."""
+        """Close the head start unless it was taken."""
         if (left := self.take()) is not None:
             left.close()
 
 
 BEGUN: list[Beginning] = []
-"""What `begin` has begun, at most once in a process."""
+"""The result of `begin`, which runs at most once per process."""
 
 
 def begin() -> Beginning:
-    """Begin with the kept program of this command line. From then on SIGINT and SIGTERM wait until they are handled."""
+    """Start the kept program of this command line, with SIGINT and SIGTERM blocked until the router handles them."""
     BEGUN.append(_beginning())
     return BEGUN[0]
 
@@ -243,6 +243,6 @@ def _beginning() -> Beginning:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         return Beginning(HeadStart(kept))
-    except Exception as error:  # noqa: BLE001 - whatever it is, the router starts without it, and says why
+    except Exception as error:  # noqa: BLE001 - after any error, the router starts without it and logs why
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
         return Beginning(None, f"{type(error).__name__}: {error}")

@@ -1,7 +1,6 @@
-"""The files of kept programs: found by command line, folder and Python, written atomically, for their owner alone.
+"""The files of kept programs: one per command line, folder and Python; written atomically, private to their owner.
 
-A file is a header, plain values as `marshal` writes them, and an image. Nothing in a file of this user that is whole is
-distrusted further.
+A file is a header, plain values in the format of `marshal`, and an image. A complete file of this user is trusted.
 """
 
 from __future__ import annotations
@@ -30,29 +29,29 @@ if TYPE_CHECKING:
     """Command line, folder and Python."""
 
 CHANGED = " has changed"
-"""The end of the reason where a table or another input was edited, which is no fault."""
+"""The end of the reason if a table or another input was edited, which is normal."""
 
 _MOST = 4
-"""Files that are kept."""
+"""Most files that are kept."""
 _ENDING = ".program"
 _UNFINISHED = ".new"
 _TRIES = ".tries"
 _MOST_TRIES = 15
-"""Starts with a file, one soon after the other, of which none came to its end; systemd allows 20."""
+"""Failed starts in quick succession after which a file is not used; systemd allows 20."""
 _STALE = 60.0
-"""Seconds after which an unfinished file is one that nobody writes any longer, and tries are forgotten."""
+"""Seconds after which an unfinished file is deleted, and failed starts are forgotten."""
 
 _MAGIC = b"rover router kept program\n"
 _FORMAT = 1
 _HEAD = struct.Struct(f"<{len(_MAGIC)}sIIQQ")
-"""The magic, the format, Python's version, the sizes of values and image. The checksum of all the rest follows."""
+"""The magic, the format, Python's version, the sizes of values and image. A checksum of everything else follows."""
 _CHECKSUM = struct.Struct("<I")
 
 
 class Kept:
-    """What is in a file that is whole. `written`: when, s of the wall clock.
+    """The content of a complete file. `written`: when, in s of the wall clock.
 
-    `parts` are plain values. `image` is memory of this process alone, writable, and begins at a page.
+    `parts` are plain values. `image` is private, writable memory, aligned to a page.
     """
 
     def __init__(self, identity: Identity, written: float, read: Plain, parts: object, image: mmap.mmap) -> None:
@@ -64,27 +63,27 @@ class Kept:
 
 
 class _UnusableError(Exception):
-    """The text says why a file is not used."""
+    """The message says why a file is not used."""
 
 
-_OF_ANOTHER = "it is of another command line, folder or Python"
+_OF_ANOTHER = "it belongs to another command line, folder or Python"
 
 
 def find() -> tuple[Kept | None, str]:
-    """What is kept for this command line, folder and Python; else why it is not used, or "" if nothing is kept."""
+    """The kept program of this command line, folder and Python, or why it is not used ("" if nothing is kept)."""
     try:
         kept, why = _judged(_path(_identity()))
         if kept is not None and kept.identity != _identity():
             return None, _OF_ANOTHER
     except FileNotFoundError:
         return None, ""
-    except Exception as error:  # noqa: BLE001 - whatever it is, the router starts without the file
+    except Exception as error:  # noqa: BLE001 - after any error, the router starts without the file
         return None, f"it cannot be read: {error!r}"
     return (None, why) if why else (kept, "")
 
 
 def every() -> Iterator[tuple[str, Kept | None, str]]:
-    """The path of each file, what is in it if it is whole, and why a start does not use it, or ""; newest first.
+    """Yield, newest first, each file's path, its content if complete, and why a start does not use it, or "".
 
     Raises OSError.
     """
@@ -93,7 +92,7 @@ def every() -> Iterator[tuple[str, Kept | None, str]]:
 
 
 def _judged(path: str) -> tuple[Kept | None, str]:
-    """What is in a file if it is whole, and why a start does not use it, or "". Raises OSError."""
+    """The content of a complete file, and why a start does not use it, or "". Raises OSError."""
     try:
         kept = _read(path)
     except _UnusableError as error:
@@ -105,7 +104,7 @@ def _judged(path: str) -> tuple[Kept | None, str]:
 def write(read: Plain, parts: object, image: bytes) -> None:
     """Keep a program for this command line, folder and Python.
 
-    Raises OSError, also if an input has changed since it was read; then what was kept before is still there.
+    Raises OSError, also if an input has changed since it was read; then the earlier file remains.
     """
     if change := inputs.changed(read):
         raise OSError(f"{change} has changed meanwhile")
@@ -135,16 +134,16 @@ def write(read: Plain, parts: object, image: bytes) -> None:
 
 
 def count_try() -> str:
-    """Count a start with what is kept. Return why there is none: it may be what ended the process each time."""
+    """Count a start with the kept file. After too many failed ones, return why the file is not used, else ""."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    with suppress(OSError):  # where nothing can be written, nothing is counted
+    with suppress(OSError):  # where nothing can be written, starts are not counted
         descriptor = os.open(_path(_identity()) + _TRIES, flags, 0o600)
         try:
             status = os.fstat(descriptor)
             if abs(time.time() - status.st_mtime) > _STALE:
                 os.ftruncate(descriptor, 0)
             elif status.st_size >= _MOST_TRIES:
-                return f"the last {_MOST_TRIES} routers that began with it did not start"
+                return f"the last {_MOST_TRIES} starts that used it failed"
             os.write(descriptor, b".")
         finally:
             os.close(descriptor)
@@ -152,19 +151,19 @@ def count_try() -> str:
 
 
 def works() -> None:
-    """Forget the tries: a router has started with what is kept."""
+    """Reset the count: a router has started with the kept file."""
     with suppress(OSError):
         os.unlink(_path(_identity()) + _TRIES)
 
 
 def _path(identity: Identity) -> str:
-    """The file for a command line, folder and Python. Raises OSError where there is no place for it."""
+    """The file for a command line, folder and Python. Raises OSError if there is no folder for it."""
     command, *others = identity
     return os.path.join(folder(), f"{zlib.crc32(os.fsencode(chr(0).join([*command, *others]))):08x}{_ENDING}")
 
 
 def folder() -> str:
-    """Where the files are: in the service's state directory, or the user's cache. Raises OSError where neither is."""
+    """The folder of the files: the service's state directory, or the user's cache. Raises OSError without either."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if os.path.isabs(state):
         return os.path.join(state, "kept")
@@ -188,17 +187,17 @@ def _crc(*parts: bytes | bytearray | memoryview) -> int:
 
 
 def _read(path: str) -> Kept:
-    """Read a whole file: one that is mapped, and truncated later, would end the process. Raises _UnusableError too."""
+    """Read a file, not mapped, as truncating a mapped one kills the process. Raises OSError or _UnusableError."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise _UnusableError("it is a link") from None
+            raise _UnusableError("it is a symbolic link") from None
         raise
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise _UnusableError("it is no ordinary file")
+            raise _UnusableError("it is not a regular file")
         _check_owner(status, "it")
         _check_owner(os.stat(os.path.dirname(path)), "its folder")
         kept = _parsed(descriptor, status)
@@ -210,7 +209,7 @@ def _read(path: str) -> Kept:
 
 
 def _parsed(descriptor: int, status: os.stat_result) -> Kept:
-    """What is in an open file. Raises _UnusableError."""
+    """The content of an open file. Raises _UnusableError."""
     with open(descriptor, "rb", buffering=0, closefd=False) as stream:
         head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
         values_size, image_size = _sizes(head, status.st_size)
@@ -235,21 +234,21 @@ def _check_owner(status: os.stat_result, what: str) -> None:
 def _sizes(head: bytes, size: int) -> tuple[int, int]:
     """The sizes of values and image in a file of this size. Raises _UnusableError."""
     if not head.startswith(_MAGIC[: len(head)]):
-        raise _UnusableError("it is no kept program")
+        raise _UnusableError("it is not a kept program")
     if len(head) < _HEAD.size:
         raise _UnusableError("it is truncated")
     _, form, version, values, image = _HEAD.unpack(head)
     if form != _FORMAT:
         raise _UnusableError("it has another format")
     if version != sys.hexversion:
-        raise _UnusableError("another version of Python has written it")
+        raise _UnusableError("it was written by another version of Python")
     if size != (whole := _HEAD.size + _CHECKSUM.size + values + image):
         raise _UnusableError("it is truncated" if size < whole else "it is damaged")
     return values, image
 
 
 def _remove_unfinished(place: str) -> None:
-    """Remove what processes have left that ended while they wrote."""
+    """Remove the unfinished files of processes that ended while writing."""
     now = time.time()
     for written, path in _files(place, _UNFINISHED):
         if abs(now - written) > _STALE:
@@ -266,7 +265,7 @@ def _remove_oldest(place: str, newest: str) -> None:
 
 
 def _files(place: str, ending: str) -> list[tuple[float, str]]:
-    """When each file was written, and its path."""
+    """The time of writing and the path of each file."""
     found = []
     for entry in os.scandir(place):
         if entry.name.endswith(ending):

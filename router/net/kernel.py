@@ -1,4 +1,4 @@
-"""What Linux reports beyond Python's socket module: arrival times, drops, buffers, interfaces, who holds a port."""
+"""Linux features that Python's socket module lacks: arrival times, drops, buffers, interfaces, the owner of a port."""
 
 from __future__ import annotations
 
@@ -36,28 +36,28 @@ _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
 _INODE = 9
-"""The column of /proc/net/udp and /proc/net/tcp."""
+"""Column of the inode in /proc/net/udp and /proc/net/tcp."""
 
 _BOUND = {"udp": "07", "tcp": "0A"}
-"""The state of a socket that receives from anybody, in /proc/net."""
+"""State in /proc/net of a socket that receives from any sender."""
 
 
 def send_arrivals(opened: socket.socket) -> None:
-    """Have the kernel send the time of its arrival with each datagram; where it does not, have it tell when asked."""
+    """Have the kernel deliver arrival times with datagrams, or else keep them for a system call."""
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     except OSError as error:
         if error.errno != errno.ENOPROTOOPT:
             raise
-        _warn_once("the kernel sends no arrival times with datagrams: each takes one more system call")
+        _warn_once("the kernel does not send arrival times with datagrams: each datagram costs one more system call")
         arrivals(opened)
 
 
 def arrivals(opened: socket.socket) -> Callable[[], int]:
-    """Have the kernel stamp datagrams. Return a function: when the last received one arrived, in ns of the wall clock.
+    """Have the kernel stamp datagrams. Return a function for the arrival of the last received one, in ns (wall clock).
 
-    That is before it waited in the receive buffer, unless the kernel cannot stamp: then it is the present time. The
-    function makes one system call and is for the receiving thread; it raises FileNotFoundError before the first
+    That is the time before the datagram waited in the receive buffer, or the present time if the kernel cannot stamp.
+    The function makes one system call and is for the receiving thread; it raises FileNotFoundError before the first
     datagram.
     """
     stamp = bytearray(_TIMESPEC.size)
@@ -69,10 +69,10 @@ def arrivals(opened: socket.socket) -> Callable[[], int]:
 
     try:
         arrived_at()
-    except FileNotFoundError:  # nothing was received; stamping begins all the same
+    except FileNotFoundError:  # nothing was received yet, but stamping is now on
         pass
     except OSError:
-        _warn_once("the kernel has no arrival times: 'ttl' does not see how long datagrams wait in the receive buffer")
+        _warn_once("the kernel provides no arrival times: 'ttl' ignores the time spent in the receive buffer")
         return wall_ns
     return arrived_at
 
@@ -84,7 +84,7 @@ def _warn_once(event: str) -> None:
 
 def drops(opened: socket.socket) -> int:
     """Datagrams that the kernel dropped before they were received, since the socket was opened."""
-    # Not before Linux 4.12, and qemu-user returns one word: then they stand in a table of all sockets.
+    # Linux before 4.12 lacks this, and qemu-user returns one word: use the table of all sockets then.
     with suppress(OSError, struct.error):
         words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
         return int(words[_MEMINFO_DROPS])
@@ -93,7 +93,7 @@ def drops(opened: socket.socket) -> int:
 
 
 def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
-    """Ask for `size` bytes, beyond the system's limit where that is allowed. Return how many were granted."""
+    """Request `size` bytes, above the system's limit where that is allowed. Return the granted size."""
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
     if (granted := receive_buffer(opened)) >= size:
         return granted
@@ -106,12 +106,12 @@ def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
 
 def receive_buffer(opened: socket.socket) -> int:
     """The size in bytes, without the kernel's overhead."""
-    # The kernel doubles what is asked for, to have room for its overhead, and returns the doubled value.
+    # The kernel doubles the requested size, to cover its overhead, and returns the doubled value.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
 def bound_interface(opened: socket.socket) -> str | None:
-    """The network interface that a socket is bound to, "" for none; None if the interface has gone."""
+    """The network interface that a socket is bound to, "" for none; None if the interface is gone."""
     try:
         return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
     except OSError:
@@ -119,19 +119,19 @@ def bound_interface(opened: socket.socket) -> str | None:
 
 
 def report_sending_errors(opened: socket.socket) -> None:
-    """Have the kernel report ICMP errors about datagrams that were sent from the socket's port."""
+    """Have the kernel report ICMP errors about datagrams sent from the socket's port."""
     opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
 
 
 def refuse_input(opened: socket.socket) -> None:
-    """Have the kernel drop whatever a socket would receive, by a filter of one instruction: return 0 bytes."""
+    """Have the kernel drop everything that a socket would receive: a filter of one instruction returns 0 bytes."""
     instruction = ctypes.create_string_buffer(struct.pack("@HBBI", 6, 0, 0, 0))
     program = struct.pack("@HP", 1, ctypes.addressof(instruction))
     opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
 
 
 def interface_is_up(name: str) -> bool | None:
-    """Whether a network interface is up; None if there is none of that name."""
+    """Whether a network interface is up; None if there is no such interface."""
     answer = _ask_interface(name, SIOCGIFFLAGS)
     return None if answer is None else bool(int.from_bytes(answer[:2], "little") & IFF_UP)
 
@@ -152,7 +152,7 @@ def _ask_interface(name: str, request: int) -> bytes | None:
 
 
 def port_taken(protocol: str, port: int) -> tuple[str, str]:
-    """Return who holds a port, and the remedy, for the text of an error. `protocol` is udp or tcp."""
+    """Return which process has a port, and the remedy, for an error message. `protocol` is udp or tcp."""
     process = _process(protocol, port)
     if process is not None and process.name == str(os.getpid()):
         return f"the router itself (pid {process.name}) has the port", "restart it, or choose another port"
@@ -160,7 +160,7 @@ def port_taken(protocol: str, port: int) -> tuple[str, str]:
 
 
 def why_not_bound(protocol: str, port: int, error: OSError) -> tuple[str, str]:
-    """Return why a socket cannot be bound, and the remedy or "". `protocol` is udp or tcp."""
+    """Return why a socket cannot be bound, and the remedy, if any. `protocol` is udp or tcp."""
     if error.errno == errno.EADDRINUSE:
         return port_taken(protocol, port)
     if error.errno == errno.EACCES:
@@ -175,7 +175,7 @@ def port_holder(protocol: str, port: int) -> str:
 
 
 def is_listening(port: int) -> bool:
-    """Whether a TCP socket of this computer listens at a port."""
+    """Whether a TCP socket of this computer listens on a port."""
     return any(True for _ in _inodes("tcp", port))
 
 
@@ -200,7 +200,7 @@ def _inodes(protocol: str, port: int) -> Iterator[str]:
 
 
 def _rows(table: str) -> Iterator[list[str]]:
-    """Those of a table in /proc/net, each as its columns. The kernel may have none for IPv6."""
+    """The rows of a table in /proc/net, as lists of columns. The kernel may have no table for IPv6."""
     from pathlib import Path
 
     with suppress(FileNotFoundError):
@@ -210,10 +210,10 @@ def _rows(table: str) -> Iterator[list[str]]:
 def _open_files(process: Path) -> Iterator[str]:
     try:
         descriptors = list((process / "fd").iterdir())
-    except OSError:  # another user's process, or one that has just ended
+    except OSError:  # another user's process, or one that just ended
         return
     for descriptor in descriptors:
-        with suppress(OSError):  # closed meanwhile, as the descriptor of the listing itself
+        with suppress(OSError):  # closed meanwhile, like the descriptor of the listing itself
             yield str(descriptor.readlink())
 
 

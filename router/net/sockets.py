@@ -1,6 +1,6 @@
-"""UDP sockets, opened with plain values: listeners, inherited ones among them, and those to send from.
+"""UDP sockets, opened with plain values: listeners, also inherited ones, and sockets to send from.
 
-What a head start opens before anything else is loaded: no settings, findings or texts, which are those of `net.udp`.
+A head start opens them before anything else is loaded, so settings, findings and messages are in `net.udp`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from router.net.kernel import (
 )
 
 BOARD_ROOM = 8192
-"""Bytes to ask for as the send buffer of a board, as the kernel keeps commands while it looks for the hardware address.
-Twice as much is granted, which holds about 20 small datagrams: a burst of 16 passes though none has left yet."""
+"""Requested send buffer of a board, in bytes: the kernel queues commands until it knows the hardware address.
+It grants twice as much, which holds about 20 small datagrams, so that a burst of 16 is queued without loss."""
 
 FIRST_INHERITED = 3
-"""The first descriptor that a service manager hands over; the others follow it."""
+"""The first descriptor that a service manager passes; the others follow it."""
 
 
 class Inherited:
-    """UDP sockets that a service manager has bound and handed over, as in sd_listen_fds(3).
+    """UDP sockets that a service manager has bound and passed, as in sd_listen_fds(3).
 
-    They outlive the process, with the datagrams in them.
+    They outlive the process, with the datagrams queued in them.
     """
 
     def __init__(self, sockets: Iterable[socket.socket] = ()) -> None:
@@ -41,7 +41,7 @@ class Inherited:
         self._taken: list[socket.socket] = []
 
     def take(self, address: tuple[str, int], interface: str | None) -> socket.socket | None:
-        """Return a duplicate of the socket that is bound so, or None. It can be taken again."""
+        """Return a duplicate of the socket with this address and interface, or None. It can be taken again."""
         for held in self._sockets:
             if _is_bound_to(held, address, interface):
                 self._taken.append(held)
@@ -50,7 +50,7 @@ class Inherited:
         return None
 
     def unclaimed(self) -> list[socket.socket]:
-        """Those that no listener has taken."""
+        """The sockets that no listener has taken."""
         return [held for held in self._sockets if held not in self._taken]
 
 
@@ -64,12 +64,12 @@ def is_udp(held: socket.socket) -> bool:
 
 @cache
 def inherited() -> Inherited:
-    """The sockets that this process has inherited. Its children inherit none."""
+    """The sockets that this process has inherited. Child processes do not inherit them."""
     return Inherited(socket.socket(fileno=descriptor) for descriptor in _inherited_descriptors(os.environ))
 
 
 def _inherited_descriptors(environment: MutableMapping[str, str]) -> list[int]:
-    """Remove the variables, which are meant for this process only."""
+    """Parse and remove the variables, which are meant for this process only."""
     pid, count = environment.pop("LISTEN_PID", ""), environment.pop("LISTEN_FDS", "")
     environment.pop("LISTEN_FDNAMES", None)
     if pid != str(os.getpid()) or not count.isdecimal():
@@ -81,15 +81,18 @@ def _inherited_descriptors(environment: MutableMapping[str, str]) -> list[int]:
 
 
 ABSENT = {
-    errno.ENODEV: ("there is no such network interface", "`ip link` lists those that there are"),
-    errno.EADDRNOTAVAIL: ("no network interface of this computer has that address", "0.0.0.0 listens on all of them"),
-    errno.ENETDOWN: ("the network is down", "`ip link` shows which interface is"),
+    errno.ENODEV: ("there is no such network interface", "run `ip link` to list the interfaces"),
+    errno.EADDRNOTAVAIL: (
+        "no network interface of this computer has that address",
+        "use 0.0.0.0 to listen on all of them",
+    ),
+    errno.ENETDOWN: ("the network is down", "run `ip link` to see which interface is"),
 }
-"""Errors of binding that pass when the network comes up, each with a remedy for one that does not."""
+"""Errors of binding that disappear when the network comes up, each with its message and a remedy."""
 
 
 def bind(opened: socket.socket, address: tuple[str, int], interface: str | None) -> None:
-    """Raises OSError."""
+    """Bind a socket to an address, and to a network interface unless None. Raises OSError."""
     if interface is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
     opened.bind(address)
@@ -98,9 +101,9 @@ def bind(opened: socket.socket, address: tuple[str, int], interface: str | None)
 class ListeningSocket:
     """A bound socket: the inherited one with this address and interface if there is one, else a new one.
 
-    While its address or interface is not there, as that of a tunnel that comes up later, it `is_waiting`: the socket is
-    not bound and receives nothing, and `address` is the one that it was to have. Any other failure raises OSError.
-    `has_senders`: some that are bound to its port are open. `receive_buffer` is what was granted, in bytes.
+    While its address or interface is missing, for example that of a tunnel that comes up later, it `is_waiting`: the
+    socket is not bound and receives nothing, and `address` is the wanted one. Any other failure raises OSError.
+    `has_senders`: senders bound to its port are open. `receive_buffer` is the granted size in bytes.
     """
 
     def __init__(
@@ -136,18 +139,18 @@ class ListeningSocket:
             self.address = self.socket.getsockname()
 
     def request_receive_buffer(self, size: int) -> None:
-        """An inherited socket may have a larger buffer, for what arrives while no process listens."""
+        """Request a buffer. An inherited socket keeps a larger one, for datagrams that arrive between processes."""
         self.receive_buffer = receive_buffer(self.socket)
         if not self.is_inherited or self.receive_buffer < size:
             self.receive_buffer = ask_for_receive_buffer(self.socket, size)
 
     def has_lost_interface(self) -> bool:
-        """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
+        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears."""
         return self.interface is not None and bound_interface(self.socket) is None
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Let sockets with SO_REUSEADDR bind its address and port meanwhile."""
+        """Allow sockets with SO_REUSEADDR to bind its address and port inside."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             yield
@@ -155,18 +158,18 @@ class ListeningSocket:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
 
     def end_input(self) -> None:
-        """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
+        """Accept nothing new. Queued datagrams can still be received, then an end with the peer None.
 
-        An inherited socket is left as it is, for the next process: its receiver has to stop by itself.
+        An inherited socket is not changed, for the next process: its receiver must stop without an end.
 
-        A socket that is connected to itself accepts nothing from others, so that a flood cannot keep the receiver busy
-        for ever; shutting it down wakes a receiver that waits.
+        A socket that is connected to itself accepts nothing from others, so a flood cannot keep the receiver busy
+        for ever; shutting it down wakes a waiting receiver.
         """
         if self.is_inherited:
             return
         host, port = self.address
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # required for a broadcast address
-        # If the interface has lost the address, connecting fails, but nothing comes in and shutting down still wakes.
+        # If the interface has lost the address, connecting fails, but nothing arrives and shutting down still wakes.
         if not self.is_waiting:
             with suppress(OSError):
                 self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
@@ -177,10 +180,10 @@ class ListeningSocket:
 def open_sending(
     source: ListeningSocket | None, listening: Collection[ListeningSocket] = (), *, is_board: bool = False
 ) -> socket.socket:
-    """Open a non-blocking socket for one destination, which it is not connected to. It receives nothing.
+    """Open a non-blocking, unconnected socket for one destination. It receives nothing.
 
-    It is bound to address and port of `source`, so that answers reach that listener; without one, or while that one is
-    waiting, the kernel chooses the port. `listening` are all that are open: they must allow it. Raises OSError.
+    It is bound to address and port of `source`, so that replies reach that listener; without one, or while it is
+    waiting, the kernel chooses the port. `listening` are all open listeners, which must allow it. Raises OSError.
     """
     opened = _open_free() if source is None or source.is_waiting else _open_beside(source, listening)
     if is_board:
@@ -194,15 +197,15 @@ def is_beside(opened: socket.socket) -> bool:
 
 
 def leaves_from(opened: socket.socket) -> str:
-    """The address that a socket to send from is bound to; 0.0.0.0 if the kernel chooses one for each datagram."""
+    """The source address of a sending socket; 0.0.0.0 if the kernel chooses one for each datagram."""
     return str(opened.getsockname()[0]).removeprefix("::ffff:")
 
 
 def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]) -> tuple[str, int]:
-    """Where a socket that sends from a listener's port is bound.
+    """The address to bind a socket that sends from a listener's port.
 
-    One with an address of its own would get what another listener, at all addresses of another interface, is to
-    receive: Linux looks for such sockets first.
+    If another listener has all addresses of another interface, a socket with a specific address would receive its
+    datagrams: Linux prefers such sockets.
     """
     everywhere = "0.0.0.0", source.address[1]
     return everywhere if any(each.address == everywhere for each in listening) else source.address
@@ -218,10 +221,10 @@ def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
 
 
 def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]) -> socket.socket:
-    """A socket that sends from a listener's address and port, while the listener alone receives.
+    """A socket that sends from a listener's address and port, while only the listener receives.
 
     It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
-    one of the datagram's own family.
+    one with the datagram's address family.
     """
     opened = _open_free(socket.AF_INET6)
     try:

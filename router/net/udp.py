@@ -1,4 +1,4 @@
-"""UDP sockets as a table describes them: their settings, and what is said of those that do not do what it asks for."""
+"""UDP sockets with the settings of a table, and messages about sockets that do not meet them."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from router.table.model import bound_to
 
 
 def unclaimed() -> list[str]:
-    """Which inherited sockets no listener has taken: UDP addresses, and descriptions of others."""
+    """The inherited sockets that no listener has taken: UDP addresses, and descriptions of other sockets."""
     return [_described(held) for held in sockets.inherited().unclaimed()]
 
 
 def _described(held: socket.socket) -> str:
     if not sockets.is_udp(held):
-        return f"{held.getsockname()}, which is no IPv4 UDP socket"
+        return f"{held.getsockname()}, which is not an IPv4 UDP socket"
     interface = bound_interface(held)
     return bound_to(Address(*held.getsockname()), "an interface that has gone" if interface is None else interface)
 
 
 def absence(address: Address, interface: str | None) -> tuple[str, str] | None:
-    """Why a listener cannot have that address and interface before the network comes up, with a remedy, or None."""
+    """Why a listener must wait for its address or interface, with a remedy; None if it need not."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             sockets.bind(probe, address, interface)
@@ -43,12 +43,11 @@ def _is_absent(host: str) -> bool:
 
 
 class Listener:
-    """A listener of the table, and its socket: one that is open already, or a new one.
+    """A listener of the table, and its socket: an open one, or a new one.
 
-    While it is waiting (see `ListeningSocket`), another Listener has to replace it. Any failure raises StartError with
-    the position in the table and a remedy. Datagrams that are not received from an inherited socket wait for the next
-    process, and its kernel drops may be older than this process. Each datagram comes with the time at which the kernel
-    got it, where the kernel has it.
+    While it is waiting (see `ListeningSocket`), another Listener must replace it. Any failure raises StartError with
+    the position in the table and a remedy. Datagrams left in an inherited socket wait for the next process, and its
+    kernel drops may be older than this process. Each datagram comes with its arrival time, if the kernel provides it.
     """
 
     def __init__(
@@ -81,20 +80,20 @@ class Listener:
         return self._settings.interface
 
     def has_lost_interface(self) -> bool:
-        """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
+        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears."""
         return self.opened.has_lost_interface()
 
     def lacks_network(self) -> bool:
-        """Whether its address or network interface is not there. It receives nothing then."""
+        """Whether its address or network interface is missing. Then it receives nothing."""
         return self.is_waiting or self.has_lost_interface() or _is_absent(self.address.host)
 
     def is_replaceable(self) -> bool:
-        """Whether it will receive nothing any more, and another Listener would."""
+        """Whether it can no longer receive, but a new Listener could."""
         has_ended = self.is_waiting or self.has_lost_interface()
         return has_ended and absence(self._settings.address.value, self._settings.interface) is None
 
     def follow(self, settings: model.Listener) -> None:
-        """Adopt name and settings of another table's listener with the same address and interface."""
+        """Adopt name and settings of the next table's listener with the same address and interface."""
         has_changed = settings.receive_buffer != self._settings.receive_buffer
         self._settings = settings
         if has_changed:
@@ -117,7 +116,7 @@ class Listener:
         asked, granted = self._settings.receive_buffer, self.opened.receive_buffer
         if granted < asked:
             logger.warning(
-                "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
+                "receive buffer is smaller than the table requests: the kernel may drop bursts",
                 listener=self.name,
                 asked=asked,
                 granted=granted,
@@ -134,12 +133,12 @@ def _refused(settings: model.Listener, error: OSError) -> StartError:
 
 
 def nobody_listens(address: Address) -> str:
-    """What "Connection refused" means for UDP: the computer is there, and no process has the port."""
+    """The meaning of "Connection refused" for UDP: the computer answers, but no process has the port."""
     return f"nobody listens at {address}"
 
 
 def why_not_sent(error: OSError, address: Address) -> str:
-    """Say in words why nothing was sent to an address, with what shows more."""
+    """Describe why nothing was sent to an address, with a command that shows more."""
     ask = f"`ip route get {address.host}`"
     match error.errno:
         case errno.ECONNREFUSED:
@@ -149,7 +148,7 @@ def why_not_sent(error: OSError, address: Address) -> str:
         case errno.EPERM:
             return f"a firewall of this computer forbids sending to {address}: `nft list ruleset`"
         case errno.ENETUNREACH | errno.EHOSTUNREACH:
-            return f"no route leads to {address.host}, or nobody there answers: {ask}"
+            return f"no route leads to {address.host}, or it does not answer: {ask}"
         case errno.EINVAL:
             return f"the routes of this computer discard what is sent to {address.host}: {ask}"
     return error.strerror or str(error)
@@ -158,7 +157,7 @@ def why_not_sent(error: OSError, address: Address) -> str:
 def why_unreachable(address: Address) -> tuple[str, str] | None:
     """Why nothing can be sent to an address now, with a remedy; None if a route leads there.
 
-    Raises BadAddressError for a broadcast address, which only the computer's interfaces tell.
+    Raises BadAddressError for a broadcast address, which depends on the computer's interfaces.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -167,20 +166,23 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
             if error.errno == errno.EACCES and _is_broadcast(address):
                 raise not_one_machine(address) from error
             if error.errno == errno.ENETUNREACH:
-                return "no network leads there", "does `ip address` show an interface in its network? is the cable in?"
+                return (
+                    "no route leads there",
+                    "check the cable, and that `ip address` shows an interface in its network",
+                )
             why = error.strerror.lower() if error.strerror else str(error)
-            return f"the kernel refuses it: {why}", f"`ip route get {address.host}` shows the route that refuses it"
+            return f"the kernel refuses it: {why}", f"run `ip route get {address.host}` to see which route refuses it"
     return None
 
 
 def usual_source(address: Address) -> str | None:
-    """The address of this computer that the route to an address has; None if no route leads there."""
+    """The source address of the route to an address; None if there is no route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         return str(probe.getsockname()[0]) if probe.connect_ex(address) == 0 else None
 
 
 def _is_broadcast(address: Address) -> bool:
-    """Whether the kernel takes the address where broadcast is allowed; it also refuses what a route prohibits."""
+    """Whether the kernel accepts the address with SO_BROADCAST, unlike one that a route prohibits."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         return probe.connect_ex(address) == 0
@@ -189,9 +191,9 @@ def _is_broadcast(address: Address) -> bool:
 def open_sending(
     endpoint: model.Endpoint, source: Listener | None = None, listening: Collection[ListeningSocket] = ()
 ) -> socket.socket:
-    """Open a socket to send to an endpoint, from the port of `source` if that is possible: `sockets.open_sending`.
+    """Open a socket to send to an endpoint, from the port of `source` if possible, as in `sockets.open_sending`.
 
-    `listening` are all that are open. Raises OSError if descriptors are short.
+    `listening` are all open listeners. Raises OSError if descriptors run out.
     """
     is_board = endpoint.kind is model.EndpointKind.BOARD
     if source is not None:
@@ -199,7 +201,7 @@ def open_sending(
             return sockets.open_sending(source.opened, listening, is_board=is_board)
         except OSError as error:
             logger.warning(
-                "datagrams to this endpoint leave from a port that is not its listener's; answers to them are lost",
+                "datagrams to this endpoint do not leave from its listener's port; replies to them are lost",
                 endpoint=endpoint.name,
                 listener=source.name,
                 why=error.strerror,

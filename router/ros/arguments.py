@@ -1,4 +1,4 @@
-"""What `--ros-args` says to a router, and which of it has no effect. Pure: rcl reads the same words."""
+"""The meaning of `--ros-args` for a router, and which arguments have no effect. Pure: rcl parses them again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SWITCHES = ("rosout-logs", "stdout-logs", "external-lib-logs")
 
 
 class Parameter(NamedTuple):
-    """`node` is the node that it is for, perhaps a pattern; empty for all."""
+    """A parameter. `node` is the name or pattern of the nodes that it is for; empty for all."""
 
     node: str
     name: str
@@ -51,15 +51,15 @@ def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
 
 
 def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
-    """The table's variables that ROS parameters set: `listen_port` is `${LISTEN_PORT}`."""
+    """The table's variables set by ROS parameters: `listen_port` sets `${LISTEN_PORT}`."""
     return {name.upper(): value for name, value in parameters.items() if name != ROUTES_PATH}
 
 
 class Variables(ChainMap[str, str]):
-    """Values for a table, each from the first of `values` that has it, and the names that it has `asked` for."""
+    """Variables of a table, each from the first of `values` that has it. `asked` are the names that were read."""
 
     def __init__(self, *values: Mapping[str, str]) -> None:
-        super().__init__(*values)  # type: ignore[arg-type]  # nothing is written
+        super().__init__(*values)  # type: ignore[arg-type]  # they are only read
         self.asked: set[str] = set()
 
     def get(self, name: str, default: str | None = None) -> str | None:  # type: ignore[override]  # texts only
@@ -68,9 +68,9 @@ class Variables(ChainMap[str, str]):
 
 
 def without_effect(ros_args: Sequence[str], program: Program, asked: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Yield each argument that nothing reads, with a remedy. `asked`: the variables that the table has.
+    """Yield each argument that has no effect, with a remedy. `asked` are the table's variables.
 
-    Parameters that name another node are meant for that one.
+    Parameters for another node are skipped.
     """
     rules = list(_rules(ros_args))
     node = _remapped(program.table.node, rules)
@@ -87,12 +87,12 @@ def without_effect(ros_args: Sequence[str], program: Program, asked: Collection[
             yield f"-r {rule.text}", "the table has neither topics nor gateways, so no ROS node"
         elif rule.match not in _NODE_RULES or not _is_for(rule.node, program.table.node):
             if not _is_for(rule.node, node):
-                yield f"-r {rule.text}", f"it is for the node '{rule.node}', and this one is '{node.name}'"
+                yield f"-r {rule.text}", f"it is for the node '{rule.node}', but this one is '{node.name}'"
             elif resolved(rule.match.removeprefix("rostopic://"), node) not in topics:
                 yield f"-r {rule.text}", _for_rule(rule.match, topics, node)
     for option in ros_args:
         if option in _LOGGING or option.removeprefix("--enable-").removeprefix("--disable-") in _SWITCHES:
-            yield option, "the router has a log of its own: `router run --log-level LEVEL`, before `--ros-args`"
+            yield option, "the router has its own log: use `router run --log-level LEVEL`, before `--ros-args`"
 
 
 def _for_parameter(name: str, read: Collection[str], variables: Sequence[str]) -> str:
@@ -109,7 +109,7 @@ def _for_rule(match: str, topics: Mapping[str, str], node: NodeSettings) -> str:
 
 
 def _topics(program: Program, node: NodeSettings) -> dict[str, str]:
-    """As the table writes them, by absolute name."""
+    """The topics as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [each.topic.topic.value for gateway in program.gateways for each in gateway.settings.inbound]
     return {resolved(topic, node): topic for topic in (*plans, *inbound)}
@@ -128,7 +128,7 @@ def _remapped(node: NodeSettings, rules: Sequence[Rule]) -> NodeSettings:
 
 
 def _is_for(owner: str, node: NodeSettings) -> bool:
-    """Whether a parameter or rule with this node's name or pattern is for the router."""
+    """Whether a parameter or rule for this node name or pattern applies to the router."""
     return not owner or fnmatch.fnmatchcase(node.name, owner.rpartition("/")[2])
 
 
@@ -142,7 +142,7 @@ def _rules(ros_args: Sequence[str]) -> Iterator[Rule]:
 
 
 def _parameters(ros_args: Sequence[str]) -> Iterator[Parameter]:
-    """All that are set, in order. Raises StartError."""
+    """All parameters, in order. Raises StartError."""
     for option, word in pairwise(ros_args):
         name, assigned, value = word.partition(":=")
         if option in ("-p", "--param") and assigned:
@@ -160,7 +160,7 @@ def _read_yaml(path: Path) -> object:
 
 
 def _of_tree(node: str, tree: object) -> Iterator[Parameter]:
-    """Yield the parameters of all nodes, in any depth of namespaces."""
+    """Yield the parameters of all nodes, at any depth of namespaces."""
     for key, value in tree.items() if isinstance(tree, dict) else ():
         if key == "ros__parameters" and isinstance(value, dict):
             yield from (Parameter(node, str(name), str(member)) for name, member in value.items())

@@ -1,4 +1,4 @@
-"""The publishers and subscriptions of a table, and their replacement by those of another table."""
+"""The publishers and subscriptions of a table, and their replacement at a reload."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from router.ros.receiving import RawSubscription
 from router.ros.types import checked_class
 
 _DISCOVERY_S, _POLL_S, _OTHERS_S = 0.5, 0.005, 0.1
-"""The longest wait for peers of a new endpoint, the interval in which they are looked for, and the wait for further
+"""Seconds: the longest wait for peers of a new endpoint, the interval between checks, and the wait for more
 publishers after the first."""
 
 CLOSING_S = 1.0
-"""How long closing a publisher waits for the middleware."""
+"""Timeout in seconds for closing a publisher."""
 
 
-# rclpy publishes with the interpreter lock held, and Fast DDS may block for seconds, waiting for a reader that has gone
-# or a shared-memory port. ctypes releases the lock.
+# rclpy publishes with the interpreter lock held, and Fast DDS may block for seconds, waiting for a vanished reader or
+# a shared-memory port. ctypes releases the lock.
 _publish_serialized = function(
     "rcl_publish_serialized_message", ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(SerializedMessage), ctypes.c_void_p
 )
@@ -43,7 +43,7 @@ _error_string = function("rcutils_get_error_string", ErrorString)
 
 
 def _rcl_error() -> Exception:
-    """The error of this thread's last failed call of rcl."""
+    """The error of this thread's last failed call to rcl."""
     text = _error_string().text.decode(errors="replace")
     RCL.rcutils_reset_error()
     error: Exception = rclpy_implementation.RCLError(text)
@@ -51,7 +51,7 @@ def _rcl_error() -> Exception:
 
 
 class Publication:
-    """A publisher. `wanted` is whether it has subscribers or serves late joiners.
+    """A publisher. `wanted` says whether it has subscribers or serves late joiners.
 
     `publish` takes CDR bytes, is thread-safe, and releases the interpreter lock while the middleware works. It raises
     RCLError if the middleware fails or the publisher is closed.
@@ -73,10 +73,10 @@ class Publication:
             handle = self._publisher.handle
             opening.enter_context(handle)
             self._open = opening.pop_all()
-        self._calls: dict[int, int] = {}  # by thread in `publish`: since when, in ns of the monotonic clock
+        self._calls: dict[int, int] = {}  # by thread in `publish`: its start, in ns of the monotonic clock
         self._is_closed = False
         self.address: int = handle.pointer
-        """That of its `rcl_publisher_t`, until it is closed."""
+        """The address of its `rcl_publisher_t`, valid until it is closed."""
         self.publish = self._publish_to(self.address)
         self.topic: str = handle.get_topic_name()
         self.qos = publisher_qos(handle.pointer)
@@ -91,7 +91,7 @@ class Publication:
             sleep(_POLL_S)
 
     def stalled(self) -> float:
-        """For how many seconds a call of `publish` has been in the middleware; 0 if there is none."""
+        """For how many seconds a call of `publish` has been in the middleware; 0 if no call is running."""
         since = list(self._calls.values())
         return (monotonic_ns() - min(since)) / 1e9 if since else 0.0
 
@@ -113,9 +113,9 @@ class Publication:
         return publish
 
     def close(self) -> bool:
-        """Close, unless a call of `publish` is stuck in the middleware; then return False, and it stays open.
+        """Close the publisher. If a call of `publish` is stuck in the middleware, leave it open and return False.
 
-        Waits up to CLOSING_S for running calls. No thread may wait for its events.
+        Waits up to CLOSING_S for running calls. No thread may be waiting for its events.
         """
         self._is_closed = True
         for _ in range(int(CLOSING_S / _POLL_S)):
@@ -123,7 +123,7 @@ class Publication:
                 break
             sleep(_POLL_S)
         else:
-            logger.error("the middleware is stuck, and this publisher stays open", topic=self.plan.label)
+            logger.error("a publish call is stuck in the middleware; the publisher stays open", topic=self.plan.label)
             return False
         self._open.close()
         return True
@@ -144,7 +144,7 @@ class Subscription:
     def await_publishers(self) -> None:
         """Wait up to 0.5 s until publishers have discovered this subscription, while an earlier one receives.
 
-        All have discovered it soon after a message of the first one; silent publishers have time afterwards.
+        The others usually follow soon after the first message arrives; silent publishers get the full time.
         """
         for _ in range(int(_DISCOVERY_S / _POLL_S)):
             sleep(_POLL_S)
@@ -153,7 +153,7 @@ class Subscription:
                 return
 
     def close(self) -> None:
-        """To be called when no thread takes from it or waits for its events."""
+        """Close the subscription, when no thread takes from it or waits for its events."""
         self.raw.close()
 
 
@@ -170,7 +170,7 @@ Opened = TypeVar("Opened", Publication, Subscription)
 
 @dataclass(slots=True)
 class RosChange:
-    """All endpoints of the next table by topic; those opened for it, and those that it does not use."""
+    """All endpoints of the next table by topic, the newly opened ones, and the unused old ones."""
 
     publications: dict[str, Publication]
     subscriptions: dict[str, Subscription]
@@ -186,14 +186,14 @@ def opened_beside(
 ) -> tuple[dict[str, Opened], list[Opened]]:
     """Open the endpoints of `plans` that are not in `now`. Raises StartError.
 
-    Returns all endpoints by topic, and those that were opened.
+    Returns all endpoints by topic, and the newly opened ones.
     """
-    classes: dict[str, type] = {}  # by name: the search for one, and for those in it, takes half a millisecond
+    classes: dict[str, type] = {}  # by name: finding a class, with the nested ones, takes half a millisecond
     for plan in plans:
         if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
-            kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
-            what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
-            raise StartError(f"{spans[plan.label]}: {what} while it runs", "restart it, or take another name")
+            kept = now[plan.label].plan.type_name  # DDS allows one type per topic in a process
+            what = f"topic '{plan.label}' has the type {kept}, which cannot change to {plan.type_name}"
+            raise StartError(f"{spans[plan.label]}: {what} while the router runs", "restart it, or use another name")
         if plan.type_name not in classes:
             classes[plan.type_name] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []
@@ -208,5 +208,5 @@ def opened_beside(
 
 
 def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
-    """The open endpoints that are not kept."""
+    """The open endpoints that are not in `kept`."""
     return [each for topic, each in now.items() if kept.get(topic) is not each]

@@ -1,6 +1,6 @@
-"""Checks of the environment before ROS 2 is imported, which may end the process otherwise.
+"""Checks of the environment before ROS 2 is imported, which could end the process.
 
-A full /dev/shm ends it by SIGBUS, an unknown middleware with exit code 102, a domain above 232 with 1.
+A full /dev/shm kills it with SIGBUS, an unknown middleware ends it with exit code 102, a domain above 232 with 1.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ LAST_DOMAIN = 232
 
 SHM = Path("/dev/shm")  # noqa: S108 - Linux's shared memory; the router writes nothing there
 _TRACING = 8 << 10
-"""Bytes there that the tracing library of ROS writes to while it is loaded."""
+"""Bytes that the tracing library of ROS writes there while it is loaded."""
 _FAST_DDS = 1 << 20
-"""Bytes there for a participant's segment and ports: 652 KiB, in full pages. With less, messages are lost silently."""
+"""Bytes there for a participant's segment and ports: 652 KiB in full pages. With less, messages are lost silently."""
 
 
 def check_environment(environ: Mapping[str, str]) -> None:
-    """Raise StartError for what would end the process when ROS is imported or a node is opened."""
+    """Raise StartError for a problem that would end the process when ROS is imported or a node is opened."""
     for what, remedy in obstacles(environ):
         raise StartError(what, remedy)
 
 
 def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str, str]]:
-    """Yield each problem that keeps ROS from being loaded, with its remedy."""
+    """Yield each problem that prevents loading ROS, with its remedy."""
     domain = environ.get("ROS_DOMAIN_ID") or "0"
     if not re.fullmatch("[0-9]{1,9}", domain) or int(domain) > LAST_DOMAIN:
         yield f"ROS_DOMAIN_ID is '{domain}'", f"set it to a number from 0 to {LAST_DOMAIN}"
@@ -42,14 +42,14 @@ def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str
         yield f"RMW_IMPLEMENTATION is '{middleware}', which is not installed here", remedy
     limit = address_space()
     if limit is not None and limit < ADDRESS_SPACE:
-        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), and ROS 2 needs {ADDRESS_SPACE >> 20}"
-        yield what, "start it with `ulimit -v unlimited`; to bound what it uses take systemd's MemoryMax"
+        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), but ROS 2 needs {ADDRESS_SPACE >> 20}"
+        yield what, "start it with `ulimit -v unlimited`; to limit its memory, use systemd's MemoryMax"
     needed, free = shared_memory(environ, shm)
     if free < needed:
-        remedy = "remove what nobody uses there (`fastdds shm clean`), or make it larger"
+        remedy = "remove unused files there (`fastdds shm clean`), or make it larger"
         if needed > _TRACING:
             remedy += "; with FASTDDS_BUILTIN_TRANSPORTS=UDPv4, ROS needs almost nothing there"
-        yield f"{shm} has {free >> 10} KiB free, and ROS 2 needs {needed >> 10}", remedy
+        yield f"{shm} has {free >> 10} KiB free, but ROS 2 needs {needed >> 10}", remedy
 
 
 def ros_remedy() -> str:
@@ -59,7 +59,7 @@ def ros_remedy() -> str:
 
 
 def ros_package_remedy(package: str) -> str:
-    """The remedy if a ROS package is missing, cannot be loaded, or differs from what the table was compiled for."""
+    """The remedy if a ROS package is missing, cannot be loaded, or differs from the one the table was compiled for."""
     ours = asset("schemas")
     if not is_installed(ours):
         return f"run 'make setup' and `. .venv/env.sh`, or install the ROS package '{package}'"
@@ -76,7 +76,7 @@ def ros_package_remedy(package: str) -> str:
 
 
 def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:
-    """Bytes of shared memory that ROS needs in `folder`, and bytes that are free there."""
+    """The bytes of shared memory that ROS needs in `folder`, and the bytes that are free there."""
     needed = _TRACING + (_FAST_DDS if uses_shared_memory(environ) else 0)
     try:
         room = os.statvfs(folder)
@@ -93,7 +93,7 @@ def uses_shared_memory(environ: Mapping[str, str]) -> bool:
 
 
 def _middlewares(environ: Mapping[str, str]) -> set[str]:
-    """The middlewares that the sourced workspaces and this Python have registered."""
+    """The middlewares registered by the sourced workspaces and this Python."""
     prefixes = [*filter(None, environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     folders = [Path(prefix, "share", "ament_index", "resource_index", "rmw_typesupport") for prefix in prefixes]
     return {each.name for folder in folders for each in folder.glob("*")} - {"rmw_implementation"}

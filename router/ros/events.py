@@ -1,4 +1,4 @@
-"""Events of publishers and subscriptions: who subscribes, which peers are incompatible, and the thread that waits."""
+"""Events of publishers and subscriptions (new subscribers, incompatible peers), and the thread that waits for them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from router.ros.endpoints import Publication, Subscription
 
 CHECK_INTERVAL_NS = 1_000_000_000
-"""The longest delay of what ends no wait: events of subscriptions, incompatible peers that have left, and a shutdown of
-ROS from outside."""
+"""The longest delay of changes that are polled: events of subscriptions, incompatible peers that leave, and a shutdown
+of ROS from outside."""
 
 Incompatible = Callable[[str, str, int], None]
-"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it keeps from matching."""
+"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and the number of peers that mismatch."""
 
 SubscriberJoined = Callable[[str], None]
 
@@ -39,7 +39,7 @@ graph."""
 
 
 WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
-"""One byte, not 0 while a topic has subscribers or serves late joiners. Native threads read it by its address."""
+"""One byte, nonzero while a topic has subscribers or serves late joiners. Native threads read it by its address."""
 
 
 class PeerEvents:
@@ -51,10 +51,10 @@ class PeerEvents:
     def __init__(self, incompatible: Incompatible, subscriber_joined: SubscriberJoined) -> None:
         self._subscriber_joined = subscriber_joined
         self._incompatible = incompatible
-        self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: how many checks are left
+        self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: remaining checks
 
     def of_publisher(self, plan: TopicPlan, wanted: WantedFlag) -> PublisherEventCallbacks:
-        """Callbacks that also keep `wanted` up to date: whether there are subscribers."""
+        """Callbacks that also set `wanted`: whether there are subscribers."""
 
         def on_matched(status: Any) -> None:
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
@@ -62,11 +62,12 @@ class PeerEvents:
                 self._subscriber_joined(plan.label)
 
         def on_incompatible_qos(status: Any) -> None:
-            problem = "a subscriber asks for a QoS that the table does not offer, and gets nothing"
+            problem = "a subscriber requests a QoS that the table does not offer: it receives nothing"
             self._on_incompatible_qos(problem, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a subscriber expects another type, and gets nothing", topic=plan.label, type=plan.type_name)
+            what = "a subscriber expects another type: it receives nothing"
+            logger.warning(what, topic=plan.label, type=plan.type_name)
 
         return PublisherEventCallbacks(
             matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
@@ -75,12 +76,12 @@ class PeerEvents:
     def check(
         self, node: Node, publishers: Mapping[str, Publication], subscriptions: Mapping[str, Subscription]
     ) -> None:
-        """Report how many incompatible peers each topic has now, if an event has named one. Arguments by topic.
+        """Report the number of incompatible peers of each topic that had such an event. Arguments by topic.
 
-        Events report peers that come, but not those that go; the graph has those that are there.
+        Events report peers that join, but not those that leave; the graph has the present ones.
         """
         for topic, checks in list(self._checks.items()):
-            del self._checks[topic]  # if `incompatible` raises, checks end until the next event
+            del self._checks[topic]  # if `incompatible` raises, checks stop until the next event
             mismatches = Counter(_mismatches(node, publishers.get(topic), subscriptions.get(topic)))
             for policy in QOS_POLICIES:
                 self._incompatible(topic, policy, mismatches[policy])
@@ -89,16 +90,17 @@ class PeerEvents:
 
     def of_subscription(self, plan: TopicPlan) -> SubscriptionEventCallbacks:
         def on_incompatible_qos(status: Any) -> None:
-            problem = "a publisher offers less than the QoS that the table asks for, and is not heard"
+            problem = "a publisher offers a weaker QoS than the table requests: its messages are not received"
             self._on_incompatible_qos(problem, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a publisher has another type, and is not heard", topic=plan.label, type=plan.type_name)
+            what = "a publisher has another type: its messages are not received"
+            logger.warning(what, topic=plan.label, type=plan.type_name)
 
         return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
 
     def _on_incompatible_qos(self, problem: str, plan: TopicPlan, status: Any) -> None:
-        """The middleware names only the last policy of the last peer."""
+        """Log the problem. The middleware names only the last policy of the last peer."""
         policy = qos_policy_name_from_kind(status.last_policy_kind).lower()
         self._checks[plan.label] = _MORE_CHECKS
         logger.warning(problem, topic=plan.label, policy=policy)
@@ -130,7 +132,7 @@ def _peers(
 
 
 class WaitSet:
-    """Waits until one of the events has happened. For one thread; others may call `wake`.
+    """Waits until one of the events happens. For one thread; others may call `wake`.
 
     Unlike the wait set of rclpy's executor, it is made only once.
     """
@@ -143,7 +145,7 @@ class WaitSet:
     def wait(self, timeout_ns: int) -> None:
         """Wait until an event happens or `wake` is called, at most `timeout_ns`. No signal handler runs meanwhile."""
         waiting = self._set
-        waiting.clear_entities()  # waiting removes what is not ready
+        waiting.clear_entities()  # waiting removes the entities that are not ready
         waiting.add_guard_condition(self._guard_condition.handle)
         for event in self._events:
             event.add_to_wait_set(waiting)
@@ -156,7 +158,7 @@ class WaitSet:
                 yield event, event.take_data()
 
     def wake(self) -> None:
-        """End the present wait, or the next one."""
+        """End the current wait, or the next one."""
         self._guard_condition.trigger()
 
     def close(self) -> None:
@@ -167,9 +169,9 @@ class WaitSet:
 class EventThread:
     """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
 
-    The latter are polled, because Fast DDS would end a wait for each message, and at once while a message is not taken:
-    this thread would compete with the receiving one for the interpreter. Events have a thread of their own because they
-    need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
+    Events of subscriptions are polled, because Fast DDS would end a wait for each message, and at once while a message
+    is not taken: this thread would compete with the receiving one for the interpreter. Events have their own thread
+    because they need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
     """
 
     def __init__(
@@ -202,7 +204,7 @@ class EventThread:
         while not self._stopping:
             self._waited_for.wait(max(0, check_at - monotonic_ns()))
             if not self._context.ok():
-                logger.critical("ROS was shut down from outside the router: nothing can be published any more")
+                logger.critical("ROS was shut down from outside the router: restart the router to publish again")
                 return
             self._serve(self._waited_for)
             if (now := monotonic_ns()) >= check_at:
@@ -218,5 +220,5 @@ class EventThread:
     def _call(self, callback: Callable[[], None]) -> None:
         try:
             callback()
-        except Exception as error:  # noqa: BLE001 a bug, which is logged; the next events are served
+        except Exception as error:  # noqa: BLE001 a bug is logged; later events are still handled
             fault(error, "lost an event").log()

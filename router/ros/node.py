@@ -1,4 +1,4 @@
-"""Opening a ROS node in a context of its own, with the transports that the environment asks for."""
+"""Opens a ROS node in a context of its own, with the transports that the environment selects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from router.log import logger
 from router.ros.types import lean_interfaces
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
-"""What rclpy raises for invalid arguments, names and settings; its own errors derive from RuntimeError."""
+"""The errors of rclpy for invalid arguments, names and settings; its own errors derive from RuntimeError."""
 
 UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
 """A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""
@@ -32,9 +32,9 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
     context = Context()
     try:
         with _environment(_transport_variables(os.environ)):
-            # The router has its own log: no log file of ROS, no /rosout. No parameter services either: parameters
-            # fill the table's variables at start, so that setting them later would have no effect. Nor a service
-            # that describes types: rclpy's executor would answer it, and none runs.
+            # The router has its own log, so it needs no log file of ROS and no /rosout. It has no parameter services:
+            # parameters set the table's variables at start, and setting them later would have no effect. It has no
+            # type description service: rclpy's executor would answer it, and none runs.
             context.init(list(ros_args), initialize_logging=False)
             with lean_interfaces():
                 node = Node(
@@ -53,12 +53,12 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
 
 
 def check_arguments(ros_args: Sequence[str]) -> None:
-    """Raise StartError for arguments that ROS does not take, without opening a node."""
+    """Raise StartError for arguments that ROS rejects, without opening a node."""
     context = Context()
     try:
         context.init(list(ros_args), initialize_logging=False)
     except RCL_ERRORS as error:
-        raise StartError(f"ROS does not take these arguments: {error}") from error
+        raise StartError(f"ROS rejects these arguments: {error}") from error
     context.try_shutdown()
 
 
@@ -66,7 +66,7 @@ def _ignore_sim_time(node: Node) -> None:
     """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
     if node.get_parameter(_SIM_TIME).value:
         logger.warning(
-            f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",
+            f"{_SIM_TIME} is ignored: the router uses real time (stamps, ttl, deadmen)",
             remedy=f"leave {_SIM_TIME} out for this node, or set it to false (docs/guides/ros-workspace.md)",
         )
         node.set_parameters([Parameter(_SIM_TIME, value=False)])
@@ -80,7 +80,7 @@ def close_node(node: Node) -> None:
 def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
     """Variables that make FASTDDS_BUILTIN_TRANSPORTS=UDPv4 effective with a discovery range of LOCALHOST.
 
-    For that range rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile has the other
+    With that range, rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile has the other
     effects of the range, and the range SUBNET does not change the profile.
     """
     wanted = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
@@ -89,20 +89,20 @@ def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
         return {}
     if taken := next((name for name in _PROFILES if variables.get(name)), None):
         logger.warning(
-            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory although "
+            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory even though "
             "FASTDDS_BUILTIN_TRANSPORTS is UDPv4",
-            remedy=f"unset {taken}, or make it what {UDP_ON_LOCALHOST} is and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+            remedy=f"unset {taken}, or set it to {UDP_ON_LOCALHOST} and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
         )
         return {}
     chosen = {_PROFILES[0]: str(UDP_ON_LOCALHOST), "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
-    if "ROS_LOCALHOST_ONLY" in variables:  # rcl warns where it is set at all
+    if "ROS_LOCALHOST_ONLY" in variables:  # rcl warns whenever it is set
         chosen["ROS_LOCALHOST_ONLY"] = "0"
     return chosen
 
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the process temporarily, as the middleware reads them from there."""
+    """Set environment variables inside, where the middleware reads them."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -116,7 +116,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def middleware() -> str:
-    """The name of the middleware, such as `rmw_fastrtps_cpp`. Raises StartError if it cannot be loaded."""
+    """The name of the middleware, for example `rmw_fastrtps_cpp`. Raises StartError if it cannot be loaded."""
     try:
         name: str = get_rmw_implementation_identifier()
     except RuntimeError as error:

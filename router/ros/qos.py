@@ -1,4 +1,4 @@
-"""QoS profiles: as rclpy takes them, as the middleware applies them, and which of them are incompatible."""
+"""QoS profiles for rclpy, the policies that the middleware applies, and which of them are incompatible."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class _Time(ctypes.Structure):
 
 
 class _Profile(ctypes.Structure):
-    """rmw_qos_profile_t, as far as it is read."""
+    """The beginning of rmw_qos_profile_t."""
 
     _fields_ = (
         ("history", ctypes.c_int),
@@ -87,7 +87,7 @@ def _named(qos: Any) -> ActualQos:
 
 
 def incompatible_policies(offered: ActualQos, requested: ActualQos) -> Iterator[str]:
-    """Yield those of QOS_POLICIES for which DDS does not match a publisher's offer with a subscriber's request."""
+    """Yield the QOS_POLICIES in which a publisher's offer does not meet a subscriber's request, as DDS defines it."""
     if (offered.reliability, requested.reliability) == (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
         yield "reliability"
     if (offered.durability, requested.durability) == (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL):

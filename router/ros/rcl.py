@@ -1,4 +1,4 @@
-"""rcl as rclpy has loaded it: the functions that are called without rclpy, and a test of the structures they take."""
+"""The rcl library that rclpy has loaded: functions that are called without rclpy, and a check of their structures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Allocator(ctypes.Structure):
 
 
 class SerializedMessage(ctypes.Structure):
-    """rcutils_uint8_array_t. The allocator stays zero where the bytes are only read."""
+    """rcutils_uint8_array_t. The allocator stays zero if the bytes are only read."""
 
     _fields_ = (
         ("buffer", c_char_p),
@@ -41,12 +41,12 @@ def address(name: str) -> int:
 
 
 def function(name: str, returned: Any, *taken: Any) -> Any:
-    """A function with its types, for this caller alone."""
+    """A function with its types, not shared with other callers."""
     return ctypes.CFUNCTYPE(returned, *taken)((name, RCL))
 
 
 class PublishFunctions(NamedTuple):
-    """Addresses of what publishes CDR bytes, of what says why it could not, and of what forgets that."""
+    """Addresses of the functions that publish CDR bytes, return the error, and reset it."""
 
     publish: int
     error: int
@@ -54,16 +54,16 @@ class PublishFunctions(NamedTuple):
 
 
 def publish_functions() -> PublishFunctions | None:
-    """None if rcl lacks one of them, or has other structures than are declared here: then only rclpy is to publish."""
+    """The addresses; None if rcl lacks a function or its structures differ: then publish only through rclpy."""
     names = "rcl_publish_serialized_message", "rcutils_get_error_string", "rcutils_reset_error"
     try:
         return PublishFunctions(*map(address, names)) if _fills_messages_as_declared() else None
-    except AttributeError:  # there is no such function
+    except AttributeError:  # no such function
         return None
 
 
 def _fills_messages_as_declared() -> bool:
-    """Whether a message that rcl has opened is a SerializedMessage, with nothing behind it."""
+    """Whether rcl initializes a message with exactly the layout of SerializedMessage."""
     capacity, behind = 1234, b"\xa5" * 64
     default = function("rcutils_get_default_allocator", Allocator)()
     opened = function("rcutils_uint8_array_init", c_int, c_void_p, c_size_t, POINTER(Allocator))

@@ -29,7 +29,7 @@ _set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 _ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
-"""Addresses of what a native thread calls to take messages, and to forget why it could not."""
+"""Addresses of the functions with which a native thread takes messages and resets errors."""
 
 
 class RawSubscription:
@@ -62,15 +62,15 @@ class RawSubscription:
 
     @property
     def address(self) -> int:
-        """That of its `rcl_subscription_t`, until it is closed."""
+        """The address of its `rcl_subscription_t`, valid until it is closed."""
         return int(self.handle.pointer)
 
     def take(self) -> tuple[bytes, int] | None:
-        """Return the oldest message and when it set out, in ns of the wall clock; None if there is no message.
+        """Return the oldest message and its time of sending, in ns of the wall clock; None if there is no message.
 
-        That is when it was sent by the sender's clock, or received by ours if that is earlier. The time of receipt
+        That is the sender's time stamp, or our time of receipt if that is earlier. The time of receipt
         alone would make old messages look new: reliable DDS repairs a loss seconds later and keeps messages for late
-        joiners, and a process that was stopped receives all that was sent meanwhile at once.
+        joiners, and a process that was stopped receives everything sent meanwhile at once.
         """
         taken = self.handle.take_message(self._message_class, True)
         if taken is None:
@@ -80,29 +80,29 @@ class RawSubscription:
         return cdr, min(sent or received, received or sent) or wall_ns()
 
     def take_all(self) -> list[tuple[bytes, int]]:
-        """Return what has arrived, at most `capacity` messages, however fast they come."""
+        """Return the messages that have arrived, at most `capacity`, even if more keep arriving."""
         return [message for _ in range(self.capacity) if (message := self.take())]
 
     def announce_to(self, eventfd: int | None) -> None:
         """Have the middleware add the number of new messages to `eventfd`, or to none.
 
         A thread of the middleware does that while it holds the reader's lock. No Python code may run there: it would
-        wait for the interpreter while the thread that has the interpreter waits for that lock, to take a message. When
-        this returns, the previous eventfd is no longer used. Raises one of `RCL_ERRORS`.
+        wait for the interpreter lock while the thread that holds it waits for the reader's lock, to take a message.
+        When this returns, the previous eventfd is no longer used. Raises one of `RCL_ERRORS`.
         """
         callback = None if eventfd is None else _ADD_TO_EVENTFD
-        # rmw_fastrtps counts what is there, then begins to listen: only a second call counts what comes in between.
+        # rmw_fastrtps counts waiting messages, then begins to listen: only a second call counts those in between.
         for _ in range(1 if eventfd is None else 2):
             if _set_callback(self.handle.pointer, callback, eventfd):
-                raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
+                raise rclpy_implementation.RCLError("the middleware does not report new messages")
 
     def close(self) -> None:
-        """To be called when nothing is announced, and no thread takes from it."""
+        """Close the subscription, when it announces to no eventfd and no thread takes from it."""
         self._node.destroy_subscription(self._subscription)
 
 
 class Arrivals:
-    """Waits until messages have arrived on subscriptions. For one thread.
+    """Waits for messages on subscriptions. For one thread.
 
     Each subscription has an eventfd that is watched for writes (edge-triggered) and never read: a wait is one system
     call, however many subscriptions there are. A wait set of rcl attaches and detaches each of them for every wait.
@@ -120,7 +120,7 @@ class Arrivals:
             self._open = opening.pop_all()
 
     def add(self, subscription: RawSubscription) -> None:
-        """Wait for this subscription too. Not to be called during a wait. Raises one of `RCL_ERRORS`, or OSError."""
+        """Also wait for this subscription. Do not call during a wait. Raises one of `RCL_ERRORS`, or OSError."""
         with ExitStack() as opening:
             eventfd = os.eventfd(0, os.EFD_CLOEXEC)
             opening.callback(os.close, eventfd)
@@ -128,10 +128,10 @@ class Arrivals:
             subscription.announce_to(eventfd)
             opening.pop_all()
         self._subscriptions[eventfd], self._eventfds[subscription] = subscription, eventfd
-        self.again(subscription)  # for messages that came before it was announced
+        self.again(subscription)  # for messages that arrived earlier
 
     def remove(self, subscription: RawSubscription) -> None:
-        """No longer wait for this subscription. Not to be called during a wait."""
+        """No longer wait for this subscription. Do not call during a wait."""
         eventfd = self._eventfds.pop(subscription)
         del self._subscriptions[eventfd]
         subscription.announce_to(None)
@@ -143,12 +143,12 @@ class Arrivals:
             self.remove(subscription)
 
     def wait(self, timeout: float | None = None) -> list[RawSubscription]:
-        """Return subscriptions with possible new messages since the last call. Waits for them, at most `timeout` s."""
+        """Wait, at most `timeout` s, and return the subscriptions that may have new messages since the last call."""
         ready = self._epoll.poll(timeout, max(1, len(self._subscriptions)))
         return [self._subscriptions[eventfd] for eventfd, _ in ready]
 
     def again(self, subscription: RawSubscription) -> None:
-        """Have `wait` return this subscription once more, as not everything was taken."""
+        """Have `wait` return this subscription again, because not all of its messages were taken."""
         os.eventfd_write(self._eventfds[subscription], 1)
 
     def close(self) -> None:

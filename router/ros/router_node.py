@@ -20,19 +20,19 @@ from router.table.model import NodeSettings
 class RouterNode:
     """The node, its publishers and subscriptions, and the thread of their events. Opening raises StartError.
 
-    `publish[topic]` takes CDR bytes. `wanted[topic]`, a byte that is updated in place, is whether the
-    topic has subscribers or serves late joiners. `topics` are those that the node has discovered. `name` has the
-    namespace: `rover1/rover_router`. Others take the messages of its subscriptions.
+    `publish[topic]` takes CDR bytes. `wanted[topic]`, a byte that is updated in place, says whether the topic has
+    subscribers or serves late joiners. `topics` are the discovered topics. `name` includes the namespace:
+    `rover1/rover_router`. The messages of its subscriptions are taken elsewhere.
 
-    `incompatible(topic, policy, peers)` is called by the thread of events, once per second for a topic that has peers
-    with an incompatible QoS, and for some seconds after that. `subscriber_joined(topic)` is called there too.
+    The event thread calls `subscriber_joined(topic)` and, once per second for a topic that has peers with an
+    incompatible QoS, and for some seconds after that, `incompatible(topic, policy, peers)`.
 
-    Topics are replaced in four steps: `prepare` opens what is new, `apply` uses it, `watch` waits for its events,
-    `finish` closes what is no longer used. After `prepare`, `abandon` undoes it.
+    Topics are replaced in four steps: `prepare` opens new endpoints, `apply` uses them, `watch` waits for their events,
+    `finish` closes the unused ones. After `prepare`, `abandon` undoes it.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
-    """What `publish[topic]` may raise."""
+    """The errors that `publish[topic]` may raise."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class RouterNode:
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._is_stuck = False
-        self._is_left = False  # a thread uses subscriptions or publishers
+        self._is_left = False  # a stuck thread uses subscriptions or publishers
         self._peers = PeerEvents(incompatible, subscriber_joined)
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
@@ -65,19 +65,19 @@ class RouterNode:
             self._open = opening.pop_all()
 
     def leave_open(self) -> None:
-        """Have `close` leave everything open: a thread is stuck where it takes messages, or publishes them."""
+        """Have `close` leave everything open, because a thread is stuck while it takes or publishes messages."""
         self._is_left = self._is_stuck = True
 
     def close(self) -> None:
-        """To be called when no thread publishes, or takes messages."""
+        """Close the node, when no thread publishes or takes messages."""
         self._open.close()
 
     def prepare(
         self, publishers: Sequence[TopicPlan], subscriptions: Sequence[TopicPlan], spans: Mapping[str, SourceSpan]
     ) -> RosChange:
-        """Open the endpoints of these plans, beside those that are open. Raises StartError.
+        """Open the endpoints of these plans in addition to the open ones. Raises StartError.
 
-        A plan that is the same as before keeps its endpoint.
+        An unchanged plan keeps its endpoint.
         """
         with ExitStack() as opening:
             publications, published = opened_beside(
@@ -99,12 +99,12 @@ class RouterNode:
         return RosChange(publications, kept, [*published, *subscribed])
 
     def abandon(self, change: RosChange) -> None:
-        """Close what `prepare` has opened."""
+        """Close the endpoints that `prepare` has opened."""
         for opened in change.opened:
             opened.close()
 
     def stalled(self) -> Iterator[tuple[str, float]]:
-        """The topics in whose publishers threads of Python are now, each with seconds."""
+        """The topics on which Python threads are publishing now, each with the seconds since they began."""
         for topic, publication in list(self._publications.items()):
             if seconds := publication.stalled():
                 yield topic, seconds
@@ -118,14 +118,14 @@ class RouterNode:
         self._use(change)
 
     def watch(self, change: RosChange) -> None:
-        """Wait for events of the endpoints in use: `wanted` follows new subscribers from now on."""
+        """Wait for events of the endpoints in use, and update `wanted` from now on."""
         if change.left or change.opened:
             self._events.stop()
             self._events = self._event_thread()
             self._events.start()
 
     def finish(self, change: RosChange) -> None:
-        """Close endpoints that are no longer used; no thread may publish there, or wait for their events."""
+        """Close unused endpoints; no thread may publish on them or wait for their events."""
         for topic in self.publish.keys() - self._publications.keys():
             del self.publish[topic], self.wanted[topic]
         for opened in change.left:
@@ -162,6 +162,6 @@ class RouterNode:
             self._is_stuck = True
 
     def _close_node(self) -> None:
-        """Close the node, unless a thread is in the middleware: that cannot be closed then."""
+        """Close the node, unless a thread is in the middleware, which makes that impossible."""
         if not self._is_stuck:
             close_node(self._node)

@@ -1,4 +1,4 @@
-"""Topics that no table names: discovery, taps for gateways, and a listener for `router tap`."""
+"""Topics outside of the table: discovery, taps for gateways, and a listener for `router listen`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DISCOVERY_INTERVAL = 0.05
 class DiscoveredPublisher(NamedTuple):
     """A publisher. `keeps`: it keeps messages for late joiners. `is_ours`: it belongs to the discovering node.
 
-    No two have the same `gid`.
+    `gid` is unique.
     """
 
     type_name: str
@@ -55,7 +55,7 @@ class RosTopics:
         return [name for name, _ in self._node.get_topic_names_and_types()]
 
     def publishers(self, topic: str) -> list[DiscoveredPublisher]:
-        """The publishers of `topic`, of all types."""
+        """The publishers of `topic`, of any type."""
         return [
             DiscoveredPublisher(
                 type_name=seen["topic_type"],
@@ -68,11 +68,11 @@ class RosTopics:
         ]
 
     def resolved(self, name: str) -> str:
-        """The absolute name of a topic, by the node's namespace and remaps."""
+        """The absolute name of a topic, from the node's namespace and remaps."""
         return str(self._node.resolve_topic_name(name))
 
     def _query(self, function: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
-        """As rclpy's Node, which takes three times as long because it makes an object of each QoS."""
+        """Query the graph, three times as fast as rclpy's Node, which makes an object of each QoS."""
         with self._handle:
             return function(self._handle, topic, False)
 
@@ -88,19 +88,20 @@ class RosTopics:
         return usable_class(type_name, definitions)
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
-        """Subscribe to `topic`. Raises StartError, also if our node has the topic with another type.
+        """Subscribe to `topic`.
 
-        And if a remap of our node changes the topic, because messages of another topic would be taken for its.
+        Raises StartError, also if our node has the topic with another type, or if a remap of our node renames the
+        topic, because messages of another topic would appear under its name.
         """
         type_name = "/".join((*message_class.__module__.split(".")[:2], message_class.__name__))
         try:
             others = self._our_types(topic) - {type_name}
             if (renamed := self.resolved(topic)) != topic:
                 raise StartError(
-                    f"a remap of this router makes '{renamed}' of '{topic}'", "remap relative names instead"
+                    f"a remap of this router changes '{topic}' to '{renamed}'", "remap relative names instead"
                 )
-            if others:  # DDS has one type for a topic in a process
-                raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
+            if others:  # DDS allows one type per topic in a process
+                raise StartError(f"topic '{topic}' is {others.pop()} in this router, so it cannot be {type_name}")
             return TopicTap(
                 self._node, topic, message_class, tap_qos(is_reliable=is_reliable, keeps=keeps, depth=depth)
             )
@@ -117,9 +118,9 @@ class RosTopics:
 
 
 class TopicTap:
-    """A subscription that is polled: messages that are not taken cost no Python. To be closed.
+    """A polled subscription: messages that are not taken cost no time in Python. The caller must close it.
 
-    `fd` is readable while messages have come that `arrived` has not counted.
+    `fd` is readable while there are messages that `arrived` has not counted.
     """
 
     def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
@@ -130,13 +131,13 @@ class TopicTap:
             opening.callback(os.close, self.fd)
             subscription = RawSubscription(node, message_class, topic, qos, silent)
             opening.callback(subscription.close)
-            subscription.announce_to(self.fd)  # at once for what has come already
+            subscription.announce_to(self.fd)  # reports earlier messages at once
             opening.callback(subscription.announce_to, None)
             self._open = opening.pop_all()
         self.take = subscription.take
 
     def arrived(self) -> int:
-        """The number of messages that have come since the last call, taken or not. Does not wait."""
+        """The number of messages that have arrived since the last call, taken or not. Does not wait."""
         try:
             return os.eventfd_read(self.fd)
         except BlockingIOError:
@@ -147,7 +148,7 @@ class TopicTap:
 
 
 def tap_qos(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
-    """For the newest `depth` messages. Best effort matches every publisher; kept messages need a reliable one."""
+    """A QoS for the newest `depth` messages. Best effort matches every publisher; kept messages need reliable QoS."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -156,17 +157,17 @@ def tap_qos(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
 
 
 class TopicListener:
-    """A subscription to `topic` with a node of its own. Raises StartError; to be closed.
+    """A subscription to `topic` with a node of its own. Raises StartError. The caller must close it.
 
-    Without a `type_name`, opening waits `patience` seconds for the first publisher, and raises TransportError if none
-    comes. If all publishers keep messages for late joiners, `take` returns these as well.
+    Without a `type_name`, opening waits `patience` seconds for the first publisher, and raises TransportError if there
+    is none. If all publishers keep messages for late joiners, `take` also returns these.
     """
 
     def __init__(
         self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = (), patience: float = math.inf
     ) -> None:
         if type_name is not None and type_name.count("/") != 2:
-            raise StartError(f"'{type_name}' is no message type", "they are written like std_msgs/msg/String")
+            raise StartError(f"'{type_name}' is not a message type", "write it like std_msgs/msg/String")
         with ExitStack() as opening:
             node = open_node("router_tap", ros_args=ros_args)
             opening.callback(close_node, node)
@@ -184,7 +185,7 @@ class TopicListener:
             self._open = opening.pop_all()
 
     def take(self, timeout: float) -> list[tuple[bytes, int]]:
-        """Wait up to `timeout` seconds; return each message's CDR bytes, and the wall clock ns at which it set out.
+        """Wait up to `timeout` seconds; return each message's CDR bytes and time of sending, in ns of the wall clock.
 
         Ctrl-C is handled when the wait is over.
         """
@@ -192,7 +193,7 @@ class TopicListener:
         return list(islice(iter(self._subscription.take, None), DEPTH))
 
     def message(self, cdr: bytes) -> Any:
-        """Deserialise a message."""
+        """Deserialize a message."""
         return deserialize_message(cdr, self._message_class)
 
     def close(self) -> None:

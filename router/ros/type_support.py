@@ -1,7 +1,7 @@
 """Installed message types without their Python classes, which a router that handles CDR never uses.
 
-A message class imports those of its whole package and of all packages that it uses, often NumPy too: 0.1 s and 25 MB
-for a rover. The C library of a package has what rcl needs, and descriptions of the types.
+A message class imports all classes of its package and of the packages that this uses, often also NumPy: 0.1 s and
+25 MB for a rover. The C library of a package has all that rcl needs, and descriptions of the types.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any
 from router.ros.rcl import RCL
 
 Definition = tuple[tuple[str, str], ...]
-"""The fields of a type, each as its name and its type in rclpy's spelling."""
+"""The fields of a type: names, and types in rclpy's notation."""
 
 _MEMBERS = ("create_ros_message", "convert_from_py", "convert_to_py", "destroy_ros_message", "type_support")
-"""What rclpy expects of the metaclass of a message, in capital letters."""
+"""The attributes that rclpy expects of the metaclass of a message, in capital letters."""
 
 _NESTED, _BOUNDED = 1, {21: "string", 22: "wstring"}
 _ARRAY, _BOUNDED_SEQUENCE, _SEQUENCE, _LISTS_END = 48, 96, 144, 192
 _SIMPLE = dict(
     enumerate(["int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float", "double"], 2)
 ) | {15: "boolean", 16: "octet", 17: "string", 18: "wstring"}
-"""FIELD_TYPE_... of type_description_interfaces/msg/FieldType; that of a list is one of the bases above more."""
+"""FIELD_TYPE_... of type_description_interfaces/msg/FieldType; for lists, one of the bases above is added."""
 
 _OF_EMPTY = "structure_needs_at_least_one_member"
 """The field of a type without fields, which neither `.msg` files nor rclpy show."""
@@ -91,9 +91,9 @@ _capsule_pointer.argtypes, _capsule_pointer.restype = (ctypes.py_object, ctypes.
 
 
 def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str, Definition]) -> Any:
-    """Return what rclpy takes for the class of a message type that is published and taken as CDR.
+    """Return a stand-in for a message class, with which rclpy publishes and takes the type as CDR.
 
-    None unless that type and those in it are installed as in `definitions`. Imports nothing but the C library.
+    None unless the type and its nested types are installed as in `definitions`. Imports only the C library.
     """
     if not hasattr(RCL, "rcl_node_type_description_service_init"):  # a release whose types do not describe themselves
         return None
@@ -105,7 +105,7 @@ def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str,
         members = {
             f"_{each.upper()}": getattr(library, f"{each}_msg__{kind}__{_snake_case(short)}") for each in _MEMBERS
         }
-    except Exception:  # noqa: BLE001 whatever it is, the import of the class says more of it
+    except Exception:  # noqa: BLE001 the import of the class will report the error in more detail
         return None
     if not definitions.items() <= dict(_described(members["_TYPE_SUPPORT"])).items():
         return None
@@ -114,13 +114,13 @@ def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str,
 
 
 def _snake_case(name: str) -> str:
-    """As rosidl makes file names of type names."""
+    """The name in rosidl's snake case, as in its file names."""
     words = re.sub("(.)([A-Z][a-z]+)", r"\1_\2", name)
     return re.sub("([a-z0-9])([A-Z])", r"\1_\2", words).lower()
 
 
 def _described(capsule: object) -> Iterator[tuple[str, Definition]]:
-    """Yield the definitions of the type and those in it, by name; nothing where it does not describe itself."""
+    """Yield the definitions of the type and its nested types, by name; nothing if it has no description."""
     address = _capsule_pointer(capsule, _capsule_name(capsule))
     describe = _TypeSupport.from_address(address).description
     if not describe:
@@ -132,7 +132,7 @@ def _described(capsule: object) -> Iterator[tuple[str, Definition]]:
 
 
 def _spelled(declared: _FieldType) -> str:
-    """The type of a field as rclpy spells it; a word that it never has where no `.msg` file can declare the type."""
+    """The type of a field in rclpy's notation; "unknown" if no `.msg` file can declare it."""
     base = (declared.id - 1) // _ARRAY * _ARRAY if declared.id <= _LISTS_END else _LISTS_END
     kind = declared.id - base
     if kind == _NESTED:

@@ -39,16 +39,16 @@ _BASIC: dict[str, Type] = {
 
 @contextmanager
 def lean_interfaces() -> Iterator[None]:
-    """Import modules of message types inside, but not what these import and CDR bytes need not.
+    """Import modules of message types inside, without imports that CDR bytes do not need.
 
-    That is numpy, for fields of fixed length, and the generator of such modules, with its parsers.
+    These are numpy, for fields of fixed length, and the generator of such modules, with its parsers.
     """
     with postponed("numpy"), left_out("rosidl_generator_py.generate_py_impl"):
         yield
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
-    """As `usable_class`; the StartError has the position `span`."""
+    """As `usable_class`, with the position `span` in the StartError."""
     try:
         return usable_class(name, definitions)
     except StartError as error:
@@ -56,9 +56,9 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
 
 def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """What rclpy takes for a type that is published and taken as CDR.
+    """The class, or a stand-in, with which rclpy publishes and takes a type as CDR.
 
-    Raises StartError unless it and all types in it are installed as in `definitions`.
+    Raises StartError unless the type and its nested types are installed as in `definitions`.
     """
     package, kind, short = _parts(name)
     if _has_part(package, kind):
@@ -70,14 +70,14 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
             raise StartError(
-                f"{part} as installed is not what the table was compiled for; {_remedy(part)}\n"
+                f"the installed {part} is not the one the table was compiled for; {_remedy(part)}\n"
                 f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
             )
     return loaded_class(name)
 
 
 def loaded_class(name: str) -> Any:
-    """As `installed_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
+    """As `installed_class`, with the type support loaded, which takes some 10 ms. Raises StartError."""
     message_class = installed_class(name)
     try:
         with lean_interfaces():
@@ -91,8 +91,8 @@ def loaded_class(name: str) -> Any:
 def installed_class(name: str) -> Any:
     """Return the class of `std_msgs/msg/String`, `std_srvs/srv/Empty_Event`, `nav2_msgs/action/Wait_FeedbackMessage`.
 
-    The name may come from a client: only Python packages with a part `msg`, `srv` or `action` are imported. Raises
-    StartError.
+    The name may come from a client: only Python packages with a submodule `msg`, `srv` or `action` are imported.
+    Raises StartError.
     """
     package, kind, short = _parts(name)
     if not _has_part(package, kind):
@@ -111,18 +111,18 @@ def _parts(name: str) -> tuple[str, ...]:
     """Package, kind and short name. Raises StartError."""
     parts = _NAME.fullmatch(name)
     if parts is None:
-        raise StartError(f"{name} is not installed (it is no name of a ROS message)")
+        raise StartError(f"{name} is not installed (it is not the name of a ROS message)")
     return parts.groups()
 
 
 def _has_part(package: str, kind: str) -> bool:
-    """Whether the package is there, without importing it."""
+    """Whether the package is installed, without importing it."""
     found = PathFinder.find_spec(package)
     return bool(found and PathFinder.find_spec(f"{package}.{kind}", found.submodule_search_locations or []))
 
 
 def _member(module: ModuleType, name: str) -> Any:
-    """The member or None. A package exports only some messages of an action; all are beside the action's class."""
+    """The member or None. A package exports only some messages of an action; the action's module has all."""
     interface = getattr(module, name.partition("_")[0], None)
     home = module if interface is None else sys.modules[interface.__module__]
     return getattr(module, name, None) or getattr(home, name, None)
@@ -137,10 +137,10 @@ def _fields(definition: Definition) -> str:
 
 
 def installed_type(name: str) -> MessageType:
-    """Return a type with all types nested in it, as its Python class describes it: without defaults and constants.
+    """Return a type with its nested types, as its Python class describes it: without defaults and constants.
 
-    For types without a `.msg` file: those of services and actions, and those written in IDL. Raises StartError if one
-    of them cannot be loaded, or has a field that no `.msg` file could declare.
+    For types without a `.msg` file: those of services and actions, and those written in IDL. Raises StartError if a
+    type cannot be loaded, or has a field that no `.msg` file could declare.
     """
     return _message(name, {})
 

@@ -129,7 +129,7 @@ def test_what_is_for_the_address_of_one_listener_and_comes_to_another_is_receive
 
 def test_the_log_warns_of_a_listener_in_another_network_than_a_board(site: Rover) -> None:
     """A board, or a router on the way, may drop what comes from an address that no route leads back to."""
-    warning = "datagrams to this endpoint leave from another network's address, and whoever checks that may drop them"
+    warning = "datagrams to this endpoint have another network's source address; firewalls may drop them"
     text = TABLE.replace("0.0.0.0:5000", "10.78.2.1:5000")
     with site.router(text) as router:
         assert [(line["endpoint"], line["address"], line["route"]) for line in router.events(warning)] == [

@@ -46,7 +46,7 @@ gateways:
 """
 HOSTS = {"driving_board": "127.0.0.222", "arm_board": "127.0.0.40", "basestation": "127.0.0.10"}
 ALONE = ("/usr/bin/unshare", "-n")
-SENT = "the deadman has sent its payload, since the router starts"
+SENT = "the deadman has sent its payload at startup"
 
 
 def envelope(case: str, **values: object) -> bytes:

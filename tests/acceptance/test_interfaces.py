@@ -180,9 +180,10 @@ def test_an_interface_that_goes_and_comes_back_is_heard_again(site: Rover) -> No
     """As a tunnel that is restarted, or an adapter that is plugged in again: it has the name, and is another one."""
     with site.router(TABLE) as router:
         site.rover.ip("link", "del", "radio0")
-        wait_until(lambda: bool(router.events("a network interface has gone: nothing comes in by it")), "the loss")
+        gone = "the network interface is gone: the listener receives nothing"
+        wait_until(lambda: bool(router.events(gone)), "the loss")
         cable(site.rover, "radio0", "10.78.2.1/24", site.radio, "eth0", "10.78.2.10/24")
-        wait_until(lambda: bool(router.events("these listeners receive now: their networks are there")), "the return")
+        wait_until(lambda: bool(router.events("these listeners now receive: their networks are up")), "the return")
         site.basestation.sendto(DRIVE, RADIO)
         wait_until(lambda: site.board_gets() == [DRIVE], "the command")
         site.board.sendto(DIAG, LAN)

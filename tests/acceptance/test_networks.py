@@ -32,10 +32,10 @@ TUNNEL = TABLE.replace(
   rover: {{address: 10.78.1.1:5000}}
   tunnel: {tunnel}""",
 ).replace("10.78.2.10:9000, kind: basestation", "10.78.2.10:9000, kind: basestation, listener: tunnel")
-UNREACHABLE = "nothing can be sent to this endpoint now; the router tries again with every datagram"
-WAITS = "this listener receives nothing until its network is there; the others work"
-ADDRESS_GONE = "the address of a listener has gone: nothing comes in by it"
-THERE = "these listeners receive now: their networks are there"
+UNREACHABLE = "nothing can be sent to this endpoint now; the router retries with every datagram"
+WAITS = "this listener receives nothing until its network is up; the others work"
+ADDRESS_GONE = "the address is gone: the listener receives nothing"
+THERE = "these listeners now receive: their networks are up"
 
 
 def reload(site: Rover, router: RouterProcess, text: str) -> str:
@@ -48,7 +48,7 @@ def reload(site: Rover, router: RouterProcess, text: str) -> str:
 
 
 def results(router: RouterProcess) -> list[dict[str, object]]:
-    refused = router.events("the table was not taken over, and nothing has changed")
+    refused = router.events("reload rejected; the old table is still running")
     return [*router.events("table reloaded"), *refused]
 
 
@@ -58,7 +58,7 @@ def drives(site: Rover) -> None:
 
 
 FORBIDDEN = {
-    "no route": ((), "no network leads there"),
+    "no route": ((), "no route leads there"),
     "unreachable": (("unreachable", "10.79.0.0/16"), "the kernel refuses it: no route to host"),
     "prohibit": (("prohibit", "10.79.0.0/16"), "the kernel refuses it: permission denied"),
     "blackhole": (("blackhole", "10.79.0.0/16"), "the kernel refuses it: invalid argument"),
@@ -101,7 +101,7 @@ def test_nor_does_one_that_a_reload_brings(site: Rover) -> None:
     with site.router(TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
         log = reload(site, router, TABLE)
         assert "table reloaded" in log
-        assert [each["why"] for each in router.events(UNREACHABLE)] == ["no network leads there"]
+        assert [each["why"] for each in router.events(UNREACHABLE)] == ["no route leads there"]
         drives(site)
 
 
@@ -185,7 +185,7 @@ def test_a_listener_waits_for_its_network_and_the_others_serve(site: Rover, what
         to = RADIO[0], 5000 if ":5000" in tunnel else 5001
         site.basestation.sendto(DRIVE, to)
         wait_until(lambda: site.board_gets() == [DRIVE], "the command")
-        refused = router.events("the table was not taken over, and nothing has changed")
+        refused = router.events("reload rejected; the old table is still running")
         assert not refused
 
 

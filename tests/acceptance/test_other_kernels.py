@@ -24,8 +24,8 @@ routes:
 DRIVE = WIRE.envelope.message_class(manual_drive={"turn": 5}).SerializeToString()
 OLD, OLD_FOR_S = 3, 0.5
 FLOOD = 1000
-ASKS = "the kernel sends no arrival times with datagrams: each takes one more system call"
-LACKS = "the kernel has no arrival times: 'ttl' does not see how long datagrams wait in the receive buffer"
+ASKS = "the kernel does not send arrival times with datagrams: each datagram costs one more system call"
+LACKS = "the kernel provides no arrival times: 'ttl' ignores the time spent in the receive buffer"
 
 
 @pytest.fixture

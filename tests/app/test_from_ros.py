@@ -235,5 +235,8 @@ def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
         stop = FromRosThread.stop
         monkeypatch.setattr(FromRosThread, "stop", lambda thread: stop(thread) and False)
         router.__exit__(None, None, None)
-        assert len([line for line in logs if "stuck, and the router ends without it" in line["event"]]) == 1
+        assert (
+            len([line for line in logs if "thread did not stop in time; the router exits without it" in line["event"]])
+            == 1
+        )
         assert [each.raw.take() for each in ros._subscriptions.values()] == [None]  # it is open

@@ -466,7 +466,7 @@ def test_a_stop_leaves_the_deadman_of_a_gateway_that_is_stuck(
         client.sendall(TRUE)
         assert is_in.wait(20)
     assert site.basestation.recv(64) == BRAKE
-    left = [entry["threads"] for entry in logged if "the router ends without it" in entry["event"]]
+    left = [entry["threads"] for entry in logged if "the router exits without it" in entry["event"]]
     assert left == [["client deadmen"]]
 
 

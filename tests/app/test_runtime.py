@@ -107,7 +107,7 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
         assert (router.total("deadman_active"), router.total("deadman_trips")) == (0, 1)
     told = [entry["event"] for entry in logged if entry.get("route") == "manual_drive"]
     assert told == [
-        "the deadman has sent its payload, since the router starts",
+        "the deadman has sent its payload at startup",
         "no commands arrive; the deadman sends in their place",
         "commands arrive again; the deadman has stopped sending",
     ]
@@ -377,7 +377,7 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
         site.send(NAN_PH, NAN_PH, NAN_PH)
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
     assert [(line["reason"], line.get("more")) for line in lines] == [("non_finite", None), ("non_finite", 2)]
-    assert lines[0]["detail"] == f"{program.table.path}:17:18: state: nan is no integer"
+    assert lines[0]["detail"] == f"{program.table.path}:17:18: state: nan is not an integer"
     assert router.totals()["datagrams_sent"] == router.totals()["messages_dropped"] == 3
 
 
@@ -468,7 +468,7 @@ def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
             site.send(DRIVE)
             assert site.basestation.recv(1000) == DRIVE
         assert site.basestation.recv(1000) == BRAKE
-    assert len([each for each in logs if each["event"] == "a step of the stop is stuck, and is left"]) == 2
+    assert len([each for each in logs if each["event"] == "shutdown step did not finish in time; continuing"]) == 2
     # What is opened next must not get the descriptor of a thread that still receives.
     assert (router.listeners["rover"].socket.fileno() >= 0) == (place == "_stop_plane")
     goes_on.set()

@@ -215,7 +215,7 @@ def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> N
         port = station.getsockname()[1]
         table.write_text(re.sub(r"(basestation: {address: \"127.0.0.1:)\d+", rf"\g<1>{port}", text))
         code, said = ended("run", table, "--ros-args", "--bad")
-        assert (code, said) == (78, ["router run: ROS does not take these arguments: ['--bad']"])
+        assert (code, said) == (78, ["router run: ROS rejects these arguments: ['--bad']"])
         with pytest.raises(TimeoutError):
             station.recv(100)
 
@@ -403,7 +403,7 @@ def test_too_little_address_space_for_ros_is_told_before_ros_is_loaded(table: Pa
     table.write_text(table.read_text() + TOPIC)
     code, said = ended("run", table, preexec_fn=may_map(300))
     assert code == 78
-    assert said[0].startswith("router run: this process may map 300 MiB of memory (ulimit -v), and ROS 2 needs 1024")
+    assert said[0].startswith("router run: this process may map 300 MiB of memory (ulimit -v), but ROS 2 needs 1024")
 
 
 def test_an_environment_that_ros_does_not_take_is_told(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -425,7 +425,7 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
     command = [*within, sys.executable, "-m", "router", name, "-t", str(table)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert answer.returncode == {"run": 78, "doctor": 1}[name]
-    assert f"{SHM} has 0 KiB free, and ROS 2 needs" in answer.stdout + answer.stderr
+    assert f"{SHM} has 0 KiB free, but ROS 2 needs" in answer.stdout + answer.stderr
 
 
 def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) -> None:

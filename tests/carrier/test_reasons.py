@@ -60,11 +60,11 @@ def note(folder: Path, **fields: Any) -> bytes:
 
 TO_ROS: Mapping[str, tuple[str, str, dict[str, Any], str]] = {
     "padding": ("std_msgs/msg/String", "{data: text}", {"text": "ab\0\0"},
-                "data: the text of 4 bytes has a NUL behind 'ab': strip(...) takes off padding"),
+                "data: the text of 4 bytes has a NUL after 'ab': strip it with strip(...)"),
     "integer": ("std_msgs/msg/Int32", "{data: round(real)}", {"real": 2147483648.0},
                 "data: 2147483648 does not fit int32"),
     "range": ("std_msgs/msg/UInt8", "{data: round(real)}", {"real": -1.0}, "data: -1 does not fit uint8"),
-    "no integer": ("std_msgs/msg/Int32", "{data: round(real)}", {"real": float("nan")}, "data: nan is no integer"),
+    "no integer": ("std_msgs/msg/Int32", "{data: round(real)}", {"real": float("nan")}, "data: nan is not an integer"),
     "64 bits": ("std_msgs/msg/Int64", "{data: round(real)}", {"real": 1e20}, "data: 1e+20 does not fit 64 bits"),
     "overflow": ("std_msgs/msg/Int64", "{data: big * big}", {"big": 1 << 40}, "data: the result does not fit 64 bits"),
     "division": ("std_msgs/msg/Float64", "{data: 1 / number}", {}, "data: division by zero"),
@@ -102,7 +102,7 @@ def test_a_datagram_that_fills_no_topic_says_where_and_why(
 HEADER = b"\0\1\0\0"
 FROM_ROS: Mapping[str, tuple[str, str, bytes, str]] = {
     "text": ("std_msgs/msg/String", "{text: data}", b"\5\0\0\0caf\xe9\0",
-             "text: 'caf\\xe9' is not UTF-8: correct its publisher"),
+             "text: 'caf\\xe9' is not UTF-8: fix its publisher"),
     "name": ("std_msgs/msg/String", "{mode: data}", b"\7\0\0\0FLYING\0",
              "mode: 'FLYING' names no value of the enum"),
     "integer": ("std_msgs/msg/Float64", "{number: round(data)}", pack("<d", -3e9),

@@ -138,7 +138,7 @@ def test_a_file_that_no_start_can_use_is_named(table: Path, told: Told) -> None:
     [path] = (table.parent / "cache/rover-router").iterdir()
     swapped = path.with_name("00000000.program")
     path.rename(swapped)
-    why = "it is of another command line, folder or Python"
+    why = "it belongs to another command line, folder or Python"
     assert told(table)[0] == f"{swapped} cannot be used as a kept program: {why}"
     swapped.write_bytes(swapped.read_bytes()[:-1])
     assert told(table)[0] == f"{swapped} cannot be used as a kept program: it is truncated"

@@ -134,7 +134,7 @@ def test_without_a_compiler_it_is_for_any_platform_and_says_what_it_lacks(tmp_pa
     assert wheel.name.endswith("-py3-none-any.whl")
     zipfile.ZipFile(wheel).extractall(tmp_path / "packages")
     said = loaded(tmp_path / "packages")
-    assert "was not built, and nothing runs without it; install the router again where there is a C compiler" in said
+    assert "was not built, and nothing runs without it; reinstall the router on a machine with a C compiler" in said
 
 
 def test_the_sdist_makes_the_same_wheel(wheel: Path, tmp_path: Path) -> None:

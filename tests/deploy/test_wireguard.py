@@ -156,9 +156,10 @@ def test_a_tunnel_that_is_set_up_again_needs_no_new_router(site: Rover) -> None:
     with site.router(TABLE) as router, ExitStack() as stack:
         station = stack.enter_context(udp(site.radio, STATION))
         site.rover.run("wg-quick", "down", site.folder / "wg0.conf")
-        wait_until(lambda: bool(router.events("a network interface has gone: nothing comes in by it")), "the loss")
+        gone = "the network interface is gone: the listener receives nothing"
+        wait_until(lambda: bool(router.events(gone)), "the loss")
         site.rover.run("wg-quick", "up", site.folder / "wg0.conf")
-        wait_until(lambda: bool(router.events("these listeners receive now: their networks are there")), "the return")
+        wait_until(lambda: bool(router.events("these listeners now receive: their networks are up")), "the return")
 
         def drives() -> bool:
             station.sendto(DRIVE, ROVER)

@@ -110,7 +110,7 @@ def test_no_flipped_bit_is_overlooked(cache: Path) -> None:
         damaged[at] ^= 1 << at % 8
         path.write_bytes(damaged)
         reasons.add(refused())
-    others = {"it is no kept program", "it has another format", "another version of Python has written it"}
+    others = {"it is not a kept program", "it has another format", "it was written by another version of Python"}
     assert reasons == {"it is damaged", "it is truncated", *others}
     path.write_bytes(whole)
     assert store.find()[0] is not None
@@ -158,14 +158,14 @@ def replace_by_loop(path: Path) -> None:
 
 
 FOREIGN: dict[str, tuple[Callable[[Path], None], str]] = {
-    "a link": (replace_by_link, "it is a link"),
-    "a link to itself": (replace_by_loop, "it is a link"),
+    "a link": (replace_by_link, "it is a symbolic link"),
+    "a link to itself": (replace_by_loop, "it is a symbolic link"),
     "a folder": (replace_by_folder, "it is not a regular file"),
     "a pipe": (replace_by_pipe, "it is not a regular file"),
     "writable by the group": (lambda path: path.chmod(0o660), "others may write to it"),
     "writable by all": (lambda path: path.chmod(0o602), "others may write to it"),
     "in a folder that all write to": (lambda path: path.parent.chmod(0o777), "others may write to its folder"),
-    "a text": (replace_by_text, "it is no kept program"),
+    "a text": (replace_by_text, "it is not a kept program"),
 }
 
 
@@ -199,14 +199,14 @@ def test_one_that_was_swapped_with_that_of_another_table_is_not_used(
     [other] = set(cache.iterdir()) - {mine}
     other.rename(mine)
     monkeypatch.setattr(sys, "argv", ["router", "run"])
-    assert refused() == "it is of another command line, folder or Python"
+    assert refused() == "it belongs to another command line, folder or Python"
 
 
 def test_one_of_another_python_or_format_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     keep()
     with monkeypatch.context() as another:
         another.setattr(sys, "hexversion", sys.hexversion + 1)
-        assert refused() == "another version of Python has written it"
+        assert refused() == "it was written by another version of Python"
     monkeypatch.setattr(store, "_FORMAT", 0)
     assert refused() == "it has another format"
 
@@ -237,7 +237,7 @@ def test_a_program_whose_inputs_changed_since_they_were_read_is_not_kept(
 
 
 def test_one_that_no_router_has_started_with_is_tried_a_few_times_a_minute(cache: Path) -> None:
-    why = f"the last {store._MOST_TRIES} routers that began with it did not start"
+    why = f"the last {store._MOST_TRIES} starts that used it failed"
 
     def try_too_often() -> None:
         assert [store.count_try() for _ in range(store._MOST_TRIES + 2)] == [*[""] * store._MOST_TRIES, why, why]

@@ -189,4 +189,4 @@ def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.Monk
     stack.enter_context(closing(Listener(plan_of(held))))
     beside, stream = udp.unclaimed()
     assert beside == f"{Address(*others[0].getsockname())} on lo"
-    assert stream.endswith("which is no IPv4 UDP socket")
+    assert stream.endswith("which is not an IPv4 UDP socket")

@@ -62,13 +62,13 @@ def unread(tmp_path: Path, *words: str, table: str = TABLE) -> dict[str, str]:
         (("-r", "__node:=other", "-r", "other:cmd_vel:=x", "-p", "other:prot:=1"), {"-p prot": "did you mean 'port'?"}),
         (
             ("-r", "camera:cmd_vel:=x"),
-            {"-r camera:cmd_vel:=x": "it is for the node 'camera', and this one is 'rover_router'"},
+            {"-r camera:cmd_vel:=x": "it is for the node 'camera', but this one is 'rover_router'"},
         ),
         (
             ("--log-level", "debug", "--disable-stdout-logs"),
             dict.fromkeys(
                 ("--log-level", "--disable-stdout-logs"),
-                "the router has a log of its own: `router run --log-level LEVEL`, before `--ros-args`",
+                "the router has its own log: use `router run --log-level LEVEL`, before `--ros-args`",
             ),
         ),
     ],

@@ -49,7 +49,9 @@ def test_a_topic_keeps_its_type(speaker: RouterNode) -> None:
     other = replace(
         string_topic(), type_name="std_msgs/msg/Bool", definitions={"std_msgs/msg/Bool": (("data", "boolean"),)}
     )
-    with pytest.raises(StartError, match=r"rover.yaml:40.*cannot become std_msgs/msg/Bool while it runs; restart it"):
+    with pytest.raises(
+        StartError, match=r"rover.yaml:40.*cannot change to std_msgs/msg/Bool while the router runs; restart it"
+    ):
         speaker.prepare([other], [], SPANS)
     assert list(speaker.publish) == ["greeting"]
 

@@ -122,7 +122,7 @@ def test_ros_arguments_rename_subscribed_topics(publisher: Publish) -> None:
 
 def test_a_middleware_that_does_not_tell_of_new_messages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("router.ros.receiving._set_callback", lambda *_: 1)
-    with Receiver(string_topic()) as receiver, pytest.raises(RCL_ERRORS, match="does not tell of new messages"):
+    with Receiver(string_topic()) as receiver, pytest.raises(RCL_ERRORS, match="does not report new messages"):
         receiver.raw.announce_to(1)
 
 

@@ -232,7 +232,7 @@ def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
     with pytest.raises(StartError) as refused:
         open_ros(TopicPlan("greeting", "greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
     assert str(refused.value) == (
-        "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
+        "routes/rover.yaml:40:16: the installed std_msgs/msg/String is not the one the table was compiled for; "
         "run 'make setup' and `. .venv/env.sh`, or install the ROS package 'std_msgs'\n"
         "  installed: string data\n"
         "  compiled:  string data, uint8 more"
@@ -244,7 +244,7 @@ def test_a_type_with_one_in_it_that_was_compiled_otherwise_is_refused() -> None:
     types = {name: interfaces.get(name) for name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")}
     definitions = {name: definition(found) for name, found in types.items() if found}
     definitions["builtin_interfaces/msg/Time"] = (("sec", "int64"), ("nanosec", "uint32"))
-    with pytest.raises(StartError, match="builtin_interfaces/msg/Time as installed is not what"):
+    with pytest.raises(StartError, match="installed builtin_interfaces/msg/Time is not the one"):
         open_ros(TopicPlan("stamps", "stamps", "std_msgs/msg/Header", RELIABLE, definitions))
 
 

@@ -88,7 +88,7 @@ def test_a_closed_tap_leaves_nothing_open(ros: RouterNode) -> None:
     [
         ("std_msgs/msg/NoSuch", {}, "std_msgs/msg/NoSuch is not installed"),
         ("no_such_package/msg/NoSuch", {}, "no_such_package/msg/NoSuch is not installed"),
-        (STRING, {STRING: (("data", "int32"),)}, "String as installed is not what the table was compiled for"),
+        (STRING, {STRING: (("data", "int32"),)}, "String is not the one the table was compiled for"),
     ],
 )
 def test_a_type_that_is_not_installed_like_that_is_refused(
@@ -146,7 +146,7 @@ def test_nothing_comes_when_nobody_publishes() -> None:
     [
         ("2bad", "std_msgs/msg/String", "topic '2bad' cannot be listened to"),
         ("2bad", None, "topic '2bad' cannot be listened to"),
-        ("greeting", "std_msgs", "'std_msgs' is no message type"),
+        ("greeting", "std_msgs", "'std_msgs' is not a message type"),
         ("greeting", "std_msgs/msg/NoSuch", "std_msgs/msg/NoSuch is not installed"),
     ],
 )

@@ -92,11 +92,11 @@ def test_a_part_of_an_action_is_found_which_its_package_does_not_show(write: Wri
         ("no_such_msgs/msg/Thing", r"there is no Python package 'no_such_msgs\.msg'\); run 'make setup'"),
         ("std_msgs/action/Wait_Feedback", r"there is no Python package 'std_msgs\.action'"),
         ("rcl_interfaces/srv/GetParameters", r"'rcl_interfaces\.srv' has no such message"),
-        ("std_msgs/msg/_string", "it is no name of a ROS message"),
-        ("some::Idl_", "it is no name of a ROS message"),
-        ("os/path/Join", "it is no name of a ROS message"),
-        ("a.b/msg/C", "it is no name of a ROS message"),
-        ("__main__/msg/C", "it is no name of a ROS message"),
+        ("std_msgs/msg/_string", "it is not the name of a ROS message"),
+        ("some::Idl_", "it is not the name of a ROS message"),
+        ("os/path/Join", "it is not the name of a ROS message"),
+        ("a.b/msg/C", "it is not the name of a ROS message"),
+        ("__main__/msg/C", "it is not the name of a ROS message"),
     ],
 )
 def test_what_is_not_installed_is_refused(name: str, why: str) -> None:
@@ -185,7 +185,7 @@ def test_a_type_for_cdr_has_the_type_support_of_its_class() -> None:
 
 @pytest.mark.parametrize("other", [("data", "wstring"), ("date", "string")])
 def test_a_type_that_is_installed_otherwise_is_refused(other: tuple[str, str]) -> None:
-    with pytest.raises(StartError, match=r"std_msgs/msg/String as installed is not what the table was compiled for"):
+    with pytest.raises(StartError, match="the installed std_msgs/msg/String is not the one the table was compiled for"):
         usable_class("std_msgs/msg/String", {"std_msgs/msg/String": (other,)})
 
 
@@ -193,7 +193,7 @@ def test_a_type_with_another_one_in_it_that_is_installed_otherwise_is_refused() 
     declared = ros_interfaces().get("sensor_msgs/msg/Imu")
     assert declared
     changed = {**definitions_of(declared), "std_msgs/msg/Header": (("frame_id", "string"),)}
-    with pytest.raises(StartError, match=r"^std_msgs/msg/Header as installed is not what the table was compiled for"):
+    with pytest.raises(StartError, match=r"^the installed std_msgs/msg/Header is not the one"):
         usable_class(declared.name, changed)
 
 

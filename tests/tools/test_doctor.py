@@ -335,10 +335,10 @@ def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_
     table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_way(address: Address) -> tuple[str, str] | None:
-        return ("no network leads there", "plug it in") if address.host == "127.0.0.30" else None
+        return ("no route leads there", "plug it in") if address.host == "127.0.0.30" else None
 
     monkeypatch.setattr(doctor_checks, "why_unreachable", no_way)
-    text = "sensor_board: nothing can be sent to 127.0.0.30: no network leads there"
+    text = "sensor_board: nothing can be sent to 127.0.0.30: no route leads there"
     [first, *others] = endpoints(compiled(table), {})
     assert first == (Grade.PROBLEM, "endpoints", text, "plug it in")
     assert "sensor_board" not in " ".join(finding.text for finding in others)
