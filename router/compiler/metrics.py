@@ -197,12 +197,12 @@ RELOAD_RESULTS: Mapping[str, str] = {
 """Results of a reload, with their meaning. Unless it is ok, the old table keeps running."""
 
 STARTS: Mapping[str, str] = {
-    "kept": "it forwarded by a kept program while the table was compiled",
-    "compiled": "nothing was kept for this command line, or it has `--no-cache`: the table was compiled first",
-    "refused": "a kept program was not used, and the log says why: the table was compiled first",
-    "replaced": "it forwarded by a kept program, which ended when an input was found to have changed meanwhile",
+    "kept": "it forwarded with a kept program while the table was compiled",
+    "compiled": "there was no kept program for this command line, or `--no-cache`: the table was compiled first",
+    "refused": "a kept program was rejected, and the log says why: the table was compiled first",
+    "replaced": "it forwarded with a kept program until an input turned out to have changed",
 }
-"""How a router started, with what each means."""
+"""Ways in which a router can start, with their meaning."""
 
 CLIENTS = "clients"
 """The `target` and `source` label of a gateway's clients."""
