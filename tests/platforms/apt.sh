@@ -10,8 +10,8 @@
 #   test       make test; TESTS=tests/ros for some
 #
 # Tests the last commit in the clone ~rover/ws/src/router of the root file system `noble` (root.sh), and keeps the
-# clone. The user rover runs everything except the service. `ros2 run` and `ros2 launch` are not tested: PyPI has neither
-# ros2cli nor launch.
+# clone. The user rover runs everything except the service. `ros2 run` and `ros2 launch` are not tested, because PyPI has
+# neither ros2cli nor launch.
 set -euo pipefail
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 here=$repository/tests/platforms
