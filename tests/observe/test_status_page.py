@@ -375,8 +375,11 @@ def test_a_topic_with_a_condition_may_be_held_back_by_it(running: FakeRunning, p
     page.until(f"{box('case:imu_info')}.ariaLabel.endsWith('no subscriber, or held back by its condition')")
 
 
-def test_a_minute_of_rates_begins_without_a_peak(running: FakeRunning, browser: Browser, url: str) -> None:
+def test_a_minute_of_rates_begins_without_a_peak(
+    running: FakeRunning, health: FakeHealth, browser: Browser, url: str
+) -> None:
     running.count("messages_received", "imu_info", "sensor_board", to=100_000)
+    health.begin()
     page = open_page(browser, url)
     shown = f"rates(passed({line('from:@sensor_board', 'case:imu_info')}))"
     spark = f"{box('case:imu_info')}.querySelector('.spark path:last-child').getAttribute('d')"
