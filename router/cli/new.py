@@ -35,7 +35,7 @@ _EXAMPLES = (
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "new", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("name", metavar="NAME", help="name of the message, in CamelCase, beginning with the board")
-    parser.add_argument("--number", type=integer, required=True, metavar="N", help="a number that was never used")
+    parser.add_argument("--number", type=integer, required=True, metavar="N", help="field number, never used before")
     completes(
         parser.add_argument(
             "--board", required=True, metavar="BOARD", help="its sender, an endpoint; `_board` may be omitted"

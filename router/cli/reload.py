@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         print(finding, file=sys.stderr)
     text = answer.body.get("text", "")
     if not answer.ok:
-        print(f"router reload: nothing has changed: {text}", file=sys.stderr)
+        print(f"router reload: rejected; the old table is still running: {text}", file=sys.stderr)
         return BAD_TABLE
     print(text)
     return OK

@@ -87,9 +87,9 @@ def _advise(resent: Resent) -> int:
     if resent.elsewhere:
         listed = ", ".join(f"{name} ({host})" for name, host in sorted(resent.elsewhere.items())[:5])
         more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
-        what = f"router replay: this computer does not have the addresses of {listed}{more}, and sent from its own"
+        what = f"router replay: this computer does not have the addresses of {listed}{more} and used its own"
         hint = "name a table that has local addresses for them (-t TABLE), or one address for all (--from PLACE)"
-        print(with_help(f"{what}: the router sees strangers", hint), file=sys.stderr)
+        print(with_help(f"{what}: to the router, they are strangers", hint), file=sys.stderr)
     if resent.refused:
         print("router replay: nobody listened for some of the datagrams", file=sys.stderr)
     return 1 if resent.refused else OK

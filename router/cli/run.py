@@ -87,7 +87,7 @@ def _compile_and_route(
             environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
             table = _table(args, ROUTES_PATH, parameters.get(ROUTES_PATH))
         with inputs.recording(asked) as read:
-            program = good_table(table, environ)[1]  # a reload can free the rest
+            program = good_table(table, environ)[1]  # only the program, so that a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.asked))
         start = "kept" if head_start is not None else "refused" if begun is not None and begun.why else "compiled"
         if head_start is not None and not _is_of(head_start, program, read):

@@ -1,6 +1,6 @@
 """`router schema lock`: record the field numbers of the `.proto` files, so that none is ever reused.
 
-It adds new numbers and rejects every other change that is not accepted by name. `router validate` compares them, too.
+It adds new numbers and rejects every other change that is not accepted by name. `router validate` also compares them.
 """
 
 from __future__ import annotations

@@ -156,7 +156,9 @@ def running_url(args: argparse.Namespace) -> str:
     return url_of(table)
 
 
-def add_for(parser: argparse.ArgumentParser, about: str = "stop after this time, as 10s (default: at Ctrl-C)") -> None:
+def add_for(
+    parser: argparse.ArgumentParser, about: str = "stop after this time, for example 10s (default: at Ctrl-C)"
+) -> None:
     """`--for 10s`, as `args.seconds`."""
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
 

@@ -28,7 +28,7 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Something that tests should touch. `gap` says so where none does."""
+    """Something that tests should touch; `gap` is the message if none does."""
 
     kind: str
     span: SourceSpan
@@ -93,7 +93,7 @@ def _items(checked: Checked, program: Program) -> Iterator[tuple[Key, Item]]:
         yield from _targets(route)
     if any(source.value != ANY for route in routes for source in route.route.sources):
         for listener in program.table.listeners.values():
-            gap = f"no test has a datagram at {listener.name} from a sender that its route does not take it from"
+            gap = f"no test has a datagram at {listener.name} from a sender that its route does not accept"
             yield ("source_mismatch", listener.name), Item("rejection", listener.span, gap)
     for endpoint in program.table.endpoints.values():
         if endpoint.bandwidth is not None:
@@ -106,11 +106,11 @@ def _items(checked: Checked, program: Program) -> Iterator[tuple[Key, Item]]:
 def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
     name = route.route.name
     for target, _ in _with_conditions(route):
-        gap = f"no test compares what {name} has for {target.label}"
+        gap = f"no test checks what {name} delivers to {target.label}"
         yield ("target", name, target.label), Item("target", target.span, gap)
     if deadman := route.route.deadman:
         for to in deadman.to:
-            gap = f"no test compares what the deadman of {name} sends for {to.value}"
+            gap = f"no test checks what the deadman of {name} sends to {to.value}"
             yield ("deadman", name, to.value), Item("target", deadman.span, gap)
 
 
@@ -127,7 +127,7 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
             gap = f"no test has a message of {name} that this withholds from {target.label}"
             yield ("filtered", name, target.label), Item("rejection", condition.span, gap)
         if target.declared.max_rate is not None:
-            gap = f"no test has {target.label} get more of {name} than its max_rate"
+            gap = f"no test exceeds the max_rate of {name} to {target.label}"
             yield ("rate_limited", name, target.label), Item("rejection", target.span, gap)
 
 

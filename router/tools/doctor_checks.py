@@ -210,7 +210,7 @@ def listeners(program: Program) -> Iterator[CheckResult]:
 
 
 def _absence(listener: Listener) -> tuple[str, str] | None:
-    return absence(listener.address.value._replace(port=0), listener.interface)  # whoever has the port
+    return absence(listener.address.value._replace(port=0), listener.interface)  # even if the port is in use
 
 
 def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:

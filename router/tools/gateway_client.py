@@ -55,7 +55,7 @@ class GatewayClient:
         return self._tally
 
     def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
-        """Yield what is received within `seconds`."""
+        """Decode what the source delivers within `seconds`, and yield what is wanted."""
         ends, asks = time.monotonic() + seconds, 0.0
         while (now := time.monotonic()) < ends:
             if not self._tally.schemas and now >= asks:
@@ -65,7 +65,7 @@ class GatewayClient:
                 yield from self.take(arrival)
 
     def take(self, arrival: Arrival) -> Iterator[Heard]:
-        """Decode one arrival."""
+        """Decode one arrival, and yield what is wanted."""
         try:
             packets = unbatched(arrival.data)
         except PacketError as error:

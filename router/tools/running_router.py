@@ -85,9 +85,9 @@ def metrics(url: str) -> Snapshot:
         at = float(headers.get(COLLECTED_AT) or time.time())
         found = parse_metrics(text.decode(errors="replace"), at)
     except (ValueError, KeyError) as error:
-        raise TransportError(f"what answers at {url}/metrics is no router") from error
+        raise TransportError(f"what answers at {url}/metrics is not a router") from error
     if not found.values:
-        raise TransportError(f"what answers at {url}/metrics is no router: it has no metrics of one")
+        raise TransportError(f"what answers at {url}/metrics is not a router: it does not have a router's metrics")
     return found
 
 
@@ -98,7 +98,7 @@ def health(url: str) -> Health:
         found = json.loads(text)
         return Health(found["table"], found["received"], tuple(map(Problem.of, found["problems"])))
     except (ValueError, LookupError, TypeError) as error:
-        raise TransportError(f"what answers at {url}/health.json is no router of this version") from error
+        raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 
 
 def down(url: str, error: TransportError) -> Problem:

@@ -45,7 +45,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """A time in which an endpoint, or a payload case, is not sent: `start` to `end`, seconds since the start."""
+    """A time in which an endpoint sends nothing, or a payload case is not sent; seconds since the start."""
 
     name: str
     start: float

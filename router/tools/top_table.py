@@ -25,7 +25,7 @@ LATENCIES_FROM = 100
 
 _SHORT = 9
 _SHORTEST = 4
-"""Least letters shown of the name of a target: of several, and of the only one."""
+"""Fewest letters shown of a target's name: with several targets, and with only one."""
 
 
 _LATENCIES: dict[str, Cell] = {

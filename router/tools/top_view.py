@@ -172,7 +172,7 @@ def summary_line(view: View) -> str:
 
 
 def _summary_parts(view: View) -> tuple[str, str]:
-    """What flows, and what is lost."""
+    """The messages received and delivered, and those lost."""
     delivered = sum(target.delivered for row in view.routes for target in row.targets)
     rate = sum(target.rate for row in view.routes for target in row.targets)
     gone = Counter(view.rejected)

@@ -46,7 +46,7 @@ def listening(text: str, table: RouteTable | None) -> Address:
 
 
 def origin(text: str, table: RouteTable | None) -> Address:
-    """`HOST[:PORT]`, or an endpoint of the table: its host, and its `source_port` where it has one."""
+    """`HOST[:PORT]`, or an endpoint of the table: its host, and its `source_port` if it has one."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
         return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)
@@ -134,7 +134,7 @@ def _port(text: str, lowest: int) -> int:
 
 
 def paced(count: int | None, rate: float | None) -> Iterator[float]:
-    """Yield `count` times (None: for ever) at `rate` Hz (None: at once) the seconds since the first time."""
+    """Yield the seconds since the first time, `count` times (None: without end) at `rate` Hz (None: at once)."""
     start = time.monotonic()
     for index in itertools.count() if count is None else range(count):
         now = time.monotonic()

@@ -300,7 +300,7 @@ def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
     answer = subprocess.run(asking, env=environment, capture_output=True, text=True, check=False)
     assert answer.returncode == 78
     assert "unknown-payload-case" in answer.stderr
-    assert "nothing has changed: the table has 1 error" in answer.stderr
+    assert "rejected; the old table is still running: the table has 1 error" in answer.stderr
 
     table.write_text(good)
     process.send_signal(signal.SIGHUP)

@@ -143,7 +143,7 @@ def test_what_no_test_touches_is_listed_and_fails(rover: Path, capsys: pytest.Ca
     change(tests, "arm_feedback: {arm_error: 3}", "arm_feedback: any")
     assert main(["test", "--coverage", "routes"]) == FAILED
     out = capsys.readouterr().out
-    assert "not covered: no test compares what arm_feedback has for arm_feedback\n" in out
+    assert "not covered: no test checks what arm_feedback delivers to arm_feedback\n" in out
     assert "topic: arm_feedback" in out
 
 

@@ -61,7 +61,7 @@ def test_the_address_is_that_of_the_table(
 def test_what_is_no_router_is_said_in_a_line(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with answering(text) as url:
         assert main(["top", "--url", url, "--interval", "10ms"]) == 1
-    assert re.fullmatch(rf"router top: what answers at {url}/metrics is no router.*\n", capsys.readouterr().err)
+    assert re.fullmatch(rf"router top: what answers at {url}/metrics is not a router.*\n", capsys.readouterr().err)
 
 
 def read_until(terminal: int, wanted: str) -> None:
