@@ -12,7 +12,7 @@
 
 /* ---- integers ---- */
 
-/* Holds every integer of either sign, and their sums and differences. */
+/* Holds every signed and unsigned 64-bit integer, and their sums and differences. */
 __extension__ typedef __int128 wide;
 
 /* An operand; `sign` is its flag. Without any flag all operands are int64, for which most operations have a fast path. */
@@ -74,7 +74,7 @@ static inline bool modulo(struct value *a, const struct value *b, unsigned flags
     return divisor && narrow(a, remainder_of(dividend, divisor), flags);
 }
 
-/* For the operations whose result is one of their operands: its bits need no conversion. */
+/* These are for operations whose result is one of the operands, so its bits need no conversion. */
 static inline bool is_less(const struct value *a, const struct value *b, unsigned flags) {
     if (!flags) return a->integer < b->integer;
     return widened(a, flags, FIRST_UNSIGNED) < widened(b, flags, SECOND_UNSIGNED);
@@ -107,7 +107,7 @@ static inline double real_modulo(double a, double b) {
     return (b < 0) != (remainder < 0) ? remainder + b : remainder;
 }
 
-/* `(a - remainder) / b` is next to a whole number, or that number. */
+/* `(a - remainder) / b` is a whole number or next to one. */
 static inline double real_floor_divide(double a, double b) {
     double remainder = fmod(a, b), quotient = (a - remainder) / b;
     if (remainder != 0 && (b < 0) != (remainder < 0)) quotient -= 1;
@@ -116,7 +116,7 @@ static inline double real_floor_divide(double a, double b) {
     return quotient - whole > 0.5 ? whole + 1 : whole;
 }
 
-/* Whether a function of one number has a result: one of a finite number is finite. */
+/* Whether a function of one number has a result, which is finite if the number is. */
 static inline bool is_result(double result, double of) {
     return !(isnan(result) && !isnan(of)) && !(isinf(result) && isfinite(of));
 }

@@ -1,9 +1,9 @@
-/* What a datagram for a board may hold: its firmware decodes with nanopb, into structures of a fixed size.
+/* Checks datagrams for boards, whose firmware decodes with nanopb into structures of a fixed size.
  *
- * Checked are the sizes of the envelope, of strings and bytes, the number of elements, and that numbers are finite. Not
- * checked, though nanopb refuses it: a field of another wire type than its own, an integer of more bits than its field, a
- * negative number in an enum that declares none, an unknown group. tests/oracles/boards.py decides the same a
- * second time. */
+ * The checks cover the sizes of the envelope, of strings and bytes, the number of elements, and that numbers are finite.
+ * They do not cover other data that nanopb rejects: a field with a wrong wire type, an integer with more bits than its
+ * field, a negative number in an enum that declares none, an unknown group. tests/oracles/boards.py is a second
+ * implementation. */
 #ifndef BOARD_H
 #define BOARD_H
 
@@ -27,7 +27,7 @@ struct board_field {
     uint32_t number;
     uint8_t kind;     /* enum wire_kind; WIRE_BYTES also for strings */
     uint8_t flags;    /* of enum board_flag */
-    uint16_t message; /* of a message: its index */
+    uint16_t message; /* index of the message, for a message */
     uint32_t longest; /* of a string or bytes */
     uint32_t most;
     uint32_t counter; /* of elements */
@@ -35,10 +35,10 @@ struct board_field {
     const char *path; /* from the payload case on: "arm_ctrl.name" */
 };
 
-/* A message at one place of the tree that the envelope is: no two places share one, as each counts for itself. The
- * counters of all that is inside follow each other. */
+/* A message at one place in the tree of an envelope. Each place has its own, with its own counters. The counters of
+ * everything inside a message are consecutive. */
 struct board_message {
-    const struct board_field *fields; /* those that are checked, by ascending number */
+    const struct board_field *fields; /* the checked fields, by ascending number */
     uint32_t count;
     uint32_t first_counter, counter_count;
     uint32_t reserved;

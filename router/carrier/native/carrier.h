@@ -1,5 +1,5 @@
-/* The threads that receive datagrams and serve what is due: `receive` and `timers`. The receive thread routes and forwards
- * (route.h), and hands over to the publish thread what topics get. */
+/* The threads `receive` and `timers`, which receive datagrams and serve timers. The receive thread routes and forwards
+ * (route.h), and passes messages for topics to the publish thread. */
 #ifndef CARRIER_H
 #define CARRIER_H
 
@@ -10,8 +10,8 @@
 #include "program.h"
 #include "ring.h"
 
-/* A received datagram in the mirror, once it is decided what becomes of it. Up to MAX_DATAGRAM + 1 bytes follow, as they
- * were received. */
+/* A received datagram in the mirror, with the routing decision. Up to MAX_DATAGRAM + 1 bytes follow, as they were
+ * received. */
 struct mirror_record {
     uint32_t size, listener;
     int64_t at; /* wall clock */
@@ -25,24 +25,24 @@ enum { STRANGER = -1 };
 
 struct carrier;
 
-/* Open a carrier that counts in `counters`, and writes losses and rejections to `events`: nobody else writes to either.
- * `published` gets the messages for topics. NULL for lack of memory. */
+/* Open a carrier that counts in `counters` and writes losses and rejections to `events`, as the only writer of both.
+ * `published` gets the messages for topics. Returns NULL if memory runs out. */
 struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published);
 
 /* Start the threads. Return 0, or an errno. */
 int carrier_start(struct carrier *carrier, const struct change *first);
 
-/* Feed the watchdog of a service manager every `interval` ns, by a socket that is connected to it. */
+/* Feed the watchdog of a service manager every `interval` ns through a socket that is connected to it. */
 void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval);
 
-/* Adopt another program between two datagrams; return when that is done. Listeners that it does not have are emptied
- * before. To be called while the receive thread runs. */
+/* Adopt another program between two datagrams, and wait for that. Listeners that it does not have are drained before.
+ * The receive thread must be running. */
 void carrier_change(struct carrier *carrier, const struct change *change);
 
-/* Show received datagrams in `mirror` from now on; NULL for none. `lost` is the counter of those that had no room. */
+/* Copy received datagrams to `mirror` from now on; NULL stops that. `lost` is the counter of those that found it full. */
 void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost);
 
-/* Python is alive: to be called every few seconds, or the watchdog is not fed. */
+/* Signal that Python is alive. Call it every few seconds, or the watchdog is not fed. */
 void carrier_pulse(struct carrier *carrier);
 
 /* A number that grows at least every 50 ms unless the receive thread is stuck. */
@@ -51,7 +51,7 @@ uint64_t carrier_turns(struct carrier *carrier);
 /* Copy the first counters of the receive thread as in `counters_copy`. */
 bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count);
 
-/* Handle what the kernel holds, and end the receive thread; then `carrier_close` ends the timer thread too. */
+/* Handle the datagrams queued in the kernel, and end the receive thread; then `carrier_close` also ends the timer thread. */
 void carrier_stop_receiving(struct carrier *carrier);
 void carrier_close(struct carrier *carrier);
 

@@ -1,5 +1,5 @@
-/* All in ns: the boot clock, for ages, deadlines and rates; the monotonic clock, for waits; the wall clock, for time
- * stamps. While the computer is suspended the monotonic clock stands still, and the boot clock goes on. */
+/* Clocks in ns: boot clock for ages, deadlines and rates; monotonic clock for waits; wall clock for time stamps. While the
+ * computer is suspended, the monotonic clock stops and the boot clock continues. */
 #ifndef CLOCK_H
 #define CLOCK_H
 

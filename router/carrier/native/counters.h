@@ -15,7 +15,7 @@ static inline void counter_add(counter *counters, uint32_t index, int64_t amount
     atomic_store_explicit(&counters[index], now + amount, memory_order_relaxed);
 }
 
-/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for what is slower and one for the sum follow. */
+/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for longer durations and one for the sum follow. */
 enum { HISTOGRAM_BOUNDS = 12 };
 
 /* Count a duration in ns in the histogram that begins at this counter. */
@@ -32,7 +32,7 @@ static inline void counter_set(counter *counters, uint32_t index, int64_t value)
     atomic_store_explicit(&counters[index], value, memory_order_relaxed);
 }
 
-/* Which state the counters of a thread are in: odd while it handles a message, whose counters belong together. */
+/* The edition of a thread's counters: odd while the thread handles a message, whose counters must be read together. */
 typedef _Atomic uint64_t edition;
 
 static inline void edition_begin(edition *of) {

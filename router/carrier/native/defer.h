@@ -1,17 +1,17 @@
-/* Messages that are held back: by `on_limit: latest`, by the bandwidth of their endpoint (pace.h), or by both. A target has
- * a deferral for each source of its route.
+/* Deferrals hold messages back for `on_limit: latest`, for the bandwidth of their endpoint (pace.h), or for both. A target
+ * has a deferral for each source of its route.
  *
- * With `on_limit: latest` at most one message passes per period, and the newest of those in between is held until it may. A
- * held message is dropped as `rate_limited` when a newer one replaces it, as `stale` when it expires. A message is counted
- * when it leaves or is dropped, and feeds deadmen when it leaves. */
+ * With `on_limit: latest`, at most one message passes per period, and the newest one in between is held until the next. A
+ * held message is dropped as `rate_limited` when a newer one replaces it, and as `stale` when it expires. A message is
+ * counted when it is sent or dropped, and feeds deadmen when it is sent. */
 #ifndef DEFER_H
 #define DEFER_H
 
 #include "deliver.h"
 #include "pace.h"
 
-/* Open the deferral of a target, a timer; `pacer` is NULL without a bandwidth. It delivers to the target that it adopts. NULL
- * for lack of memory. */
+/* Open the deferral of a target, a timer; `pacer` is NULL without a bandwidth. It delivers to the target that it adopts.
+ * Returns NULL if memory runs out. */
 struct deferral *deferral_open(struct pacer *pacer);
 void deferral_close(struct deferral *deferral);
 

@@ -5,14 +5,14 @@
  *     condition   `when`                                              else filtered
  *     age         `ttl`                                               else stale
  *     rate        `max_rate`                                          else rate_limited
- *     message     what its routine writes, or the envelope as it was received
- *     board       what the firmware can take                          else too_large or non_finite
+ *     message     the output of its routine, or the envelope as it was received
+ *     board       the limits of the firmware                          else too_large or non_finite
  *     defer       `on_limit: latest` and `bandwidth` (defer.h)
  *     send or publish, and feed deadmen
  *
- * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table asks for.
+ * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table requests.
  *
- * A stage provides the clock, sockets and middleware as functions, so that tests can do without them. */
+ * A stage provides the clock, sockets and middleware as functions, so that tests can replace them. */
 #ifndef DELIVER_H
 #define DELIVER_H
 
@@ -29,32 +29,32 @@
 #include "report.h"
 #include "sender.h"
 
-/* ---- what a table says ---- */
+/* ---- settings of the table ---- */
 
 /* A topic that any number of routes publish on. */
 struct topic {
     const void *publisher; /* rcl_publisher_t */
-    const uint8_t *wanted; /* not 0 while somebody subscribes */
+    const uint8_t *wanted; /* nonzero while there are subscribers */
 };
 
 struct target {
-    struct routine condition; /* empty: it gets every message */
-    struct routine message;   /* empty: it gets the envelope as it was received */
-    /* One for each source of the route, by `source_of`, or NULL: of `max_rate` with `on_limit: first`, and what may hold
-     * messages back. */
+    struct routine condition; /* empty: the target gets every message */
+    struct routine message;   /* empty: the target gets the envelope as it was received */
+    /* By `source_of`, one for each source of the route, or NULL: the limits of `max_rate` with `on_limit: first`, and the
+     * deferrals. */
     struct limit *const *limits;
     struct deferral *const *deferrals;
     int64_t period;            /* of `on_limit: latest`, ns; 0 without */
-    const struct topic *topic; /* NULL for a destination, which has these: */
+    const struct topic *topic; /* NULL for a destination, which has: */
     struct sender *sender;
-    const struct board *board; /* NULL if it is no board */
+    const struct board *board; /* NULL if it is not a board */
     const struct feed *feeds;  /* the deadmen that a command feeds or disarms */
     uint32_t feed_count;
-    uint32_t trims; /* it gets datagrams without their trailing zeros */
-    uint32_t priority; /* where its messages wait for a bandwidth, an enum priority in pace.h */
+    uint32_t trims; /* whether it gets datagrams without their trailing zeros */
+    uint32_t priority; /* of its messages under a bandwidth: enum priority in pace.h */
     uint32_t id;    /* in events */
-    /* Counters. `waiting`: of a target whose messages come by a ring; `collected`: of one that gets frames;
-     * `delivered_bytes`: of a destination. */
+    /* Counters. `waiting` is for a target whose messages pass a ring, `collected` for one that gets frames,
+     * `delivered_bytes` for a destination. */
     uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
 };
 
@@ -63,56 +63,56 @@ enum { SLOT_RECEIVED_AT, SLOT_SOURCE };
 
 struct collect;
 
-/* The targets of a route that one thread serves. */
+/* The targets of a route that are served by one thread. */
 struct targets {
     int64_t ttl;                 /* ns, 0 for none */
-    const struct layout *layout; /* what their routines read; NULL if there are none */
+    const struct layout *layout; /* the fields that their routines read; NULL without routines */
     const struct value *sources; /* names of senders, by column; of datagrams */
-    const struct collect *collect; /* they get frames (collect.h), not each datagram; NULL without `collect` */
+    const struct collect *collect; /* they get frames (collect.h) instead of datagrams; NULL without `collect` */
     const struct target *targets;
     uint32_t count;
-    /* In events: the route, the topic whose messages these are, or NO_NAME, and the generation of the program. */
+    /* For events: the route, the topic that the messages come from, or NO_NAME, and the generation of the program. */
     uint32_t route, topic, generation;
 };
 
-/* ---- what is delivered ---- */
+/* ---- messages ---- */
 
-/* A datagram as it was received, with what the carrier knows about it. */
+/* A datagram as it was received, with what envelope_read found. */
 struct datagram {
     const uint8_t *data;
     uint32_t size;
-    uint32_t start, length; /* of the payload, or of its pieces with all that is between them, as in struct envelope */
+    uint32_t start, length; /* of the payload, or of its pieces with everything between them, as in struct envelope */
     bool is_single;         /* it is in one piece */
     uint32_t column;        /* of the sender */
     int64_t received_at;    /* wall clock */
 };
 
-/* A message on its way to the targets of a route. Its fields are read when a routine first needs them. */
+/* A message for the targets of a route. Its fields are read when a routine first needs them. */
 struct message {
-    const struct datagram *datagram; /* NULL if it is from ROS: then it has been read */
+    const struct datagram *datagram; /* NULL for a message from ROS, whose fields are already read */
     int64_t now;                     /* boot clock: when it was received */
     struct born born;
-    enum refused since; /* what its age counts from */
+    enum refused since; /* the event that its age counts from */
     bool is_read;
-    int outcome;    /* of reading: EVALUATED, or an enum loss */
-    uint32_t place; /* that refused it, an enum place */
+    int outcome;    /* result of reading: EVALUATED, or an enum loss */
+    uint32_t place; /* where it was refused: enum place */
 };
 
-/* The source of a message in arrays of its route: the column of the sender, or 0 if it is from ROS. */
+/* The index of a message's source in arrays of its route: the column of the sender, or 0 for a message from ROS. */
 static inline uint32_t source_of(const struct message *message) { return message->datagram ? message->datagram->column : 0; }
 
-/* ---- how it is delivered ---- */
+/* ---- delivery ---- */
 
 enum publication { PUBLISHED, PUBLISH_FAILED, ABANDONED };
 enum { BRAKE_LATER = -1 };
 
-/* What a thread needs to deliver messages. */
+/* The environment in which a thread delivers messages. */
 struct stage {
-    struct rehearsal *rehearsal; /* that the functions belong to; NULL in flight */
+    struct rehearsal *rehearsal; /* the owner of the functions in a rehearsal; NULL in operation */
     counter *counters;
     struct reporter reporter;
-    struct timers *timers; /* in which its commands feed deadmen */
-    /* Called for each counter that a message or a deadman adds to; NULL in flight. */
+    struct timers *timers; /* the group of the deadmen that its commands feed */
+    /* Called for each increment by a message or a deadman; NULL in operation. */
     void (*counted)(struct stage *stage, uint32_t index, int64_t amount);
     /* The boot clock, ns. */
     int64_t (*now)(struct stage *stage);
@@ -121,12 +121,12 @@ struct stage {
     /* Send the datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
     int (*brake)(struct stage *stage, const struct deadman_destination *to);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. ABANDONED: the thread was
-     * stuck in the middleware and was abandoned, and must not use anything that belongs to others. */
+     * stuck in the middleware and has been abandoned: it must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
     struct machine machine; /* last, as it is large */
 };
 
-/* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false for lack of memory.
+/* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false if memory runs out.
  * Close the stage in either case. */
 bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers);
 void stage_close(struct stage *stage);
@@ -137,21 +137,21 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
     if (stage->counted) stage->counted(stage, index, amount);
 }
 
-/* Begin with a datagram: slots have their defaults, but those of its time and its sender. */
+/* Begin with a datagram: set the slots of its time and its sender, and the others to their defaults. */
 void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
 
-/* Begin with it, and read the fields that routines of the route use. Return false if it is malformed. */
+/* Likewise, then read the fields that routines of the route use. Return false if the datagram is malformed. */
 bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
 
-/* Count and report that a target loses a message. `lost` has the reason, and details if there are any. */
+/* Count and report the loss of a message for a target. `lost` has the reason, and details if there are any. */
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost, const char *text);
 
-/* Likewise of what the machine has refused. */
+/* Likewise for a message that the machine has refused. */
 void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost);
 
-/* The message is older than `ttl`: it has expired. `since` says what its age counts from. */
+/* Likewise for an expired message, older than `ttl`. `since` is the event that its age counts from. */
 void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
                 enum refused since);
 

@@ -1,5 +1,5 @@
-/* Events of native threads for Python's log, as records of a ring. Ids stand for names that Python knows. Only so many are
- * written per window of time: the counter that an event names says how many there were. */
+/* Events of native threads for Python's log, as records of a ring. Ids stand for names that Python knows. Their rate is
+ * limited: the counter that an event names has the full number. */
 #ifndef EVENTS_H
 #define EVENTS_H
 
@@ -7,15 +7,15 @@
 
 enum event_kind { EVENT_TRIPPED = 1, EVENT_RELEASED, EVENT_DEADMAN_ERROR, EVENT_REJECTED, EVENT_LOST };
 
-/* What every event begins with. */
+/* The beginning of every event. */
 struct event_head {
     uint32_t size, kind;
 };
 
 struct deadman_event {
     uint32_t size, kind;           /* EVENT_TRIPPED, EVENT_RELEASED or EVENT_DEADMAN_ERROR */
-    uint32_t deadman, destination; /* `destination` only of an error */
-    int32_t error;                 /* errno; 0 of an error whose text follows, up to a NUL */
+    uint32_t deadman, destination; /* `destination`: for errors only */
+    int32_t error;                 /* errno; 0 if a text follows, up to a NUL */
     uint32_t counter;              /* of such errors */
 };
 
@@ -27,8 +27,7 @@ struct rejected_event {
     uint32_t counter;         /* of such rejections */
 };
 
-/* What shows that a loss is right, with numbers in `values` of a struct refusal. Those with a text have its beginning behind
- * the event. */
+/* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */
 enum refused {
     REFUSED_UNTOLD,
     /* Values of a mapping: */
@@ -36,26 +35,26 @@ enum refused {
     REFUSED_INTEGER,   /* not between two bounds; `flags` (enum sign) say which of the three are unsigned */
     REFUSED_OVERFLOW,  /* a result of integers */
     REFUSED_DIVISION,  /* by zero */
-    REFUSED_BOUNDS,    /* a low bound above the high one; likewise */
-    REFUSED_RESULT,    /* of a function, which has none; `flags` 1: the bits of its real argument */
-    REFUSED_REAL,      /* the bits of a real number that is no integer, or none of 64 bits */
-    REFUSED_FLOAT32,   /* those of one that is infinite as a float32 */
-    REFUSED_SIZE,      /* bytes of a text or of bytes, and the most */
+    REFUSED_BOUNDS,    /* a low bound above the high one; flags likewise */
+    REFUSED_RESULT,    /* a function has no result; `flags` 1: the bits of its real argument */
+    REFUSED_REAL,      /* the bits of a real number that is not an integer, or not one of 64 bits */
+    REFUSED_FLOAT32,   /* the bits of a real number that is infinite as a float32 */
+    REFUSED_SIZE,      /* the size of a text or bytes, and the largest allowed one */
     REFUSED_UTF8,      /* the number of bytes, and a text */
     REFUSED_NUL,       /* likewise, the text up to its first NUL */
-    REFUSED_NAME,      /* of no value of an enum, likewise */
-    REFUSED_MEMBER,    /* a number of no value of an enum */
-    REFUSED_ELEMENT,   /* an index, and how many elements there are */
-    REFUSED_COUNT,     /* elements, and how many there have to be */
-    REFUSED_MOST,      /* elements, and the most */
-    REFUSED_LENGTHS,   /* elements of two lists side by side */
-    REFUSED_WORK,      /* more turns of loops than a message may take */
+    REFUSED_NAME,      /* likewise, a name that the enum lacks */
+    REFUSED_MEMBER,    /* a number that the enum lacks */
+    REFUSED_ELEMENT,   /* an index, and the number of elements */
+    REFUSED_COUNT,     /* the number of elements, and the required number */
+    REFUSED_MOST,      /* the number of elements, and the largest allowed one */
+    REFUSED_LENGTHS,   /* the numbers of elements of two parallel lists */
+    REFUSED_WORK,      /* more loop iterations than a message may take */
     REFUSED_ROOM,      /* more cells or text than it may take, or a message that is too large to write */
-    /* Ages: how old the message is and `ttl`, in ns. */
-    REFUSED_ARRIVAL, /* since it arrived here */
-    REFUSED_SENDING, /* since it was sent by its sender's clock */
-    REFUSED_STAMP,   /* by its own stamp */
-    REFUSED_WAITING  /* at the latest when it could leave */
+    /* Ages: the age of the message and `ttl`, in ns. */
+    REFUSED_ARRIVAL, /* age since arrival */
+    REFUSED_SENDING, /* age since sending, by the sender's clock */
+    REFUSED_STAMP,   /* age by its own stamp */
+    REFUSED_WAITING  /* age at the time when it could be sent */
 };
 
 struct refusal {
@@ -65,12 +64,12 @@ struct refusal {
 };
 
 struct lost_event {
-    uint32_t size, kind; /* EVENT_LOST; a text that says more may follow, up to a NUL */
-    uint32_t route, topic, target; /* `topic`: of ROS, whose message it was, or NO_NAME */
+    uint32_t size, kind; /* EVENT_LOST; a text with details may follow, up to a NUL */
+    uint32_t route, topic, target; /* `topic`: of the message from ROS, or NO_NAME */
     uint32_t reason;     /* enum loss */
     int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
     uint32_t counter;    /* of such losses */
-    uint32_t generation; /* of the program, if a place in it refused the message: an enum place */
+    uint32_t generation; /* of the program, if `place` in it refused the message */
     uint32_t place;
     struct refusal refusal;
 };
@@ -84,7 +83,7 @@ enum place {
     PLACE_OPERATIONS /* and the index of one */
 };
 
-/* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
+/* Why a target did not get a message: DROP_REASONS in compiler/metrics.py. */
 enum loss {
     LOSS_MAPPING_ERROR,
     LOSS_NON_FINITE,

@@ -1,23 +1,23 @@
-/* When a message was born by the boot clock: its time stamp is of the wall clock, which may have been set since.
+/* Converts time stamps of the wall clock to the boot clock, although the wall clock may have been set since.
  *
  * Each look compares the wall clock with the boot clock. If the offset has changed, the clock was set since the last look.
  * A stamp means a different time under each setting, but only times at which that setting may have been in force are
- * possible. While several are, the stamp is ambiguous: a clock that is set back shows the same time twice.
+ * possible. If there are several, the stamp is ambiguous: a clock that is set back shows the same time twice.
  *
  * Provided that the clock was set at most once between two looks, and that stamps come from clocks that are set together
- * with ours, it follows for an event of the last FRESHNESS_MEMORY, within FRESHNESS_TOLERANCE:
+ * with ours, the following holds for an event of the last FRESHNESS_MEMORY, within FRESHNESS_TOLERANCE:
  *
- * - The oldest reading is never younger than the event: what is stale by it stays so whatever is done to the clock. For a
- *   while after the clock was set back by `d`, it takes fresh messages for `d` older, unless it is known that they cannot
- *   be: by `not_before`, or because the past was forgotten.
+ * - The oldest reading is never younger than the event: a message that is stale by it remains stale however the clock is
+ *   set. For a while after the clock was set back by `d`, it makes fresh messages appear older by `d`, unless that is
+ *   excluded by `not_before`, or because the past was forgotten.
  * - The youngest reading is never older than the event: no jump makes a fresh message stale by it. It is younger only if
  *   the clock was set since, or since the last look before the event, by some `d` no greater than its age.
  *
- * An older event may be taken for any age if the clock was set since.
+ * An older event may have any age if the clock was set since.
  *
  * A stamp in the future under all settings comes from a computer whose clock is ahead; it counts as now. For
- * FRESHNESS_MEMORY after our clock was set back by more than theirs is ahead, it is instead taken for a stamp from before
- * that. */
+ * FRESHNESS_MEMORY after our clock was set back by more than theirs is ahead, it instead counts as a stamp from before the
+ * change. */
 #ifndef FRESHNESS_H
 #define FRESHNESS_H
 
@@ -25,8 +25,8 @@
 
 enum { FRESHNESS_MOST_SETTINGS = 32 };
 
-/* The error (ns) of a reading while the wall clock is slewed, at up to 1 ms/s; and for how long a past setting of the
- * clock is remembered after the next one was detected. */
+/* In ns: the error of a reading while the wall clock is slewed, at up to 1 ms/s, and how long a past setting of the clock
+ * is remembered after the next one was detected. */
 static const int64_t FRESHNESS_TOLERANCE = 10000000, FRESHNESS_MEMORY = 10000000000;
 
 /* The wall clock was `offset` ahead of the boot clock, at most from `since` until `until`. */
@@ -36,24 +36,24 @@ struct setting {
 
 struct freshness {
     int64_t is_known, offset, since, seen;
-    uint32_t first, count; /* of the ring `past`: settings under which what is still to come may have been stamped */
+    uint32_t first, count; /* of the ring `past`: settings under which later messages may have been stamped */
     struct setting past[FRESHNESS_MOST_SETTINGS];
 };
 
-/* The earliest and the latest time (boot clock, ns) that a stamp can mean. */
+/* The earliest and the latest possible time of a stamp (boot clock, ns). */
 struct born {
     int64_t oldest, youngest;
 };
 
-/* Compare the clocks: `now` and `received_at` are the boot clock and the wall clock, read now in this order. Often, also
- * while nothing is stamped: that bounds when the clock can have been set. For one thread. */
+/* Compare the clocks: `now` and `received_at` are the boot clock and the wall clock, read now in this order. Call it often,
+ * also without stamps, to bound the time at which the clock was set. For one thread. */
 void freshness_look(struct freshness *freshness, int64_t received_at, int64_t now);
 
-/* Nothing that is still to come was stamped before the last look: the queue was found empty since. */
+/* State that no later message was stamped before the last look: the queue was empty since. */
 static inline void freshness_forget_past(struct freshness *freshness) { freshness->count = 0; }
 
-/* Look, and return when an event was that the wall clock stamped `stamp`; never after `now`. It was not before
- * `not_before` (boot clock), if that is known; else INT64_MIN. */
+/* Look, and return the possible times of an event with the wall-clock stamp `stamp`, never after `now`. The event did not
+ * happen before `not_before` (boot clock), if that is known; else INT64_MIN. */
 struct born freshness_born(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
                            int64_t not_before);
 

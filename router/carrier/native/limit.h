@@ -1,8 +1,8 @@
-/* `max_rate`: passes at most so many messages per second; all times are of the boot clock, in ns.
+/* `max_rate`: limits the number of messages per second. All times are in ns of the boot clock.
  *
- * Passes keep to a grid of one period. A message up to half a period early takes its place on the grid (a limiter by
- * interval would wait for the next and undershoot: 25 instead of 30 Hz out of 100); after a pause the grid starts anew, so
- * nothing is saved up for a burst. At most one message more than the rate passes in any second. */
+ * Messages pass on a grid of one period. A message up to half a period early takes the next place on the grid: a limiter by
+ * interval would wait for the next message and undershoot, to 25 instead of 30 Hz out of 100. After a pause the grid
+ * restarts, so no burst accumulates. In any second, at most one message more than the rate passes. */
 #ifndef LIMIT_H
 #define LIMIT_H
 
@@ -11,14 +11,14 @@
 
 struct limit {
     int64_t period, late; /* `late` is period - period / 2 */
-    int64_t next_pass;    /* from when on a message may pass; -period at first */
+    int64_t next_pass;    /* the earliest time at which a message may pass; -period at first */
 };
 
-/* A limit that passes a message each `period`, of which nothing was used. NULL for lack of memory. */
+/* Open an unused limit that passes one message per `period`. Returns NULL if memory runs out. */
 struct limit *limit_open(int64_t period);
 void limit_close(struct limit *limit);
 
-/* Whether a message may pass now; if so, it takes the place. */
+/* Return whether a message may pass now, and if so, count it against the limit. */
 bool limit_passes(struct limit *limit, int64_t now);
 
 #endif

@@ -1,5 +1,5 @@
-/* A list is stored in one of two ways: as scalars in a row, as CDR has them, which stay in the message; or as a chain of
- * cells. What is read from protobuf, and what programs compute, is in cells. */
+/* A list is stored in one of two ways: as an array of scalars, which stays in the CDR message, or as a chain of cells. Lists
+ * from protobuf and computed lists are in cells. */
 #ifndef LISTS_H
 #define LISTS_H
 
@@ -53,12 +53,12 @@ static inline bool list_add(struct machine *machine, struct value *list, struct 
     return true;
 }
 
-/* Take the first element off a list that has one. */
+/* Remove and return the first element of a list that is not empty. */
 static inline struct value list_next(const struct machine *machine, struct value *list, enum scalar stored) {
     list->size--;
     if (stored == IN_CELLS) {
         const struct cell *cell = &machine->cells[list->list.first];
-        list->list.first = cell->next; /* of the last one, it means nothing */
+        list->list.first = cell->next; /* has no meaning after the last cell */
         return cell->value;
     }
     struct value element = scalar_load(list->bytes, stored);

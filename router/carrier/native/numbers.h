@@ -1,4 +1,4 @@
-/* Numbers as they stand in messages: protobuf and CDR have them little-endian, floats as IEEE 754 has them. */
+/* The encoding of numbers in protobuf and CDR: little-endian, floats as in IEEE 754. */
 #ifndef NUMBERS_H
 #define NUMBERS_H
 
@@ -17,7 +17,7 @@ static inline void store_little_endian(uint8_t *to, uint64_t bits, unsigned size
     for (unsigned index = 0; index < size; index++) to[index] = (uint8_t)(bits >> (8 * index));
 }
 
-/* Whether a number is one of `count` int32 at `numbers`, which ascend and need not be aligned. */
+/* Whether a number is one of `count` ascending int32 at `numbers`, which need not be aligned. */
 static inline bool is_among(int64_t number, const void *numbers, uint32_t count) {
     uint32_t low = 0, high = count;
     while (low < high) {
@@ -57,9 +57,9 @@ static inline uint64_t float64_bits(double number) {
     return bits;
 }
 
-/* Whether a number is finite as a float32, or not finite anyway. */
+/* Whether a number stays finite as a float32; true for infinity and NaN. */
 static inline bool fits_float32(double number) {
-    static const double END = 3.4028235677973366e38; /* the smallest magnitude that does not round to a finite float32 */
+    static const double END = 3.4028235677973366e38; /* the smallest magnitude that rounds to infinity */
     return !isfinite(number) || fabs(number) < END;
 }
 

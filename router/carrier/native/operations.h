@@ -1,9 +1,9 @@
-/* The format of routines, the same for every direction. A layout says which fields a reader puts into which slots
- * (read_protobuf.h, read_cdr.h). Operations compute with slots on a stack (evaluate.h); some of them write a message
- * (write_cdr.h, write_protobuf.h). router/compiler/lowering makes routines of checked expressions.
+/* The format of routines, for all directions. A layout says which fields a reader stores in which slots (read_protobuf.h,
+ * read_cdr.h). Operations compute with slots on a stack (evaluate.h); some of them write a message (write_cdr.h,
+ * write_protobuf.h). router/compiler/lowering makes routines from checked expressions.
  *
  * Values carry no type: the compiler knows the type of each one, and the range of each integer. Integers have 64 bits,
- * signed or unsigned. Where a result may not fit, an operation checks it. An operation without a result refuses the
+ * signed or unsigned. If a result may not fit, an operation checks it. An operation without a result refuses the
  * message. */
 #ifndef OPERATIONS_H
 #define OPERATIONS_H
@@ -11,16 +11,16 @@
 #include <stdint.h>
 
 enum {
-    MOST_STACKED = 256,  /* values at a time; the first one is never used */
-    MOST_LOOPS = 8,      /* loops in loops */
-    MOST_OPEN = 32,      /* payloads in payloads, while one is written */
-    MOST_TEXT = 1 << 20  /* bytes of text that a routine puts together: the compiler has added them up */
+    MOST_STACKED = 256,  /* values at once; the first one is never used */
+    MOST_LOOPS = 8,      /* depth of nested loops */
+    MOST_OPEN = 32,      /* depth of nested payloads while writing */
+    MOST_TEXT = 1 << 20  /* bytes of text that a routine computes; the compiler checks the sum */
 };
 enum { NONE = UINT16_MAX }; /* no such slot, section or enum */
 
 /* ---- values ---- */
 
-/* A list in cells. If it is empty, `first` and `last` have no meaning. */
+/* A list in cells. `first` and `last` have no meaning if it is empty. */
 struct list {
     uint32_t first, last;
 };
@@ -43,7 +43,7 @@ struct cell {
     uint32_t next, reserved;
 };
 
-/* Scalars as CDR has them, and how a list is stored: as `size` of these in a row at `bytes`, or in cells. */
+/* Scalar types of CDR, and how a list is stored: as an array of `size` scalars at `bytes`, or in cells. */
 enum scalar {
     SCALAR_BOOL,
     SCALAR_INT8,
@@ -85,8 +85,8 @@ enum op {
     OP_MODULO,   /* has the sign of the divisor; refuses the divisor 0 */
     OP_LEAST,    /* the smaller one of two */
     OP_GREATEST, /* the larger one of two */
-    OP_CLAMP,    /* x, low, high: the bound that x is beyond, else x */
-    OP_FIT,      /* x, low, high: refuses an x beyond the bounds */
+    OP_CLAMP,    /* x, low, high: the bound that x exceeds, else x */
+    OP_FIT,      /* x, low, high: refuses x outside of the bounds */
     OP_WRAP,     /* x, low, high: x, moved between the bounds by multiples of their distance; refuses low > high */
     /* Real numbers: */
     OP_REAL_ADD,
@@ -95,7 +95,7 @@ enum op {
     OP_REAL_DIVIDE,       /* refuses the divisor 0 */
     OP_REAL_FLOOR_DIVIDE, /* likewise */
     OP_REAL_MODULO,       /* likewise */
-    OP_REAL_POWER,        /* refuses, as the functions below, if there is no result or finite operands give infinity */
+    OP_REAL_POWER,        /* like the functions below, refuses if there is no result or finite operands give infinity */
     OP_REAL_NEGATE,
     OP_REAL_ABSOLUTE,
     OP_REAL_LEAST,
@@ -108,58 +108,57 @@ enum op {
     OP_ATAN2,
     OP_HYPOT,
     OP_FLOAT32, /* refuses a finite number that is infinite as a float32; the number stays a double */
-    /* From one to the other: */
+    /* Conversions: */
     OP_INTEGER_TO_REAL, /* `flag` 1: the integer is unsigned */
-    OP_ROUND,           /* a tie goes to the even integer. These four give a signed integer. They refuse NaN and infinity as
-                           LOSS_NON_FINITE, and what is beyond 64 bits as LOSS_MAPPING_ERROR */
+    OP_ROUND,           /* ties go to the even integer. These four give a signed integer. They refuse NaN and infinity as
+                           LOSS_NON_FINITE, and numbers beyond 64 bits as LOSS_MAPPING_ERROR */
     OP_TRUNCATE,
     OP_FLOOR,
     OP_CEIL,
-    /* Truth is the integer 0 or 1: */
+    /* Booleans are the integers 0 and 1: */
     OP_COMPARE, /* `flag` is the enum relation, `slot` the enum compared */
     OP_NOT,
     OP_JUMP,   /* skips the next `size` operations */
-    OP_UNLESS, /* pops a truth, and skips `size` operations if it is false */
+    OP_UNLESS, /* pops a boolean, and skips `size` operations if it is false */
     OP_AND,    /* skips `size` operations if the top is false, else pops it */
     OP_OR,     /* skips `size` operations if the top is true, else pops it */
-    OP_EITHER, /* `or` of two that are both evaluated */
+    OP_EITHER, /* `or` of two booleans, both of which are evaluated */
     /* Text and bytes: */
     OP_JOIN,
     OP_DECIMAL,    /* an integer as text; `flag` 1: it is unsigned */
     OP_DIGITS,     /* a real number as text with `slot` decimals, or as "nan", "inf" or "-inf" */
     OP_CHARACTERS, /* the number of characters in UTF-8 */
-    OP_SIZE,       /* the number of bytes; of a list, its elements */
+    OP_SIZE,       /* the number of bytes, or of a list's elements */
     OP_FIT_SIZE,   /* refuses more than `integer` bytes */
     OP_STRIP,      /* text without the blanks and NULs at both of its ends: space, tab, line feed, vertical tab, form feed
                       and carriage return */
-    OP_UTF8,       /* refuses what is not UTF-8 */
-    OP_NAMELESS,   /* refuses the text, as a name of no value of an enum */
+    OP_UTF8,       /* refuses text that is not UTF-8 */
+    OP_NAMELESS,   /* refuses the text as a name that the enum lacks */
     OP_OCTETS,     /* a list of integers, stored as `flag` says, as bytes; refuses integers beyond 0 to 255 */
     OP_MEMBER,     /* refuses an integer that is not among `size` ascending int32 in the literals, from `integer` */
     /* Lists. `flag` (enum scalar) says how a list is stored: */
-    OP_FIT_COUNT,  /* refuses a number of elements other than `integer`; `flag` 1: only a larger one */
-    OP_SAME_COUNT, /* pops a number of elements, and refuses it unless the one below is the same */
-    OP_ELEMENT, /* the element with the index `integer`; refuses a list that has none */
+    OP_FIT_COUNT,  /* refuses a number of elements other than `integer`; `flag` 1: refuses only a larger one */
+    OP_SAME_COUNT, /* pops a number of elements, and refuses it unless the next one is equal */
+    OP_ELEMENT, /* the element with the index `integer`; refuses a list without it */
     OP_ENTER,   /* pops a message, and reads it into section `slot` */
-    OP_REPEAT,  /* pops an integer, and repeats the next `size` operations so many times; the last of them is its OP_AGAIN.
-                   `flag` 1: cells and text that they take are kept, else each turn frees what it has taken */
+    OP_REPEAT,  /* pops an integer, and repeats the next `size` operations that many times; the last of them is its OP_AGAIN.
+                   `flag` 1: their cells and text are kept; else each iteration frees its own */
     OP_AGAIN,
     OP_NEXT,   /* removes the first element from the list in `slot`, and pushes it */
     OP_LIST,   /* pops `size` values, and pushes a list of them in cells */
-    OP_UNPACK, /* a list that is stored as scalars, in cells */
-    OP_APPEND, /* pops a value, and adds it to the list in cells in `slot` */
-    /* A message, from its first byte on. In CDR the known bytes begin with the header: */
+    OP_UNPACK, /* converts a list of scalars to cells */
+    OP_APPEND, /* pops a value, and appends it to the list in cells in `slot` */
+    /* A message, from its first byte on. In CDR, the constant bytes begin with the header: */
     OP_KNOWN, /* writes `size` bytes of the literals, from `integer`, aligned to `slot`, which is 1 in protobuf */
-    /* A message in CDR. Alignment counts from behind the header. Each pops a value: */
+    /* A message in CDR. Alignment is relative to the end of the header. Each pops a value: */
     OP_PUT,        /* writes the lowest `slot` bytes of an integer, aligned to their number */
     OP_PUT_FLOAT,  /* refuses a finite number that is infinite as a float32 */
     OP_PUT_DOUBLE,
     OP_PUT_TEXT,   /* refuses text with a NUL */
-    OP_PUT_BYTES,  /* without their number in front */
-    /* A message in protobuf. `size` is the tag, field number << 3 | wire type, or 0 for none, as of packed elements. Each
+    OP_PUT_BYTES,  /* without a length prefix */
+    /* A message in protobuf. `size` is the tag, field number << 3 | wire type, or 0 for none, for packed elements. Each
      * OP_WRITE pops a value, and writes zero and the empty string only if `flag` is 1: */
-    OP_OPEN, /* what follows, up to its OP_CLOSE, gets tag and length in front: a message, or packed elements. `flag` 0: it
-                is left out if it is empty */
+    OP_OPEN, /* begins a message or packed elements, up to its OP_CLOSE, with tag and length. `flag` 0: omitted if empty */
     OP_CLOSE,
     OP_WRITE_VARINT,
     OP_WRITE_ZIGZAG,
@@ -175,7 +174,7 @@ enum sign { FIRST_UNSIGNED = 1, SECOND_UNSIGNED = 2, THIRD_UNSIGNED = 4, RESULT_
 
 enum relation { EQUAL, UNEQUAL, LESS, LESS_OR_EQUAL, MORE, MORE_OR_EQUAL };
 
-/* What is compared with what, exactly: the first of two is the left operand. */
+/* The types of an exact comparison, the left operand first. */
 enum compared {
     SIGNED_INTEGERS,
     UNSIGNED_INTEGERS,
@@ -198,18 +197,18 @@ struct operation {
     };
 };
 
-/* Operations, in order: they decide a condition, write a message, or give a value. */
+/* A sequence of operations that evaluates a condition, writes a message, or gives a value. */
 struct routine {
     const struct operation *operations;
     uint32_t count, reserved;
 };
 
-/* ---- what is read ---- */
+/* ---- reading ---- */
 
 enum field_type {
     TYPE_BOOL,
-    TYPE_INT32, /* open enums as well */
-    TYPE_INT64, /* uint64 as well: the same bits */
+    TYPE_INT32, /* and open enums */
+    TYPE_INT64, /* and uint64: the same bits */
     TYPE_UINT32,
     TYPE_SINT32,
     TYPE_SINT64,
@@ -221,7 +220,7 @@ enum field_type {
     TYPE_BYTES, /* and string */
     TYPE_MESSAGE,
     TYPE_GROUP,      /* never wanted, but it may be a member of a oneof */
-    TYPE_CLOSED_ENUM /* a number that it does not have is an unknown field */
+    TYPE_CLOSED_ENUM /* a number that the enum lacks is an unknown field */
 };
 
 /* A wanted field of a protobuf message, or a member of its oneof. */
@@ -230,11 +229,11 @@ struct wanted_field {
     uint8_t type; /* enum field_type */
     uint8_t is_repeated;
     uint16_t slot;     /* of its value or list, or NONE */
-    uint16_t presence; /* slot that becomes 1 when it is there, or NONE */
-    uint16_t section;  /* of a message that is not repeated, or NONE */
-    uint16_t choice;   /* slot with the number of the oneof's member that is there, or NONE */
+    uint16_t presence; /* slot that is set to 1 if the field is present, or NONE */
+    uint16_t section;  /* for a message that is not repeated, or NONE */
+    uint16_t choice;   /* slot for the number of the oneof's present member, or NONE */
     uint16_t cleared, cleared_count; /* slots of the oneof's members */
-    uint16_t closed;   /* of the layout's closed enums, or NONE */
+    uint16_t closed;   /* index of the layout's closed enums, or NONE */
 };
 
 struct closed_enum {
@@ -244,9 +243,9 @@ struct closed_enum {
 
 enum read_kind {
     READ_SCALAR,        /* of `type`, into `slot` */
-    READ_SKIP,          /* steps over `count` scalars of `size` bytes, which is also their alignment */
+    READ_SKIP,          /* skips `count` scalars of `size` bytes, which is also their alignment */
     READ_ARRAY,         /* `count` scalars of `size` bytes: a list of them into `slot`, which is never NONE */
-    READ_SEQUENCE,      /* likewise, but the number of scalars comes first; NONE: steps over them */
+    READ_SEQUENCE,      /* likewise, but the number of scalars comes first; NONE: skips them */
     READ_TEXT,          /* the number of bytes with the final NUL, then the bytes; into `slot` without the NUL, or NONE */
     READ_EACH,          /* repeats the next steps, up to its READ_AGAIN, `count` times. `slot`: a list in cells that gets the
                            place where each element begins, or NONE */
@@ -255,7 +254,7 @@ enum read_kind {
     READ_TEXTS /* as READ_TEXT, but adds the text to the list in cells in `slot`, which is never NONE */
 };
 
-/* A step through a message in CDR. */
+/* A step in reading a CDR message. */
 struct read_operation {
     uint8_t kind; /* enum read_kind */
     uint8_t size;
@@ -265,7 +264,7 @@ struct read_operation {
     uint32_t count;
 };
 
-/* A message at one place: of protobuf the wanted fields, and all members of their oneofs, by ascending number; of CDR the
+/* A message at one place. In protobuf: its wanted fields and all members of their oneofs, by ascending number. In CDR: the
  * steps up to its last wanted field. */
 struct section {
     union {
@@ -273,13 +272,13 @@ struct section {
         const struct read_operation *steps;
     };
     uint32_t count;
-    uint16_t first_slot, slot_count; /* of an element of a list: its own, with those of messages in it */
+    uint16_t first_slot, slot_count; /* for a list element: its slots, including those of nested messages */
 };
 
-/* What routines have in common that read the same messages. */
+/* The common part of routines that read the same messages. */
 struct layout {
     const struct section *sections; /* the first one is the message */
-    const struct value *defaults; /* what slots hold where nothing was read */
+    const struct value *defaults; /* the values of slots before reading */
     const struct closed_enum *closed;
     const uint8_t *literals;
     uint32_t slot_count;

@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* Bytes of a message. A list that is written for each element of another one could fill the memory. */
+/* Bytes of a message. Writing a list for each element of another list could exhaust the memory. */
 enum { MOST_WRITTEN = 1 << 26 };
 
 struct output {
@@ -16,7 +16,7 @@ struct output {
     size_t size, capacity;
 };
 
-/* Make room for `size` more bytes. Return false for lack of memory, or if the message gets too long. */
+/* Make room for `size` more bytes. Return false if memory runs out or the message gets too long. */
 static inline bool has_room(struct output *output, size_t size) {
     if (size <= output->capacity - output->size) return true;
     if (size > MOST_WRITTEN - output->size) return false;

@@ -1,13 +1,12 @@
-/* `bandwidth`: a pacer sends to one endpoint, on average at most so many bytes of UDP payload per second.
+/* `bandwidth`: a pacer limits the average number of bytes of UDP payload per second to one endpoint.
  *
- * Datagrams that are no commands leave only when the budget for them is saved up, so they never overdraw it. At most 20 ms
- * of it are saved up, and beyond that the cost of the first datagrams that wait: the longest datagram passes the smallest
- * budget. A command leaves as long as no earlier command waits and the budget is overdrawn by 100 ms of it at most, or
- * 2048 bytes: it waits for commands only, and all others wait until the overdraft is paid.
+ * Datagrams other than commands are sent only when enough budget has accumulated, so they never overdraw it. At most 20 ms
+ * of the budget accumulate, or more if the first waiting datagrams need it, so the longest datagram passes the smallest
+ * budget. A command is sent if no earlier command waits and the budget is overdrawn by at most 100 ms of it, or 2048 bytes:
+ * commands wait only for commands, and all other datagrams wait until the overdraft is paid.
  *
- * Waiting datagrams leave by priority, then by age. When more wait than there is room for, the oldest of the lowest
- * priority is dropped as `queue_full`; what expires meanwhile is dropped as `stale`. A datagram is charged also if sending
- * it fails. */
+ * Waiting datagrams are sent by priority, then by age. If there is no room, the oldest one of the lowest priority is dropped
+ * as `queue_full`; datagrams that expire are dropped as `stale`. A datagram is charged even if sending it fails. */
 #ifndef PACE_H
 #define PACE_H
 
@@ -15,16 +14,16 @@
 
 #include "deliver.h"
 
-/* In which order they leave. */
+/* The order of sending. */
 enum priority { PRIORITY_COMMAND, PRIORITY_TELEMETRY, PRIORITY_BULK };
 enum { PRIORITIES = PRIORITY_BULK + 1 };
 
-/* How many bytes may wait: 1 s of the bandwidth, within these bounds; and how many datagrams: one for so many bytes. */
+/* Bounds of the bytes that may wait, which are 1 s of the bandwidth; and bytes per datagram that may wait. */
 enum { LEAST_ROOM = 1 << 16, MOST_ROOM = 1 << 24, BYTES_PER_WAITING = 16 };
 
 enum { LONGEST_SENT = 65507 }; /* by UDP over IPv4 */
 
-/* A target of a route. Of one whose messages wait, it may change to that of the next program. */
+/* A target of a route. While its messages wait, a reload may replace it with that of the next program. */
 struct route_target {
     const struct targets *to;
     const struct target *target;
@@ -32,12 +31,12 @@ struct route_target {
 
 struct pacer;
 
-/* Open a pacer, a timer, for a bandwidth in bytes per second. NULL for lack of memory. */
+/* Open a pacer, a timer, for a bandwidth in bytes per second. Returns NULL if memory runs out. */
 struct pacer *pacer_open(int64_t bandwidth);
 void pacer_close(struct pacer *pacer);
 
-/* Both with the lock of the group held. Send a datagram of up to LONGEST_SENT bytes now or later, or drop it; and send at
- * once all that waits for `of`, whatever the budget. */
+/* Both with the lock of the group held. Send a datagram of up to LONGEST_SENT bytes now or later, or drop it; and send all
+ * waiting datagrams of `of` at once, whatever the budget. */
 void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
                  int64_t expires, int64_t now);
 void pacer_release(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);

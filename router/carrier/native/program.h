@@ -1,6 +1,6 @@
-/* A program: immutable arrays that router/carrier/program.py makes of a compiled table.
+/* A program: immutable arrays that router/carrier/program.py makes from a compiled table.
  *
- * All arrays belong to the caller and must live until another program was adopted, the ring holds no message that refers to
+ * All arrays belong to the caller and must live until another program is adopted, the ring holds no message that points to
  * them, and the receive thread has made another turn since (`carrier_turns`): it may be dropping such a message. */
 #ifndef PROGRAM_H
 #define PROGRAM_H
@@ -18,7 +18,7 @@ struct route {
     uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
 };
 
-/* What a sender's messages of a payload case come to: the index of a route, or -1. */
+/* The route for messages of one sender with one payload case: its index, or -1. */
 struct choice {
     int32_t route;
     uint32_t received; /* counter */
@@ -32,7 +32,7 @@ struct payload_case {
     uint32_t unhandled; /* counter */
 };
 
-/* An endpoint as a listener recognises it. */
+/* An endpoint, as a listener identifies it. */
 struct peer {
     uint32_t address; /* host byte order */
     uint32_t port;    /* 0: any */
@@ -45,8 +45,8 @@ struct listener {
     int32_t fd;
     uint32_t id; /* in events, and in what is mirrored */
     uint32_t repairs;
-    uint32_t keeps_input; /* what it holds at the stop is left for the next process */
-    const struct peer *peers; /* by address; of one address, those with a port first */
+    uint32_t keeps_input; /* datagrams queued at the stop are left for the next process */
+    const struct peer *peers; /* by address; for one address, those with a port first */
     const struct choice *choices; /* `columns` for each row; the last one is for strangers */
     uint32_t peer_count, columns;
     uint32_t received, received_bytes, padded, rejected[REASONS]; /* counters */
@@ -63,7 +63,7 @@ struct program {
     const struct route *routes;
 };
 
-/* What changes with a program, beside it: done between two datagrams. What ends sends what it holds, then. */
+/* The changes that come with a program, made between two datagrams. Timers that end send what they hold. */
 struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
@@ -71,7 +71,7 @@ struct change {
     uint32_t replaced_count, reserved;
 };
 
-/* A message for topics, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
+/* A message for topics in the ring. The bytes of the envelope follow, as they are forwarded. */
 struct message_record {
     uint32_t size, generation;
     const struct targets *to;

@@ -1,5 +1,5 @@
-/* What is used of rcl. It has these types in C as well, but its headers need not be there where the library is made:
- * library.c compares them if they are, and router/ros/rcl.py tries them when the router starts. */
+/* The types and functions of rcl that the library uses, declared here because rcl's headers may be missing at the build:
+ * library.c compares the two if they exist, and router/ros/rcl.py checks them when the router starts. */
 #ifndef RCL_TYPES_H
 #define RCL_TYPES_H
 
@@ -8,7 +8,7 @@
 #include <stdint.h>
 #include <stdlib.h>
 
-enum { TAKE_FAILED = 401 }; /* RCL_RET_SUBSCRIPTION_TAKE_FAILED: there is no message */
+enum { TAKE_FAILED = 401 }; /* RCL_RET_SUBSCRIPTION_TAKE_FAILED: no message */
 
 /* rcutils_allocator_t */
 struct allocator {
@@ -19,7 +19,7 @@ struct allocator {
     void *state;
 };
 
-/* rcutils_uint8_array_t. Taking makes the buffer larger where that is necessary, and never smaller. */
+/* rcutils_uint8_array_t. Taking enlarges the buffer if necessary, and never shrinks it. */
 struct serialized_message {
     uint8_t *buffer;
     size_t length, capacity;
@@ -29,12 +29,12 @@ struct serialized_message {
 enum { GID_SIZE = 16 };
 #define NO_NUMBER UINT64_MAX /* RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED */
 
-/* rmw_message_info_t begins like this. Times of the wall clock, 0 where the middleware does not know. */
+/* The beginning of rmw_message_info_t. Times of the wall clock, 0 if unknown to the middleware. */
 struct message_info {
     int64_t source_timestamp, received_timestamp;
     uint64_t publication_sequence_number, reception_sequence_number;
     const char *implementation;
-    uint8_t publisher[GID_SIZE]; /* rmw_gid_t has these two */
+    uint8_t publisher[GID_SIZE]; /* this and the next one are rmw_gid_t */
     uint8_t rest[200];
 };
 
@@ -46,14 +46,14 @@ struct error_text {
 /* rcl_take_serialized_message: fills a serialized message and its info. Returns 0 if there was one. */
 typedef int take_function(const void *subscription, void *message, void *info, void *allocation);
 
-/* rcl_publish_serialized_message. Returns 0 if it has published. */
+/* rcl_publish_serialized_message. Returns 0 on success. */
 typedef int publish_function(const void *publisher, const void *message, void *allocation);
 
-/* rcutils_get_error_string and rcutils_reset_error: what went wrong in the calling thread. */
+/* rcutils_get_error_string and rcutils_reset_error: the last error of the calling thread. */
 typedef struct error_text error_function(void);
 typedef void reset_function(void);
 
-/* Whether the library was made beside headers of rcl that have something else. */
+/* Whether the library was built with headers of rcl that differ. */
 bool rcl_types_differ(void);
 
 static inline void *allocate(size_t size, void *state) {

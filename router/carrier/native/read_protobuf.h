@@ -1,7 +1,7 @@
 /* Reads the wanted fields of a protobuf message into slots, as the protobuf library would parse them: the last of several
  * values counts, messages that come in parts are merged, and a member of a oneof clears the others.
  *
- * The carrier has checked the payload before (envelope.h); what is not well formed all the same is refused. */
+ * The carrier has already checked the payload (envelope.h); a malformed one is refused nevertheless. */
 #ifndef READ_PROTOBUF_H
 #define READ_PROTOBUF_H
 
@@ -11,12 +11,12 @@
 
 #include "machine.h"
 
-enum { MOST_SECTIONS_DEEP = 32 }; /* messages in messages */
+enum { MOST_SECTIONS_DEEP = 32 }; /* depth of nested messages */
 
-/* Read a message into the slots of a section, which have their defaults. */
+/* Read a message into the slots of a section, which hold their defaults. */
 bool read_protobuf(struct machine *machine, uint16_t section, const uint8_t *message, size_t size);
 
-/* The same for a message that comes in pieces: fields of the same number, the first one at `data`, and perhaps others
+/* Likewise for a message in pieces: fields with the same number, the first one at `data`, perhaps with other fields
  * between them. */
 bool read_protobuf_pieces(struct machine *machine, uint16_t section, const uint8_t *data, size_t size);
 

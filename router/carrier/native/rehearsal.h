@@ -1,8 +1,8 @@
-/* The stage for rehearsal: a program without threads, sockets, middleware and a clock of its own. Messages are handed in,
- * and the clock is told what time it is; what became of them is written down, in order. It runs the functions that the
- * threads of a router run, each of them at once.
+/* The stage for rehearsal executes a program without threads, sockets or middleware, on a simulated clock. The caller passes
+ * messages and sets the clock; the outcome is recorded, in order. The stage runs the functions of a router's threads
+ * synchronously.
  *
- * Every topic is wanted, and the network and the middleware take everything. */
+ * Every topic has subscribers, and the network and the middleware accept everything. */
 #ifndef REHEARSAL_H
 #define REHEARSAL_H
 
@@ -12,10 +12,10 @@
 #include "program.h"
 #include "route_ros.h"
 
-/* What was written down: events (events.h), and records of these kinds. Each begins with `size` and `kind`. */
+/* Records besides events (events.h). Each begins with `size` and `kind`. */
 enum record_kind { RECORD_TIME = 32, RECORD_COUNTED, RECORD_SENT, RECORD_BRAKED, RECORD_PUBLISHED };
 
-/* What follows was at this time; before the first one, at that of the opening. */
+/* The time of the following records; before the first one, they are of the time of opening. */
 struct time_record {
     uint32_t size, kind;
     int64_t at; /* boot clock */
@@ -27,7 +27,7 @@ struct counted_record {
     uint32_t counter, reserved;
 };
 
-/* What left, by a target or by a deadman; the bytes follow. It is counted afterwards. */
+/* A message sent by a target or a deadman; the bytes follow. Its counter follows. */
 struct left_record {
     uint32_t size, kind;
     uint32_t target, length; /* `target`: as in events */
@@ -35,39 +35,39 @@ struct left_record {
 
 struct rehearsal;
 
-/* Open a stage that counts in `counters`, at this time of the boot clock. NULL for lack of memory or descriptors. */
+/* Open a stage that counts in `counters`, at this boot-clock time. Returns NULL if memory or descriptors run out. */
 struct rehearsal *rehearsal_open(counter *counters, int64_t now);
 void rehearsal_close(struct rehearsal *rehearsal); /* when it has no timer left */
 
 /* The timers of destinations: deadmen of its programs are opened there. */
 struct timers *rehearsal_timers(struct rehearsal *rehearsal);
 
-/* Go on with another program, as at a reload, or with the first one. `published` is what changes for the timers of topics.
- * All belongs to the caller. */
+/* Switch to another program, as at a reload, or to the first one. `published` are the changes to the timers of topics.
+ * Everything belongs to the caller. */
 void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct timer_change *published,
                      const struct ros_topic *topics);
 
-/* Receive a datagram of a listener, or a message of a topic from ROS, by their indexes in the program. A datagram has
- * `arrived_at`, and a message `sent_at` by the wall clock. */
+/* Receive a datagram on a listener, or a message from ROS on a topic, by index in the program. `arrived_at` and `sent_at`
+ * are wall-clock times. */
 void rehearsal_datagram(struct rehearsal *rehearsal, uint32_t listener, uint32_t address, uint32_t port, const void *data,
                         size_t size, int64_t arrived_at);
 void rehearsal_message(struct rehearsal *rehearsal, uint32_t topic, const void *data, size_t size, int64_t sent_at);
 
-/* Let time pass, and serve what is due until then. It never goes back. */
+/* Advance the clock to that time, and serve timers that become due. Never goes back. */
 void rehearsal_advance(struct rehearsal *rehearsal, int64_t to);
 
-/* Set the wall clock, to so many ns ahead of the boot clock: 0 at first. */
+/* Set the wall clock to `ahead` ns ahead of the boot clock; 0 at first. */
 void rehearsal_set_clock(struct rehearsal *rehearsal, int64_t ahead);
 
-/* Stop as the router does: what is held leaves, and armed deadmen send last. */
+/* Stop as the router does: send what is held back, then have armed deadmen send. */
 void rehearsal_end(struct rehearsal *rehearsal);
 
-/* Return the records since the last call, valid until the next call of any function, and their size in bytes; NULL for
- * lack of memory. */
+/* Return the records since the last call, valid until the next call of any function, and their size in bytes; NULL if
+ * memory runs out. */
 const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size);
 
-/* Evaluate a condition on a payload, as `when` of a route is evaluated. `source` is the name of the sender. Return EVALUATED,
- * an enum loss if it has no value for this payload or the payload is malformed, or LOSSES for lack of memory. */
+/* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender. Return EVALUATED, an enum
+ * loss if it has no value for this payload or the payload is malformed, or LOSSES if memory runs out. */
 int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
                     int64_t received_at, const void *payload, size_t size, bool *holds);
 

@@ -1,7 +1,7 @@
-/* What a received datagram comes to: it is routed, sent to the destinations of its route, and handed over to the thread
- * that serves the route's topics; there it comes out of a ring again.
+/* Routes a received datagram, sends it to the destinations of its route, and passes it to the thread that serves the route's
+ * topics, through a ring.
  *
- * Sockets, threads and clocks are the caller's: carrier.c, publish.c, and rehearsal.c, which has none. */
+ * The callers provide sockets, threads and clocks: carrier.c, publish.c, and rehearsal.c, which simulates them. */
 #ifndef ROUTE_H
 #define ROUTE_H
 
@@ -14,43 +14,43 @@
 #include "envelope.h"
 #include "freshness.h"
 
-/* What a thread needs that routes datagrams. */
+/* The environment of a thread that routes datagrams. */
 struct routing {
-    struct stage stage; /* first: what it calls is given this */
+    struct stage stage; /* first: its functions get a pointer to it */
     const struct program *program;
     struct freshness freshness;
-    struct ring *published; /* gets messages for topics */
-    /* A datagram, and the record that is made of it. Last, as they are large. */
+    struct ring *published; /* messages for topics */
+    /* A datagram, and its record for the ring. Last, as they are large. */
     _Alignas(8) uint8_t datagram[MAX_DATAGRAM + 8];
     _Alignas(8) uint8_t record[MAX_DATAGRAM + 256];
 };
 
-/* A datagram that was received. */
+/* A received datagram. */
 struct received {
-    /* By the caller: */
+    /* Set by the caller: */
     const struct listener *listener;
-    size_t length;          /* of the datagram; what is longer than MAX_DATAGRAM + 1 bytes was cut */
+    size_t length;          /* of the datagram, which is cut to MAX_DATAGRAM + 1 bytes */
     uint32_t address, port; /* of the sender */
-    int64_t arrived_at;     /* wall clock, when the kernel got it; 0 if that is not known */
+    int64_t arrived_at;     /* wall clock, arrival in the kernel; 0 if unknown */
     int64_t received_at;    /* wall clock */
     int64_t now;            /* boot clock */
-    /* By `route_datagram`: */
+    /* Set by `route_datagram`: */
     const struct peer *peer; /* NULL for a stranger */
     uint32_t column;
-    const struct route *route; /* NULL if none takes it */
+    const struct route *route; /* NULL if no route matches */
     struct born born;
     struct envelope envelope;
 };
 
 enum { ROUTED = -1 };
 
-/* Route and deliver the datagram in `routing->datagram`. Return ROUTED, or the reason why no route takes it. */
+/* Route and deliver the datagram in `routing->datagram`. Return ROUTED, or the reason for rejecting it. */
 int route_datagram(struct routing *routing, struct received *received);
 
-/* Adopt another program between two datagrams: deadmen pass from the earlier one to it, or end. */
+/* Adopt another program between two datagrams: deadmen of the earlier one are passed on, or end. */
 void routing_adopt(struct routing *routing, const struct change *change);
 
-/* Deliver a message that `route_datagram` has put into the ring. Return false if the thread was abandoned. */
+/* Deliver a message that `route_datagram` has put into the ring. Return false if the thread has been abandoned. */
 bool route_to_topics(struct stage *stage, const struct message_record *record);
 
 #endif

@@ -1,6 +1,6 @@
-/* What a message from ROS comes to: the routes of its topic deliver it, or each element of one of its lists.
+/* Routes a message from ROS: each route of its topic delivers it, or each element of one of its lists.
  *
- * Threads, middleware and clocks are the caller's: from_ros.c, and rehearsal.c, which has none. */
+ * The callers provide threads, middleware and clocks: from_ros.c, and rehearsal.c, which simulates them. */
 #ifndef ROUTE_ROS_H
 #define ROUTE_ROS_H
 
@@ -12,19 +12,19 @@
 #include "freshness.h"
 #include "rcl_types.h"
 
-/* ---- what a table says ---- */
+/* ---- settings of the table ---- */
 
-/* `for_each`: each element of a list is served as a message. */
+/* `for_each`: each element of a list is handled like a message. */
 struct for_each {
     struct routine list;   /* leaves the list on the stack; empty without `for_each` */
-    uint16_t stored;    /* how, an enum scalar */
-    uint16_t section;      /* into which an element is read that is a message, or NONE */
-    uint16_t item;      /* slot of any other element */
-    uint16_t index, count; /* slots, NONE if nothing uses them */
+    uint16_t stored;    /* how the list is stored: enum scalar */
+    uint16_t section;      /* for an element that is a message, or NONE */
+    uint16_t item;      /* slot for any other element */
+    uint16_t index, count; /* slots, or NONE if unused */
     uint16_t reserved[3];
 };
 
-/* A route, as one of its topics feeds it. */
+/* A route, for messages from one of its topics. */
 struct ros_route {
     struct targets targets;
     struct for_each for_each;
@@ -37,48 +37,48 @@ struct ros_topic {
     const struct ros_route *routes;
     uint32_t route_count;
     uint32_t capacity; /* messages that the subscription holds */
-    int32_t eventfd;   /* the middleware adds to it when messages come; nobody reads it */
+    int32_t eventfd;   /* the middleware adds to it when messages arrive; it is never read */
     uint32_t reserved;
 };
 
-/* ---- what is served ---- */
+/* ---- messages ---- */
 
 enum { MOST_PUBLISHERS = 64 };
 
-/* A publisher numbers its messages, and sends them in order. Of its last one: the number, and the oldest readings of its
- * stamps. */
+/* A publisher, which numbers its messages and sends them in order. `number` is that of the last message, `sent` and
+ * `stamped` are the oldest readings of its stamps. */
 struct ros_publisher {
     uint8_t gid[GID_SIZE];
-    uint32_t topic;        /* as in events: a table may call a topic by two names, and has a subscription for each */
-    uint64_t number;       /* 0 if it is not known, */
-    int64_t sent, stamped; /* INT64_MIN if these are not */
+    uint32_t topic;        /* as in events: a table may use two names for a topic, with a subscription each */
+    uint64_t number;       /* 0 if unknown */
+    int64_t sent, stamped; /* INT64_MIN if unknown */
 };
 
-/* What a thread needs that routes messages from ROS. */
+/* The environment of a thread that routes messages from ROS. */
 struct ros_routing {
-    struct stage stage; /* first: what it calls is given this */
+    struct stage stage; /* first: its functions get a pointer to it */
     struct freshness freshness;
     struct ros_publisher publishers[MOST_PUBLISHERS];
 };
 
-/* A message that was taken. */
+/* A taken message. */
 struct taken {
     const uint8_t *data;
     size_t size;
-    int64_t published_at, arrived_at; /* wall clock of the sender, and of this computer; 0 if it is not known */
+    int64_t published_at, arrived_at; /* wall clock of the sender, and of this computer; 0 if unknown */
     int64_t received_at;              /* wall clock */
     int64_t now;                      /* boot clock */
     struct ros_publisher *publisher;
 };
 
-/* Return what is known of a publisher on a topic. One with the same hash is forgotten. */
+/* Return the state of a publisher on a topic. It replaces another publisher with the same hash. */
 struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid, uint32_t topic);
 
-/* Whether a message comes after the publisher's last one, as far as the middleware numbers them. Where one subscription
- * takes over from another, both receive what comes meanwhile. */
+/* Whether a message is newer than the publisher's last one, if the middleware numbers messages. When one subscription
+ * replaces another, both receive the messages in between. */
 bool is_new(struct ros_publisher *publisher, uint64_t number);
 
-/* Go on from what is known of a publisher elsewhere. */
+/* Copy the state of a publisher from another thread. */
 void follow_publisher(struct ros_routing *routing, const struct ros_publisher *known);
 
 /* Deliver a message of a topic. */

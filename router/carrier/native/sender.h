@@ -1,8 +1,8 @@
 /* A non-blocking UDP socket for one destination. Any thread may send.
  *
- * It is not connected, so that what comes back reaches a listener. It is bound to the address and port of one, or to a
- * port that the kernel has chosen. ICMP errors about what it has sent reach the listener; without one, or if they come by
- * another interface than the listener's, the socket itself. */
+ * It is not connected, so that replies reach a listener. It is bound to the address and port of that listener, or to a port
+ * chosen by the kernel. ICMP errors about its datagrams reach the listener, or the socket itself if there is no listener or
+ * they arrive on another interface than the listener's. */
 #ifndef SENDER_H
 #define SENDER_H
 
@@ -13,39 +13,39 @@
 #include <stdint.h>
 
 struct sender {
-    struct sender *next; /* in the list of all */
+    struct sender *next; /* in the list of all senders */
     struct sockaddr_in address;
     _Atomic int fd;       /* -1 after `sender_end` */
     _Atomic int listener; /* the socket of the listener from whose port it sends; -1 for none */
-    _Atomic int refused;  /* errno of an earlier datagram, not returned yet; 0 for none */
+    _Atomic int refused;  /* errno about an earlier datagram, not returned yet; 0 for none */
 };
 
-/* Return a sender to `address` (host byte order) and `port`, or NULL for lack of memory. The caller closes the sockets,
- * after `sender_end`: sending fails with EBADF from then on. */
+/* Open a sender to `address` (host byte order) and `port`. Returns NULL if memory runs out. The caller closes the sockets
+ * after `sender_end`, from which on sending fails with EBADF. */
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
-void sender_close(struct sender *sender); /* when nothing refers to it any more */
+void sender_close(struct sender *sender); /* when nothing uses it */
 
-/* Send by another socket from now on. The caller closes the earlier one when no thread uses it any more. */
+/* Send through another socket from now on. The caller closes the earlier one when no thread uses it. */
 void sender_move(struct sender *sender, int fd, int listener);
 
 /* Send a datagram. Return 0, or an errno: then exactly one datagram is lost.
  *
- * An error may be about an earlier datagram, which was counted as sent and which its receiver has refused: nobody listens
- * there (ECONNREFUSED), or its firewall says no. Then this datagram was sent, so the counters balance. */
+ * An error may be about an earlier datagram, which was counted as sent and then refused: no process listens there
+ * (ECONNREFUSED), or a firewall rejects it. Then this datagram was sent, so the counters balance. */
 int sender_send(struct sender *sender, const void *data, size_t size);
 
-/* The two steps of `sender_send`: send the datagram and return an errno of its own, then return that of an earlier one. */
+/* The two steps of `sender_send`: send the datagram and return its own errno, then return that of an earlier one. */
 int sender_send_only(struct sender *sender, const void *data, size_t size);
 int sender_take_refused(struct sender *sender);
 
-/* As `sender_send`, for deadmen. A send buffer that commands have filled does not stop the datagram. Errors of this datagram
- * that are known at once are returned as well: no process listens on a local port. With `sender_send`, a later datagram
- * would get that error. One thread at a time may send so. */
+/* As `sender_send`, for deadmen. It sends even if commands have filled the send buffer. It also returns immediate errors of
+ * this datagram: no process listens on a local port. `sender_send` would return these for a later datagram. Only one thread
+ * at a time may call it. */
 int sender_send_checked(struct sender *sender, const void *data, size_t size);
 
-/* Read the ICMP errors that a listener has, for the senders whose datagrams they are about. Return whether there
- * were any. A flood of them is cut short. */
+/* Read the ICMP errors of a listener, and assign them to the senders of the datagrams. Return whether there were any. Stops
+ * early in a flood. */
 bool sender_note_errors(int listener);
 
 #endif

@@ -1,5 +1,5 @@
-/* Text that programs make. It stays in the machine's text buffer until the program ends, or the turn of the loop that
- * made it. Functions return false if the buffer is full, or the message takes too much work. */
+/* Computed text. It stays in the machine's text buffer until the routine, or the loop iteration that made it, ends.
+ * Functions return false if the buffer is full or the message takes too much work. */
 #ifndef TEXTS_H
 #define TEXTS_H
 
@@ -16,7 +16,7 @@ static inline struct value text_of(const void *bytes, size_t size) {
     return (struct value){.bytes = bytes, .size = (uint32_t)size};
 }
 
-/* Take `size` bytes of the buffer. Return NULL if that is refused. */
+/* Reserve `size` bytes of the buffer. Return NULL if that is refused. */
 static inline uint8_t *take_text(struct machine *machine, size_t size) {
     if (size > MOST_TEXT - machine->text_size || !spend(machine, size / BYTES_PER_TURN)) return NULL;
     uint8_t *taken = machine->text + machine->text_size;
@@ -46,8 +46,8 @@ static inline bool to_decimal(struct machine *machine, struct value *number, boo
     return join(machine, number, &text);
 }
 
-/* printf of glibc rounds correctly, and allocates nothing for a double. But its decimal point is that of the process's
- * locale: the digits on both sides are moved together, with a point between them. */
+/* printf of glibc rounds correctly, and allocates nothing for a double. But it uses the decimal point of the process's
+ * locale, which is replaced here. */
 static inline bool to_digits(struct machine *machine, struct value *number, uint16_t decimals) {
     char printed[384]; /* -, 309 digits, a point of at most 16 bytes, 17 decimals */
     if (!isfinite(number->real)) {
@@ -79,7 +79,7 @@ static inline void strip(struct value *text) {
     for (; text->size && is_padding(*text->bytes); text->bytes++) text->size--;
 }
 
-/* A list of integers as bytes. Notes what it refuses. */
+/* Convert a list of integers to bytes. Records a refusal. */
 static inline bool to_octets(struct machine *machine, struct value *list, enum scalar stored) {
     if (stored == SCALAR_UINT8) return true;
     struct value octets = text_of(take_text(machine, list->size), list->size);

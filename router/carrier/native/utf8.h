@@ -1,4 +1,4 @@
-/* UTF-8 as RFC 3629 has it, which is what Python's strict decoder and protobuf take. */
+/* UTF-8 as in RFC 3629, which Python's strict decoder and protobuf accept. */
 #ifndef UTF8_H
 #define UTF8_H
 
@@ -8,8 +8,8 @@
 
 static inline bool is_continuation(uint8_t byte) { return (byte & 0xC0) == 0x80; }
 
-/* The size in bytes of the character at `at`, whose first byte is not ASCII, or 0 if it is none: too long for its code
- * point, a surrogate, or beyond U+10FFFF. The second byte's lowest and highest values say so. */
+/* The size in bytes of the character at `at`, whose first byte is not ASCII, or 0 if it is invalid: overlong, a surrogate, or
+ * beyond U+10FFFF, which the range of the second byte excludes. */
 static inline size_t utf8_size(const uint8_t *at, size_t size) {
     uint8_t first = at[0], low = 0x80, high = 0xBF;
     size_t needed = first < 0xC2 ? 0 : first < 0xE0 ? 2 : first < 0xF0 ? 3 : first < 0xF5 ? 4 : 0;

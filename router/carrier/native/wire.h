@@ -21,15 +21,15 @@ enum {
     LONGEST_SIZE = 5
 };
 
-/* What is left to read. */
+/* The remaining bytes to read. */
 struct bytes {
     const uint8_t *at, *end;
 };
 
 static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
 
-/* Read a varint of at most `longest` bytes. It may be longer than it needs to be; bits beyond 64 are dropped. Of one that
- * is cut or too long, `value` is what was read. */
+/* Read a varint of at most `longest` bytes. It may be longer than necessary; bits beyond 64 are dropped. If it is cut or too
+ * long, `value` is the part that was read. */
 static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *value) {
     uint64_t read = 0;
     for (unsigned index = 0; index < longest && bytes->at < bytes->end; index++) {
@@ -78,7 +78,7 @@ static inline bool skip_scalar(struct bytes *bytes, uint32_t wire_type) {
     }
 }
 
-/* Read the value of a field of a well-formed message: `value` is all of it, of a group with its end. */
+/* Read the value of a field of a well-formed message. The `value` of a group includes its end. */
 static inline bool read_value(struct bytes *bytes, uint32_t wire_type, struct bytes *value) {
     if (wire_type == LEN) return read_len(bytes, value);
     value->at = bytes->at;
@@ -102,8 +102,8 @@ static inline bool read_value(struct bytes *bytes, uint32_t wire_type, struct by
     return true;
 }
 
-/* Read the next piece of a message that comes in several: fields with one tag, which is 0 in front of the first piece, and
- * perhaps other fields between them. */
+/* Read the next piece of a message in several pieces: fields with one tag, perhaps with other fields between them. `tag` is
+ * 0 before the first piece. */
 static inline bool read_piece(struct bytes *bytes, uint32_t *tag, struct bytes *piece) {
     uint32_t found;
     do {

@@ -1,6 +1,5 @@
-/* Writes a serialized ROS message in plain CDR (read_cdr.h describes the format). Functions return false for lack of
- * memory, or for a value that CDR cannot hold. They are inline because the machine calls them for each field
- * (evaluate.c). */
+/* Writes a serialized ROS message in plain CDR (read_cdr.h describes the format). Functions return false if memory runs out
+ * or CDR cannot hold a value. They are inline because the machine calls them for each field (evaluate.c). */
 #ifndef WRITE_CDR_H
 #define WRITE_CDR_H
 
@@ -15,9 +14,9 @@
 
 enum { CDR_HEADER = 4, WIDEST = 8 /* bytes of a scalar */ };
 
-/* Fill up to a multiple of `alignment`, which counts from behind the header. There is room for WIDEST bytes. */
+/* Pad to a multiple of `alignment`, relative to the end of the header. There is room for WIDEST bytes. */
 static inline void align(struct output *output, size_t alignment) {
-    memset(output->data + output->size, 0, WIDEST); /* of a size that is known, it is one store */
+    memset(output->data + output->size, 0, WIDEST); /* one store instruction, as the size is constant */
     output->size += (CDR_HEADER - output->size) & (alignment - 1);
 }
 
@@ -29,7 +28,7 @@ static inline bool put(struct output *output, const void *bytes, size_t size, si
     return true;
 }
 
-/* Append the lowest `size` bytes of an integer. All its bytes are stored; those behind are overwritten by what comes. */
+/* Append the lowest `size` bytes of an integer. All bytes are stored; the next value overwrites the others. */
 static inline bool put_integer(struct output *output, uint64_t bits, uint16_t size) {
     if (!has_room(output, WIDEST + sizeof bits)) return false;
     align(output, size);

@@ -1,6 +1,6 @@
 /* Writes a protobuf message from its first byte to its last. The length of an inner message is known only at its end: one
- * byte is reserved for it, and the inner message is moved if its length needs more. Functions return false for lack of
- * memory. They are inline because the machine calls them for each field (evaluate.c). */
+ * byte is reserved for it, and the inner message is moved if its length needs more. Functions return false if memory
+ * runs out. They are inline because the machine calls them for each field (evaluate.c). */
 #ifndef WRITE_PROTOBUF_H
 #define WRITE_PROTOBUF_H
 
@@ -14,7 +14,7 @@
 #include "output.h"
 #include "wire.h"
 
-/* Write a varint where there is room for LONGEST_VARINT bytes. Returns its end. */
+/* Write a varint, for which there is room of LONGEST_VARINT bytes. Returns its end. */
 static inline uint8_t *store_varint(uint8_t *to, uint64_t value) {
     for (; value > 0x7F; value >>= 7) *to++ = (uint8_t)(value | 0x80);
     *to++ = (uint8_t)value;
@@ -23,10 +23,10 @@ static inline uint8_t *store_varint(uint8_t *to, uint64_t value) {
 
 static inline uint64_t to_zigzag(uint64_t bits) { return bits << 1 ^ (bits >> 63 ? UINT64_MAX : 0); }
 
-/* A field begins with its tag. Those without one are elements of packed ones. */
+/* Write the tag of a field. Elements of packed fields have none. */
 static inline uint8_t *store_tag(uint8_t *to, uint32_t tag) { return tag ? store_varint(to, tag) : to; }
 
-/* A field that has no presence is left out if it is zero or empty: `is_kept` is false for these. */
+/* A field without presence is omitted if it is zero or empty: `is_kept` is false. */
 static inline bool write_varint(struct output *output, uint32_t tag, uint64_t value, bool is_kept) {
     if (!value && !is_kept) return true;
     if (!has_room(output, LONGEST_TAG + LONGEST_VARINT)) return false;
@@ -53,9 +53,9 @@ static inline bool write_bytes(struct output *output, uint32_t tag, const struct
     return true;
 }
 
-/* An inner message or packed elements, while they are written. */
+/* An inner message or packed elements being written. */
 struct opened {
-    size_t tag, content; /* where these begin in the output */
+    size_t tag, content; /* their beginnings in the output */
     bool is_kept;        /* written even if it is empty */
 };
 
@@ -74,7 +74,7 @@ static inline bool write_close(struct output *output, const struct opened *opene
         return true;
     }
     uint8_t length[LONGEST_VARINT];
-    size_t more = (size_t)(store_varint(length, size) - length) - 1; /* bytes of the length than were reserved */
+    size_t more = (size_t)(store_varint(length, size) - length) - 1; /* bytes of the length beyond the reserved one */
     if (!has_room(output, more)) return false;
     uint8_t *content = output->data + opened->content;
     if (more) memmove(content + more, content, size);
