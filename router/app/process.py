@@ -58,7 +58,7 @@ def reloading() -> Iterator[None]:
 
 
 def notify(*lines: str) -> None:
-    """Send lines such as `READY=1` to the service manager, if there is one."""
+    """Send lines, for example `READY=1`, to the service manager, if there is one."""
     if (notifying := _notify_socket()) is None:
         return
     with notifying:

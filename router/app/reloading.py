@@ -179,7 +179,7 @@ def _node(node: NodeSettings) -> object:
 
 
 def _changes(before: Program, after: Program) -> str:
-    """Describe a reload in one line, such as `route imu_info changed, endpoint arm_board added`."""
+    """Describe a reload in one line, for example `route imu_info changed, endpoint arm_board added`."""
     now, then = before.table, after.table
     found = [
         *_differing("listener", now.listeners, then.listeners),

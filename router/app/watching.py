@@ -101,7 +101,7 @@ class InterfaceWatcher:
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """The table, what it extends, configurations of Zenoh, the lock, and all files beside its protos."""
+    """The table, the tables that it extends, Zenoh configurations, the lock file, and all files beside its protos."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
     protos: Iterable[Path] = ()

@@ -115,11 +115,11 @@ def _age(since: str, refusal: NativeRefusal, _: bytes) -> str:
     if since == _BY_STAMP and age > _YEAR:
         hint = ": is the publisher on simulated time?"
     elif since in {_BY_STAMP, _BY_SENDER} and age > _MINUTE:
-        hint = ": is the clock of the publisher right?"
-    return f"{since.format(_duration(age))}, and ttl is {_duration(ttl)}{hint}"
+        hint = ": is the publisher's clock right?"
+    return f"{since.format(_duration(age))}, but ttl is {_duration(ttl)}{hint}"
 
 
-_BY_STAMP, _BY_SENDER = "the stamp is {} old", "sent {} ago by the clock of the publisher"
+_BY_STAMP, _BY_SENDER = "the stamp is {} old", "sent {} ago by the publisher's clock"
 _SECOND = 1_000_000_000
 _MINUTE, _HOUR, _DAY, _YEAR = 60 * _SECOND, 3600 * _SECOND, 86_400 * _SECOND, 31_557_600 * _SECOND
 
@@ -136,7 +136,7 @@ def _always(words: str) -> Callable[[NativeRefusal, bytes], str]:
 
 
 _WORDS: Mapping[Refused, Callable[[NativeRefusal, bytes], str]] = {
-    Refused.MALFORMED: _always("it ends too early, or is of another type"),
+    Refused.MALFORMED: _always("it ends too early, or has another type"),
     Refused.INTEGER: _integer,
     Refused.OVERFLOW: _always("the result does not fit 64 bits"),
     Refused.DIVISION: _always("division by zero"),
@@ -144,19 +144,19 @@ _WORDS: Mapping[Refused, Callable[[NativeRefusal, bytes], str]] = {
     Refused.RESULT: _result,
     Refused.REAL: _no_integer,
     Refused.FLOAT32: lambda refusal, _: f"{_real(refusal)} does not fit float32",
-    Refused.SIZE: partial(_counted, "{first} byte{s}, and at most {second} fit"),
+    Refused.SIZE: partial(_counted, "{first} byte{s}, but at most {second} fit"),
     Refused.UTF8: _no_utf8,
     Refused.NUL: _nul,
     Refused.NAME: _no_name,
     Refused.MEMBER: partial(_counted, "the enum has no value {first}"),
     Refused.ELEMENT: partial(_counted, "there is no element [{first}]: the list has {second}"),
-    Refused.COUNT: partial(_counted, "{first} element{s}, and it takes {second}"),
-    Refused.MOST: partial(_counted, "{first} element{s}, and it takes at most {second}"),
+    Refused.COUNT: partial(_counted, "{first} element{s}, but {second} are required"),
+    Refused.MOST: partial(_counted, "{first} element{s}, but at most {second} fit"),
     Refused.LENGTHS: partial(_counted, "lists side by side have {first} and {second} elements"),
-    Refused.WORK: _always("the lists are so long that it would take too much time"),
-    Refused.ROOM: _always("the lists, the text or the message made of it are too large"),
+    Refused.WORK: _always("the lists are too long to be processed in time"),
+    Refused.ROOM: _always("the lists, the text or the resulting message are too large"),
     Refused.ARRIVAL: partial(_age, "it arrived {} ago"),
     Refused.SENDING: partial(_age, _BY_SENDER),
     Refused.STAMP: partial(_age, _BY_STAMP),
-    Refused.WAITING: partial(_age, "{} old when it could leave"),
+    Refused.WAITING: partial(_age, "{} old when it could be sent"),
 }

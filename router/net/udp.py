@@ -150,7 +150,7 @@ def why_not_sent(error: OSError, address: Address) -> str:
         case errno.ENETUNREACH | errno.EHOSTUNREACH:
             return f"no route leads to {address.host}, or it does not answer: {ask}"
         case errno.EINVAL:
-            return f"the routes of this computer discard what is sent to {address.host}: {ask}"
+            return f"the routes of this computer discard datagrams to {address.host}: {ask}"
     return error.strerror or str(error)
 
 

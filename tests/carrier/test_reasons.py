@@ -78,7 +78,7 @@ TO_ROS: Mapping[str, tuple[str, str, dict[str, Any], str]] = {
     "element": ("std_msgs/msg/Int32", "{data: 'numbers[2]'}", {"numbers": [1, 2]},
                 "data: there is no element [2]: the list has 2"),
     "count": ("sensor_msgs/msg/Imu", "{orientation_covariance: reals}", {"reals": [0.0] * 8},
-              "orientation_covariance: 8 elements, and it takes 9"),
+              "orientation_covariance: 8 elements, but 9 are required"),
     "lengths": ("std_msgs/msg/Float64MultiArray", "{data: reals + numbers}", {"reals": [1.0], "numbers": [1, 2]},
                 "data: lists side by side have 1 and 2 elements"),
 }  # fmt: skip
@@ -110,7 +110,7 @@ FROM_ROS: Mapping[str, tuple[str, str, bytes, str]] = {
     "octets": ("std_msgs/msg/Float64MultiArray", "{data: round(data)}", pack("<4I2d", 0, 0, 2, 0, 1, 256),
                "data: 256 does not fit uint8"),
     "malformed": ("std_msgs/msg/Float64", "{real: data}", b"\5",
-                  "a malformed message: it ends too early, or is of another type"),
+                  "a malformed message: it ends too early, or has another type"),
 }  # fmt: skip
 
 
@@ -160,14 +160,14 @@ def test_a_stale_message_says_what_its_age_counts_from(tmp_path: Path) -> None:
             stage.datagram("exact", SENSOR_BOARD, GPS, START)
         stage.advance(START + SECOND)
 
-    clock = "the clock of the publisher"
+    clock = "the publisher's clock"
     reports = told(program(tmp_path, AGED), do=happen)
     assert [(each.place, each.reason, each.detail) for each in reports] == [
-        ("ph_info", "stale", "the stamp is 55 years old, and ttl is 500 ms: is the publisher on simulated time?"),
-        ("drive_motor", "stale", f"sent 1.5 s ago by {clock}, and ttl is 200 ms"),
-        ("drive_motor", "stale", f"sent 5 minutes ago by {clock}, and ttl is 200 ms: is {clock} right?"),
-        ("gps_info", "stale", "it arrived 301 ms ago, and ttl is 300 ms"),
-        ("gps_info", "stale", "500 ms old when it could leave, and ttl is 300 ms"),
+        ("ph_info", "stale", "the stamp is 55 years old, but ttl is 500 ms: is the publisher on simulated time?"),
+        ("drive_motor", "stale", f"sent 1.5 s ago by {clock}, but ttl is 200 ms"),
+        ("drive_motor", "stale", f"sent 5 minutes ago by {clock}, but ttl is 200 ms: is {clock} right?"),
+        ("gps_info", "stale", "it arrived 301 ms ago, but ttl is 300 ms"),
+        ("gps_info", "stale", "500 ms old when it could be sent, but ttl is 300 ms"),
     ]  # fmt: skip
 
 

@@ -55,7 +55,7 @@ static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *
     timer_set_due(stage->timers, &deferral->timer, deferral->limit.next_pass);
 }
 
-/* Deliver what is held, unless it has expired. */
+/* Deliver the held message, unless it has expired. */
 static void release(struct timers *timers, struct deferral *deferral, int64_t now) {
     if (!deferral->is_held) return;
     forget(timers, deferral);
@@ -89,7 +89,7 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     if (now > deferral->expires || limit_passes(&deferral->limit, now)) release(timers, deferral, now);
 }
 
-/* With another rate, what is held leaves now, and the limit begins anew. */
+/* If the rate has changed, send the held message now, and restart the limit. */
 static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
     struct deferral *deferral = (struct deferral *)timer;
     int64_t period = target->period;

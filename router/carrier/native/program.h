@@ -38,12 +38,12 @@ struct peer {
     uint32_t port;    /* 0: any */
     uint32_t column;  /* of the listener's choices */
     uint32_t last_seen; /* counter */
-    uint32_t id;        /* of the endpoint, in what is mirrored */
+    uint32_t id;        /* of the endpoint, in mirror records */
 };
 
 struct listener {
     int32_t fd;
-    uint32_t id; /* in events, and in what is mirrored */
+    uint32_t id; /* in events and mirror records */
     uint32_t repairs;
     uint32_t keeps_input; /* datagrams queued at the stop are left for the next process */
     const struct peer *peers; /* by address; for one address, those with a port first */

@@ -1,4 +1,4 @@
-/* Starts threads; has those that may be stuck in the middleware publish and end. */
+/* Starts threads, and stops threads that may be stuck in the middleware. */
 #ifndef THREADS_H
 #define THREADS_H
 
