@@ -41,7 +41,7 @@ static enum publication publish_written(struct stage *stage, const struct target
 
 /* ---- the thread ---- */
 
-/* How long to wait for messages, in ns: until the next timer is due, or for ever (-1). */
+/* How long to wait for messages, in ns: until the next timer is due, or forever (-1). */
 static int64_t patience_of(const struct publish_thread *thread) {
     int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return -1;

@@ -112,7 +112,7 @@ static size_t take_ready(struct ring *ring, void *records, size_t limit) {
     }
 }
 
-/* Sleep while `is_waited_for`, for up to `timeout` ns (-1: for ever). */
+/* Sleep while `is_waited_for`, for up to `timeout` ns (-1: forever). */
 static void sleep_until_woken(struct ring *ring, int64_t timeout) {
     struct timespec until = {timeout / 1000000000, timeout % 1000000000};
     syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAIT_PRIVATE, 1, timeout < 0 ? NULL : &until, NULL, 0);
