@@ -166,7 +166,7 @@ class Look:
 
     def _states(self) -> Iterator[Problem]:
         if self.standing > Kind.RECEIVE_STUCK.threshold:
-            yield self._problem(Kind.RECEIVE_STUCK, {}, f" for {age_text(self.standing)}")
+            yield self._problem(Kind.RECEIVE_STUCK, {}, f": no progress for {age_text(self.standing)}")
         if not self.now.total(Kind.RELOAD_FAILED.metric):
             yield self._problem(Kind.RELOAD_FAILED, {})
         for (name, mode), connections in self.now.counts(Kind.GATEWAY_DISCONNECTED.metric).items():
@@ -180,7 +180,7 @@ class Look:
         for name in sorted(silent - away, key=lambda name: (name not in held, name)):
             kind, more = Kind.ENDPOINT_NEVER_HEARD, ""
             if self._was_heard(name):
-                kind, more = Kind.ENDPOINT_SILENT, f" for {age_text(self.silence[name])}"
+                kind, more = Kind.ENDPOINT_SILENT, f": last heard {age_text(self.silence[name])} ago"
             routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
             problem = self._problem(kind, {"endpoint": name}, more, routes)
             if (sender := self._in_place_of(name)) is not None:

@@ -12,7 +12,7 @@ from router.cli.status import DEGRADED
 from router.observe.problems import Kind, Problem
 from tests.tools.answering import answering
 
-SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, " for 8 s", "Check power and cable.")
+SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, ": last heard 8 s ago", "Check power and cable.")
 HELD = Problem(Kind.DEADMAN_ACTIVE, {"route": "drive"}, routes=("drive",))
 HALTED = Problem(Kind.HALTED, {"route": "drive"}, " for 27 min", routes=("drive",))
 SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
@@ -27,12 +27,15 @@ SWITCHED_OFF = Problem(Kind.ENDPOINT_NEVER_HEARD, {"endpoint": "arm_board"})
         (
             [SILENT, HALTED],
             DEGRADED,
-            "degraded: arm_board is silent for 8 s; drive is halted: no commands for 27 min; 7 datagrams received",
+            (
+                "degraded: arm_board is silent: last heard 8 s ago; drive is halted: no commands for 27 min; "
+                "7 datagrams received"
+            ),
         ),
         (
             [SILENT, HELD],
             DEGRADED,
-            f"degraded: arm_board is silent for 8 s; {HELD.words}; 7 datagrams received",
+            f"degraded: arm_board is silent: last heard 8 s ago; {HELD.words}; 7 datagrams received",
         ),
     ],
 )

@@ -48,7 +48,7 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
     router.hear("sensor_board")
     told = reported(router, 3.1)
     assert told["endpoint/sensor_board"].level == told["route/imu_info"].level == Level.STALE
-    assert told["route/imu_info"].message == "sensor_board is silent for 3.1 s"
+    assert told["route/imu_info"].message == "sensor_board is silent: last heard 3.1 s ago"
     assert told["route/drive_diag"].level == Level.OK  # another board, with more patience
     router.hear("sensor_board")
     told = reported(router, 1)

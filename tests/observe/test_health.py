@@ -94,7 +94,7 @@ def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
     router.is_stuck = True
     router.look(0)
     assert router.told(2.5) == [
-        "the receive thread is stuck for 2.5 s",
+        "the receive thread is stuck: no progress for 2.5 s",
         "rover receives nothing: its address or network interface does not exist",
         "the kernel drops datagrams of rover, 2 in 2 s",
     ]
@@ -163,7 +163,7 @@ def test_an_endpoint_is_silent_after_its_own_time_and_with_it_the_routes_that_on
     router.hear("sensor_board")
     assert router.told(3) == []
     [problem] = router.look(0.1).problems
-    assert (problem.text, problem.kind.level) == ("sensor_board is silent for 3.1 s", Level.WARNING)
+    assert (problem.text, problem.kind.level) == ("sensor_board is silent: last heard 3.1 s ago", Level.WARNING)
     assert "imu_info" in problem.routes
     assert not {"manual_drive", "ph_info"} & set(problem.routes)  # of the basestation, also of the arm board
     assert "ping 192.168.0.30" in problem.remedy
@@ -248,7 +248,10 @@ def test_who_is_silent_while_a_deadman_acts_comes_before_others_that_are(router:
     router.hear("basestation")
     router.count("deadman_active", "manual_drive", to=1)
     first, second, *_ = router.told(10)
-    assert (first, second) == ("basestation is silent for 10 s", "sensor_board is silent for 10 s")
+    assert (first, second) == (
+        "basestation is silent: last heard 10 s ago",
+        "sensor_board is silent: last heard 10 s ago",
+    )
 
 
 def parked(router: Counting, *routes: str) -> None:
@@ -295,7 +298,7 @@ def test_who_drives_may_be_silent_while_nobody_does_and_a_board_may_not(router: 
     [halted] = router.look(1).problems
     assert halted.text == "manual_drive is halted: no commands for 61 s, and basestation is silent"
     [first, *_, last] = router.told(4)
-    assert first == "driving_board is silent for 6.0 s"
+    assert first == "driving_board is silent: last heard 6.0 s ago"
     assert last.startswith("manual_drive is halted")
 
 
@@ -319,7 +322,7 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
     router.look(1)
     router.shift = shift
     assert router.told(1) == []
-    assert router.told(1.5) == ["sensor_board is silent for 3.5 s"]
+    assert router.told(1.5) == ["sensor_board is silent: last heard 3.5 s ago"]
     router.hear("sensor_board")
     router.look(1)
     assert router.watch.look(router.now, router.wall).silence["sensor_board"] == 1.0

@@ -273,7 +273,7 @@ def test_a_silent_operator_is_said_before_the_deadmen_that_act(running: FakeRunn
     running.count("endpoint_last_seen_timestamp_seconds", "basestation", to=time.time_ns() - 14 * 10**9)
     for route in ("manual_drive", "manual_arm"):
         running.count("deadman_active", route, to=1)
-    page.until("/^basestation is silent for 1[4-9] s$/.test(document.querySelector('#what').textContent)")
+    page.until("/^basestation is silent: last heard 1[4-9] s ago$/.test(document.querySelector('#what').textContent)")
     assert page.text("#todo").startswith("Check power, cable or radio, and ping 127.0.0.10;")
     assert page.text("#spoken") == "warning: basestation is silent"
     page.until("document.querySelectorAll('#others li').length === 3")

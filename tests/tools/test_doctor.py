@@ -390,13 +390,17 @@ def test_a_healthy_router_is_fine(table: Path) -> None:
 
 
 def test_what_is_wrong_with_a_running_router_is_told_with_its_remedy_and_page(table: Path) -> None:
-    stuck = Problem(Kind.RECEIVE_STUCK, {}, " for 7 s", "Restart it.")
-    silent = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, " for 9 s", "Check its cable.")
+    stuck = Problem(Kind.RECEIVE_STUCK, {}, ": no progress for 7 s", "Restart it.")
+    silent = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, ": last heard 9 s ago", "Check its cable.")
     with serving(compiled(table), stuck, silent):
         first, second = told(table)
     page = "docs/troubleshooting/alerts.md"
-    assert first == problem("router", "the receive thread is stuck for 7 s", f"Restart it. See {page}#receivestuck")
-    assert second == warning("router", "sensor_board is silent for 9 s", f"Check its cable. See {page}#endpointsilent")
+    assert first == problem(
+        "router", "the receive thread is stuck: no progress for 7 s", f"Restart it. See {page}#receivestuck"
+    )
+    assert second == warning(
+        "router", "sensor_board is silent: last heard 9 s ago", f"Check its cable. See {page}#endpointsilent"
+    )
 
 
 def test_a_rover_that_nobody_drives_is_fine(table: Path) -> None:

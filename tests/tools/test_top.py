@@ -51,7 +51,7 @@ def snapshot(at: float, imu: int, gps: int = 0, **more: Counts) -> Snapshot:
     return Snapshot(at, values | more)
 
 
-SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, " for 1.0 s")
+SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, ": last heard 1 s ago")
 HELD = Problem(Kind.DEADMAN_ACTIVE, {"route": "imu_info"}, routes=("imu_info",))
 SEEN = view(snapshot(10, 0, 0), snapshot(12, 100, 10), [SILENT, HELD], NOW)
 
@@ -70,7 +70,7 @@ def printed(shown: object, width: int = 120) -> list[str]:
 def test_a_page_has_all_of_it() -> None:
     assert printed(Page(SEEN, Order.TABLE)) == [
         "in 113 (55/s), delivered 115 (55/s), lost 3 malformed, 3 stale",
-        f"! sensor_board is silent for 1.0 s; {HELD.words}",
+        f"! sensor_board is silent: last heard 1 s ago; {HELD.words}",
         "last heard !sensor_board 1.0 s arm_board never",
         "route in/s endpoints topics p50 p99 age drops",
         "!imu_info 50 basestation 50 imu_data 0 15 us 20 us 5.0 s -",
