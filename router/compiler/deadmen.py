@@ -160,7 +160,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
         return
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
-    message = f"it would interrupt commands of '{case}', which '{board}' also receives"
+    message = f"the deadman would interrupt commands of '{case}', which '{board}' also receives"
     # Commands to another motor of the board must not disarm it: it would stay silent as long as they arrive.
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))

@@ -305,7 +305,10 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
             if (name := _taken(key, taken)) is not None:
                 message = f"another route takes '{route.case.value}' from '{name}'"
                 yield Diagnostic(
-                    origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; remove it from one of them"
+                    origin.span,
+                    Code.SOURCE_CLASH,
+                    message,
+                    f"see {taken[name]}; remove the source from one of the routes",
                 )
         taken.update((key, origin.span) for key, origin in origins.items())
 

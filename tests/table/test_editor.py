@@ -221,7 +221,7 @@ def test_a_mistake_is_underlined_where_it_is(
             "timeout: 300 ms": ("Timeout", "without a fresh command"),
             "detected_object": ("Payload case", "a list of routes"),
             "for_each": ("For each", "'item', 'index' and 'count'"),
-            "timeout: 1s": ("Timeout", "the rest of a frame"),
+            "timeout: 1s": ("Timeout", "the other messages of a frame"),
         }),
         (GATEWAYS, {
             "gateways": ("Gateways", "neither ROS nor protobuf"),
