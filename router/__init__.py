@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 __version__ = "1.0.0"
 
 NO_CACHE = "--no-cache"
-"""Of `router run`: without a head start."""
+"""Option of `router run`: compile the table before routing starts."""
 
 _KEYBOARD_INTERRUPT = 130
 _UNTIL_COLLECTED = 200_000
@@ -50,7 +50,7 @@ def _open_what_is_closed() -> None:
 
 
 def _exit(code: int) -> None:
-    """End the process without what libraries do at its end, when all is closed: Fast DDS sleeps for 0.1 s then."""
+    """End the process without the exit handlers of libraries, once all is closed: that of Fast DDS sleeps for 0.1 s."""
     with suppress(OSError):
         sys.stderr.flush()
     os._exit(code)

@@ -59,7 +59,7 @@ class Inputs:
             self._values[kind, name] = _UNSTEADY
 
     def add(self, other: Inputs) -> None:
-        """Note everything that is in `other`."""
+        """Add all inputs of `other`."""
         for (kind, name), value in other._values.items():
             self.note(kind, name, value)
 

@@ -73,7 +73,7 @@ class Built:
     client_deadmen: Mapping[str, ClientDeadman]
 
     def timers(self, earlier: Built | None, *, of_topics: bool) -> c.TimerChange:
-        """Changes to the timers of topics or of endpoints. Those that only `earlier` had deliver what they hold."""
+        """Changes to the timers of topics or of endpoints. Timers only in `earlier` deliver what they hold."""
         now, before = (
             [each for each in adopted if each.is_topic is of_topics]
             for adopted in (self.adopted, earlier.adopted if earlier else ())
@@ -126,7 +126,7 @@ class Plane:
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
     def tell(self) -> None:
-        """Start to report events, and that Python is alive. All receivers of events must be complete."""
+        """Start to report events, and to signal that Python is alive. All receivers of events must be complete."""
         self._events.start()
 
     def _pulse(self) -> None:

@@ -252,7 +252,7 @@ class Services:
         self._last_request: Future[None] | None = None
 
     def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
-        """Open the services, and have `opening` close them. Raises StartError.
+        """Open the services; `opening` closes them. Raises StartError.
 
         `diagnostics`: the node's name and a function that publishes CDR bytes; None if the table asks for none.
         """

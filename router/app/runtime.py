@@ -149,7 +149,7 @@ class Runtime:
     def finish(self, change: Change, earlier: Built | None) -> None:
         """Watch the peers of new topics, and close what only the earlier program used.
 
-        What a stuck thread still uses stays open until the thread goes on. All steps run even if one raises.
+        Sockets and topics that a stuck thread uses stay open until it continues. All steps run even if one raises.
         """
         with ExitStack() as last_first:
             last_first.callback(self._close_passed, change, earlier)

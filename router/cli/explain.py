@@ -34,7 +34,7 @@ _EXAMPLES = (
     "router explain --diff routes/legacy.yaml routes/rover.yaml",
 )
 _LIVE = 2.0
-"""Seconds; discovery rarely takes longer."""
+"""Default of --for, in seconds; discovery rarely takes longer."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -242,7 +242,7 @@ def _quantity(parse: Callable[[str], float], text: str, unit: str) -> float:
 
 
 def say(line: str) -> None:
-    """Print a line to stderr; stdout is for what the verb shows."""
+    """Print a line to stderr; stdout is for the output of the verb."""
     print(line, file=sys.stderr, flush=True)
 
 

@@ -23,9 +23,9 @@ def serialize(message: MessageType, values: Mapping[str, Any], padding: int = 0)
 
 
 def deserialize(message: MessageType, data: bytes) -> SimpleNamespace:
-    """The message in bytes with their header, as objects with its fields; lists of bytes are lists of numbers.
+    """Decode a CDR message with its header to nested objects; lists of bytes become lists of numbers.
 
-    Bytes after the message are ignored. Raises MappingError or ValueError if it is not such a message.
+    Bytes after the message are ignored. Raises MappingError or ValueError if the bytes are not such a message.
     """
     if data[:2] != b"\x00\x01":
         raise MappingError(f"not plain CDR: {data[:2].hex()}")

@@ -72,7 +72,7 @@ class Comparison:
         yield from _filtered(expected, events)
 
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
-        """What happened since the previous step, at a time that belongs to no step."""
+        """Yield a failure for each place with an event between the previous step and this one."""
         related: dict[Related | None, list[Event]] = {}
         for event in outcome.early:
             if isinstance(event, (Sent, Published, Dropped)):
@@ -181,7 +181,7 @@ class Comparison:
     # places and words
 
     def _of_name(self, target: str, outcome: Outcome) -> Related | None:
-        """The place where the table should have delivered to a target that got nothing."""
+        """Return where in the table the delivery to a target is missing."""
         return self._index.of_name(target, (each.route for each in outcome.events if isinstance(each, Received)))
 
 

@@ -385,7 +385,7 @@ def shown(kind: Type, value: Any) -> str:
 def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]:
     """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text.
 
-    A submessage that is not set has none: it may be of the type of its message, and so on without end.
+    A submessage that is not set has none: its type may contain itself.
     """
     if isinstance(kind, MessageType):
         for field in kind.fields:

@@ -1,7 +1,7 @@
 """A program on a simulated clock: messages go in, a list of events comes out.
 
 The library that drives the rover executes it (`carrier.rehearsal`). Every topic has a subscriber,
-and the network takes everything. Gateways do not take part, and deadmen do not send at the start.
+and the network accepts everything. Gateways do not take part, and deadmen do not send at the start.
 """
 
 from __future__ import annotations

@@ -169,8 +169,8 @@ class WaitSet:
 class EventThread:
     """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
 
-    Events of subscriptions are polled, because Fast DDS would end a wait for each message, and at once while a message
-    is not taken: this thread would compete with the receiving one for the interpreter. Events have their own thread
+    Events of subscriptions are polled, because in Fast DDS every message ends a wait for them, and an untaken one
+    ends it at once: this thread would compete with the receiving one for the interpreter. Events have their own thread
     because they need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
     """
 

@@ -36,7 +36,7 @@ EACH = "each"
 """Replaces a gateway's period or rate: every message is sent."""
 
 NEVER = "never"
-"""Replaces a duration that never passes."""
+"""Written in place of a duration that never passes."""
 
 MIN_PERIOD = 1_000_000
 """ns. A gateway with a shorter period would do nothing else; `each` sends every message."""

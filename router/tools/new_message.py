@@ -119,7 +119,7 @@ _OF_PROTOBUF = range(19_000, 20_000)
 
 
 def new_message(name: str, number: int, board: str, fields: Sequence[str], site: Site) -> NewMessage:
-    """The message that the command line describes. Raises UsageError if it is invalid."""
+    """Return the message that the command line describes. Raises UsageError if it is invalid."""
     endpoint = _endpoint(board, site.table)
     case = _case(name, endpoint.name)
     _check_names(name, case, site)

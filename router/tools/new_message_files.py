@@ -378,7 +378,7 @@ def _flow(key: str, values: object) -> list[str]:
 
 
 def _sample(type_name: str, place: int, site: Site) -> object:
-    """A value that is no field's default, and mostly differs from field to field."""
+    """A value that is never a default, and mostly differs from field to field."""
     if type_name in SCALARS:
         return _scalar(type_name == "bool", type_name in ("float", "double"), place)
     return _value(site.schema.enums.get(type_name) or site.schema.messages[type_name], place)

@@ -86,7 +86,7 @@ class SimView:
         return self.headline() + (f"; {', '.join(parts)}" if parts else "")
 
     def _statuses(self) -> Iterator[tuple[str, str, str]]:
-        """Endpoint, its status in words, and the style of that."""
+        """Yield each endpoint, its status in words, and the style of the status."""
         for endpoint, inbox in self._statistics.inboxes.items():
             if inbox.board is not None:
                 yield endpoint, inbox.board.status(self._seconds), _STYLES[inbox.board.state]

@@ -182,9 +182,9 @@ def _local_time(at: int) -> dt.datetime:
 
 
 class RunningTap:
-    """Decodes what a running router receives. `missed` counts datagrams that were not sent because this is too slow.
+    """Decodes what a running router receives. `missed` counts datagrams not sent because this reader is too slow.
 
-    Selects payloads of `cases` that fulfil `condition`; without both, everything, including what is no payload.
+    Selects payloads of `cases` that fulfil `condition`; without either, all datagrams, even without a payload.
     """
 
     def __init__(

@@ -21,10 +21,10 @@ from router.tools.top_table import RouteTable, reasons_text
 from router.values import age_text, rate_text, shortened
 
 _ENDPOINT_LINES = 4
-"""At most, on a screen; silent endpoints are also among the problems above."""
+"""Maximum lines of endpoints on a screen; silent endpoints are also among the problems above."""
 
 _LETTERS = 24
-"""Of the name of an endpoint."""
+"""Maximum letters of an endpoint's name."""
 
 _SCROLLING = {"[A": "up", "[B": "down", "[5~": "page up", "[6~": "page down", "[H": "home", "[F": "end"}
 _ESCAPE = "\x1b"
@@ -32,7 +32,7 @@ _ESCAPE = "\x1b"
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits for a key, at most so many seconds, and returns it (`q`, `page down`) or "".
+    """Yield a function that waits for a key, up to a number of seconds, and returns it (`q`, `page down`) or "".
 
     Until the context ends, keys come without Enter and are not echoed. Without a terminal there are none.
     """

@@ -26,9 +26,10 @@ def leads(message: MessageType, names: Sequence[str]) -> bool:
 
 
 def ways(message: MessageType, names: Sequence[str], *, with_lists: bool = False) -> list[str]:
-    """Return the paths that end in `names`, shortest first; for a single name, else those that end in a similar one.
+    """Return the paths that end in `names`, shortest first.
 
-    `with_lists`, they may go through the first element of a list, as in `samples[0].value`.
+    If there are none for a single name, return the paths that end in a similar name. `with_lists`: paths may go through
+    the first element of a list, as in `samples[0].value`.
     """
     below = list(_below(message, with_lists=with_lists))
     wanted = ".".join(names)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 _MOST_STACKED = 32
-"""Maximum elements of a literal that are on the stack at a time."""
+"""Maximum elements of a literal that are on the stack at once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ class LoweredRoute:
 class LoweredElements:
     """`for_each`: `routine` pushes a list, stored as `scalar` specifies.
 
-    Each element is read into `section` if it is a message, else put into the slot `item`. Unused ones are NONE.
+    Each element is read into `section` if it is a message, else into the slot `item`. Unused numbers are NONE.
     """
 
     routine: Routine
