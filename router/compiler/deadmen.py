@@ -122,10 +122,10 @@ def _doubtful_times(
             "set for example `timeout: 500ms`",
         )
     elif timeout.value < SHORTEST_TIMEOUT:
-        message = f"it trips between commands unless they arrive more often than every {time}"
+        message = f"the deadman trips between commands unless they arrive more often than every {time}"
         yield timeout.span, message, "set `timeout` to at least 20ms"
     if repeat.value > max(2 * timeout.value, DEFAULT_REPEAT.value):
-        message = f"if its datagram is lost, the next one follows {duration(repeat.value)} later"
+        message = f"if the deadman's message is lost, the next one follows {duration(repeat.value)} later"
         yield repeat.span, message, f"repeat it within the timeout of {time}"
     if ttl is not None and ttl.value > timeout.value:
         message = f"a command that is {duration(ttl.value)} late would release the deadman, which trips after {time}"
@@ -160,7 +160,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
         return
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
-    message = f"it would interrupt commands of '{case}', which '{board}' also receives"
+    message = f"the deadman would interrupt commands of '{case}', which '{board}' also receives"
     # Commands to another motor of the board must not disarm it: it would stay silent as long as they arrive.
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
@@ -204,10 +204,9 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
             lookup.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
         elif name.value not in served and are_known:
             to = " or ".join(f"'{to.value}'" for to in deadman.to)
-            message = f"no other route sends '{name.value}' to {to}, so it cannot take over"
-            hint = (
-                did_you_mean(name.value, _commanding(table, route, deadman)) or f"no other route sends commands to {to}"
-            )
+            message = f"no other route sends '{name.value}' to {to}, so it cannot disarm this deadman"
+            nobody = f"remove it: no other route sends commands to {to}"
+            hint = did_you_mean(name.value, _commanding(table, route, deadman)) or nobody
             lookup.report(name.span, Code.BAD_VALUE, message, hint)
     return tuple(each.name for each in found)
 

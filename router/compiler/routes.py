@@ -154,7 +154,8 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for index, topic in enumerate(route.topics):
         if any(are_same(topic, other) for other in route.topics[:index]):
-            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{topic.topic.value}' is a topic twice", "name it once")
+            message = f"topic '{topic.topic.value}' is listed twice"
+            lookup.report(topic.topic.span, Code.BAD_VALUE, message, "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None:
             targets.append(_publish(lookup, route, case, topic, ros_type, names))
@@ -219,7 +220,7 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
     for topic in route.source_topics:
         name = topic.topic.value
         if next(other for other in route.source_topics if other.topic.value == name) is not topic:
-            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")
+            lookup.report(topic.topic.span, Code.BAD_VALUE, f"topic '{name}' is listed twice", "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, found)):
             subscriptions.append(checked)
@@ -304,7 +305,10 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
             if (name := _taken(key, taken)) is not None:
                 message = f"another route takes '{route.case.value}' from '{name}'"
                 yield Diagnostic(
-                    origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; remove it from one of them"
+                    origin.span,
+                    Code.SOURCE_CLASH,
+                    message,
+                    f"see {taken[name]}; remove the source from one of the routes",
                 )
         taken.update((key, origin.span) for key, origin in origins.items())
 

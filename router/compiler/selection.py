@@ -32,7 +32,7 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
         try:
             re.compile(pattern.text)
         except (re.error, OverflowError, RecursionError) as error:
-            hint = "write a regular expression of Python that matches whole names"
+            hint = "write a Python regular expression that matches whole names"
             return PatternProblem(f"'{pattern.text}' is not a regular expression: {error}", hint)
         return None
     if not pattern.text.startswith("/"):

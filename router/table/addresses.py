@@ -106,7 +106,7 @@ def _bad_host(host: str) -> BadAddressError:
     if len(parts) != 4:
         return BadAddressError(f"'{host}' has {len(parts)} numbers where an IPv4 address has four")
     wrong = next(part for part in parts if not _is_octet(part))
-    return BadAddressError(f"'{wrong}' in '{host}' is not a number from 0 to 255, written without leading zeros")
+    return BadAddressError(f"'{wrong}' in '{host}' must be a number from 0 to 255 without leading zeros")
 
 
 ADDRESSES: tuple[Path, ...] = (

@@ -216,7 +216,7 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
         return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
     if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
         keys = _keys_at(source, start.line)
-        what = f"this line is indented like the '-' above, but the keys of that item by {keys}"
+        what = f"this line is indented like the '-' above; the keys of that item are indented by {keys}"
         return _Advice(what, f"indent it by {keys} spaces, or remove the '-' on line {start.line + 1}")
     if problem in _NOT_CLOSED or (problem in _BETWEEN_KEYS and before.strip()):
         return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])

@@ -132,7 +132,9 @@ class LockComparison:
         if names:
             old = min(names)
             more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
-            self._add(span, f"the lock still has {names[old]} as {old}{more}", "the wire format is the same; ")
+            self._add(
+                span, f"the lock records {names[old]} under its old name {old}{more}", "the wire format is the same; "
+            )
         if lock.max_size != envelope.max_size and not self.conflicts:
             but = ", not counting fields without a bound" if self._schema.unbounded(envelope.name) else ""
             message = f"{envelope.name} takes up to {envelope.max_size} bytes{but}; the lock says {lock.max_size}"

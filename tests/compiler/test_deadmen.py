@@ -238,5 +238,5 @@ def test_deadmen_of_one_board_know_each_other(
     table = BESIDE.format(destinations=destinations, drive=drive, arm=arm)
     found = [each for each in check_text(table, endpoints=THREE).diagnostics if each.code is Code.DOUBTFUL_DEADMAN]
     assert [each.message for each in found] == [
-        f"it would interrupt commands of '{case}', which 'board' also receives" for case in places
+        f"the deadman would interrupt commands of '{case}', which 'board' also receives" for case in places
     ]

@@ -215,17 +215,17 @@ message Envelope { oneof payload { Motor motor = 1; } }
     [
         (
             "oneof a { bool x = 1; bool y = 2; }", "oneof b { bool x = 1; bool y = 2; }",
-            ["warning the lock still has Motor.b as Motor.a"],
+            ["warning the lock records Motor.b under its old name Motor.a"],
         ),
         (
             "oneof a { bool x = 1; bool y = 2; }", "oneof b { bool x = 1; } oneof c { bool y = 2; }",
             ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
-             "warning the lock still has Motor.b as Motor.a"],
+             "warning the lock records Motor.b under its old name Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof c { bool x = 1; bool y = 2; }",
             ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
-             "warning the lock still has Motor.c as Motor.a"],
+             "warning the lock records Motor.c under its old name Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof b { bool x = 1; } oneof a { bool y = 2; }",
