@@ -53,7 +53,7 @@ class Carrier(NativeThread):
         self._running = change, used
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
-        """Mirror received datagrams to `ring` from now on. `lost` is the counter of those that found it full.
+        """Mirror received datagrams to `ring` from now on. `lost` counts those dropped because it is full.
 
         Does nothing after `close`.
         """

@@ -108,7 +108,7 @@ def _begun(begun: Beginning | None) -> HeadStart | None:
 
     head_start = begun.take() if begun is not None else None
     if head_start is not None:
-        logger.info("forwarding by the kept program while the table is compiled", listening=[*head_start.listening])
+        logger.info("forwarding with the kept program while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
         log = logger.info if begun.why.endswith(CHANGED) else logger.warning
         log("the kept program is not used: the table is compiled first", why=begun.why)

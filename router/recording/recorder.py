@@ -138,7 +138,7 @@ class Recorder:
         self._wake()
         self._thread.join(STOP_SECONDS)
         if self._thread.is_alive():
-            event = "the disk is too slow to finish the recordings; they are readable as far as they were written"
+            event = "the disk is too slow to finish the recordings; the parts already written are readable"
             logger.error(event, directory=str(self._directory.path))
         else:
             self._wake_up.close()

@@ -21,7 +21,7 @@ struct sender {
 };
 
 /* Open a sender to `address` (host byte order) and `port`. Returns NULL if memory runs out. The caller closes the sockets
- * after `sender_end`, from which on sending fails with EBADF. */
+ * after `sender_end`, after which sending fails with EBADF. */
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
 void sender_close(struct sender *sender); /* when nothing uses it */
