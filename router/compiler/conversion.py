@@ -151,7 +151,7 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
             hint = f"elements are filled by field name: {both} need fields of the same name and type"
         else:
             hint = "write the elements one by one, as in [x[0].y, x[1].y]"
-        raise ExpressionError(found.span, found.code, f"element: {found.message}", hint) from error
+        raise ExpressionError(found.span, found.code, f"list element: {found.message}", hint) from error
 
 
 def _want_length(value: tree.Node, target: List, length: int) -> None:

@@ -99,7 +99,7 @@ def timing_findings(
     `max_rate` (Hz) limits all its commands.
     """
     if max_rate is not None and deadman.timeout.value * max_rate <= NS_PER_SECOND:
-        message = f"it would trip between commands, which `max_rate` limits to {max_rate:g} Hz"
+        message = f"the deadman would trip between commands: `max_rate` limits them to {max_rate:g} Hz"
         yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "raise the timeout, or max_rate")
     if deadman.repeat.value < SHORTEST_REPEAT:
         message = f"more than 100 {sends} per second would flood the receivers"

@@ -192,11 +192,11 @@ def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnos
         return
     for other in others:
         if other.publishes and other.owner != use.owner:
-            message = f"while clients of {use.owner} are silent, this would publish on '{name}' against {other.owner}"
+            message = f"this deadman would publish on '{name}' while {other.owner} also publishes there"
             hint = "give each its own topic, and let a node such as twist_mux choose between them"
         elif other.route is not None and other.route.deadman is not None and not other.publishes:
-            message = f"{other.owner} subscribes to '{name}', so this would keep its deadman from tripping"
-            hint = "remove this one: the route has its own"
+            message = f"this deadman's messages on '{name}' would keep the deadman of {other.owner} from tripping"
+            hint = "remove this deadman: the route has its own"
         else:
             continue
         yield Diagnostic(use.deadman.span, Code.BAD_VALUE, message, hint)

@@ -1,1 +1,1 @@
-"""ROS topics as JSON for clients that speak neither ROS nor protobuf, and what they send back."""
+"""ROS topics as JSON, in both directions, for clients without ROS and protobuf."""

@@ -1,4 +1,4 @@
-"""The clients of one gateway: each gets frames at once, or, while it is behind, the newest of each topic."""
+"""The clients of one gateway. Each gets frames at once or, while it is behind, the newest frame of each topic."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from router.log import FloodLog, logger
 
 
 class ClientQueue:
-    """What one client gets. `number` is its label in metrics: the lowest that no other client of the gateway has.
+    """The output of one client. `number` is its label in metrics: the lowest that no other client of the gateway has.
 
-    While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema): a newer frame
-    takes the place of the one that waits, so that each topic keeps its turn. `sent` and `dropped` count frames since
-    the client came. Times are of the boot clock, in ns.
+    While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema). A newer frame
+    replaces the one in the queue and keeps its place. `sent` and `dropped` count frames since the client joined. Times
+    are of the boot clock, in ns.
     """
 
     def __init__(self, client: Client, number: int, on_wire: Callable[[Sequence[Frame]], Sequence[Frame]]) -> None:
@@ -26,7 +26,7 @@ class ClientQueue:
         self.sent = 0
         self.dropped = 0
         self.lacking: set[str] = set()
-        """Topics of which frames gave way to newer ones."""
+        """Topics with frames that newer ones replaced."""
         self._on_wire = on_wire
         self._behind_since: int | None = None
         self._schemas: dict[Hashable, Frame] = {}
@@ -43,7 +43,7 @@ class ClientQueue:
         return self._behind_since is None and self.client.backlog() < HIGH_WATER
 
     def lag(self, now: int) -> int:
-        """Return for how long (ns) the client has not had everything."""
+        """Return how long (ns) the client has been behind."""
         return 0 if self._behind_since is None else now - self._behind_since
 
     def write(self, frames: Sequence[Frame]) -> None:
@@ -51,7 +51,7 @@ class ClientQueue:
         self.sent += len(frames)
 
     def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[str, Frame], frames: int, now: int) -> int:
-        """Queue the newest of so many `frames`. Return how many frames gave way to newer ones."""
+        """Queue the newest of so many `frames`. Return how many frames were replaced by newer ones."""
         if self._behind_since is None:
             self._behind_since = now
         before = self.waiting
@@ -87,7 +87,7 @@ class ClientQueue:
 class Clients:
     """All clients of a gateway. `clock_ns` is the boot clock, `wall_s` gives the wall clock in seconds.
 
-    `log` is to be flushed regularly.
+    Flush `log` regularly.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Clients:
         self.log = FloodLog()
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Whether there are any clients."""
         return bool(self.queues)
 
     def send(self, frames: Sequence[Frame]) -> None:
@@ -130,12 +130,12 @@ class Clients:
             ready[0].write(frames)
 
     def lack(self, topic: str) -> None:
-        """Record that no client got some message of the topic."""
+        """Record that all clients missed a message of the topic."""
         for queue in self.queues.values():
             queue.lacking.add(topic)
 
     def send_to(self, queue: ClientQueue, frames: Sequence[Frame]) -> None:
-        """Answer one client."""
+        """Send frames to one client."""
         if not frames:
             return
         if queue.keeps_up:
@@ -173,7 +173,7 @@ class Clients:
         self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))
 
     def _log_change(self, event: str, queue: ClientQueue) -> None:
-        """Log who came or went; repetitions from one host are summed up."""
+        """Log that a client joined or left; repetitions from one host are summed up."""
         address = queue.client.label
         key = event, address.rpartition(":")[0]
         self.log.note(key, logger.info, event, gateway=self._gateway, client=queue.number, address=address)

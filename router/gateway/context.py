@@ -1,4 +1,4 @@
-"""What the parts of a gateway share: the context of all gateways of a router, and the tasks of one."""
+"""The context that all gateways of a router share, and the tasks of one gateway."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CANCEL_AGAIN_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class GatewayContext:
-    """`converting` runs what would block the loop: large messages from ROS.
+    """`converting` converts large messages from ROS, which would block the loop.
 
     `failed` reports faults of the router itself. Clocks in ns.
     """
@@ -31,7 +31,7 @@ class GatewayContext:
 
 
 class Tasks:
-    """Asyncio tasks, periodic or not. `failed` reports what they raise; an exception ends no other task."""
+    """Asyncio tasks, periodic or not. Their exceptions go to `failed`; one that fails ends no other task."""
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
@@ -43,14 +43,14 @@ class Tasks:
         task.add_done_callback(self._done)
 
     def each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
-        """Call `work` now and then on a grid of `period_s`; points that were missed are skipped."""
+        """Call `work` now and then every `period_s`, on a fixed grid; missed points are skipped."""
         self.run(self._each(period_s, work))
 
     async def attempt(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Call `work` once, and report what it raises."""
+        """Call `work` once, and report its exceptions."""
         try:
             await work()
-        except Exception as error:  # noqa: BLE001 what comes next matters as much
+        except Exception as error:  # noqa: BLE001 other work continues
             self._failed(error)
 
     async def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The counters of one gateway: what came from ROS, what clients got, and what was lost on the way."""
+"""The counters of one gateway: messages from ROS, frames for clients, and losses."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from router.table.model import ROS, Gateway
 
 
 class GatewayCounters:
-    """Each ROS message that came is counted as sent, filtered or dropped, once.
+    """Counts each ROS message once as sent, filtered or dropped.
 
-    For the thread that owns `counts`. `wall_ns` is the wall clock.
+    Use it only in the thread that owns `counts`. `wall_ns` is the wall clock.
     """
 
     def __init__(
@@ -46,43 +46,43 @@ class GatewayCounters:
         self._lost = {reason: counters.index("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
     def received(self, messages: int) -> None:
-        """Messages came from ROS."""
+        """Count messages from ROS."""
         if messages:
             self._counts[self._received] += messages
             self._counts[self._last] = self._wall_ns()
 
     def sent(self) -> None:
-        """One of them was handed to all clients."""
+        """Count a ROS message that was sent to all clients."""
         self._counts[self._sent] += 1
 
     def filtered(self, messages: int) -> None:
-        """Messages were replaced by newer ones before their period was up, or there was no client."""
+        """Count messages that newer ones replaced within their period, or for which there was no client."""
         self._counts[self._filtered] += messages
 
     def dropped(
         self, reason: str, topic: str, error: Exception | None = None, detail: str = "", messages: int = 1
     ) -> None:
-        """No client got them, for one of GATEWAY_DROP_REASONS."""
+        """Count and report messages that no client got, for one of GATEWAY_DROP_REASONS."""
         if messages:
             self._counts[self._dropped[reason]] += messages
             self._report(Report("drop", self._name, topic, reason, error, detail))
 
     def written(self, frames: int, size: int) -> None:
-        """Datagrams, packets or documents went to the transport."""
+        """Count datagrams, packets or documents that were given to the transport."""
         self._counts[self._written] += frames
         self._counts[self._written_bytes] += size
 
     def arrived(self, size: int) -> None:
-        """A client sent something."""
+        """Count a datagram, packet or document from a client."""
         self._counts[self._arrived] += 1
         self._counts[self._arrived_bytes] += size
 
     def superseded(self, frames: int) -> None:
-        """Newer frames replaced those that waited for a slow client."""
+        """Count frames for a slow client that newer ones replaced."""
         self._counts[self._lost["superseded"]] += frames
 
     def left(self, frames: int) -> None:
-        """A client left while these waited for it."""
+        """Count frames that were queued for a client when it left."""
         self._counts[self._lost["left"]] += frames
 
     def send_error(self, error: Exception, frames: int) -> None:
@@ -90,12 +90,12 @@ class GatewayCounters:
         self._report(Report("drop", self._name, CLIENTS, "send_error", error))
 
     def contended(self) -> None:
-        """Another gateway has the same Zenoh key."""
+        """Count a conflict with another gateway that uses the same Zenoh key."""
         if self._contended is not None:
             self._counts[self._contended] += 1
 
     def connected(self, number: int) -> None:
-        """So many other Zenoh routers and peers are connected."""
+        """Set the number of connected Zenoh routers and peers."""
         if self._connections is not None:
             self._counts[self._connections] = number
 

@@ -1,4 +1,4 @@
-"""JSON documents between a gateway and its clients: one object each, whose `op` says what it is.
+"""JSON documents between a gateway and its clients. Each is one object; `op` is its kind.
 
     {"op": "data", "topic": T, "type": N, "time": S, "data": {...}}      to the client
     {"op": "schema", "type": N, "time": S, "schema": {...}}
@@ -6,7 +6,7 @@
     {"op": "inbound", "topics": [{"topic": T, "type": N, "schema": {...}, "example": {...}}]}
     {"op": "rejected", "reason": R, "detail": TEXT, "topic": T}
     {"op": "publish", "topic": T, "type": N, "time": S, "data": {...}}   to the gateway; type and time may be left out
-    {"op": "schema", "type": N}                                          asks for schemas, of all without a type
+    {"op": "schema", "type": N}                                          requests a schema; all without `type`
 
 Times are wall-clock seconds. No document has a newline in it.
 """
@@ -45,24 +45,24 @@ Request = Union[PublishRequest, SchemaRequest]
 
 
 def data_document(topic: str, type_name: str, time: float, text: bytes) -> bytes:
-    """A message whose JSON text is `text`."""
+    """Make a message document from the JSON text of a message."""
     names = b'"topic":%b,"type":%b' % (orjson.dumps(topic), orjson.dumps(type_name))
     return b'{"op":"data",%b,"time":%b,"data":%b}' % (names, orjson.dumps(time), text)
 
 
 def schema_document(type_name: str, time: float, text: str) -> bytes:
-    """A type whose schema is the JSON text `text`."""
+    """Make a schema document from the JSON text of a schema."""
     return orjson.dumps({"op": "schema", "type": type_name, "time": time, "schema": orjson.Fragment(text)})
 
 
 def topics_document(time: float, rates: Iterable[tuple[str, str, float]]) -> bytes:
-    """The topics that are served: name, type, and messages per second as they come in."""
+    """Make a document of the topics that are served: name, type, and incoming messages per second."""
     topics = [{"topic": topic, "type": type_name, "rate": rate} for topic, type_name, rate in rates]
     return orjson.dumps({"op": "topics", "time": time, "topics": topics})
 
 
 def inbound_document(types: Mapping[str, MessageType]) -> bytes:
-    """The topics that clients may publish on, and their types."""
+    """Make a document of the topics that clients may publish on, with their types."""
     topics = [
         {"topic": topic, "type": type_.name, "schema": orjson.Fragment(schema_text(type_)), "example": example(type_)}
         for topic, type_ in types.items()
@@ -71,7 +71,7 @@ def inbound_document(types: Mapping[str, MessageType]) -> bytes:
 
 
 def rejected_document(reason: str, detail: str, topic: str) -> bytes:
-    """Why a client's message is not published: one of GATEWAY_REJECT_REASONS, and a sentence."""
+    """Make a document that says why a client's message was rejected: one of GATEWAY_REJECT_REASONS, and a sentence."""
     return orjson.dumps({"op": "rejected", "reason": reason, "detail": detail, "topic": topic})
 
 
@@ -90,7 +90,7 @@ _read = reader(msgspec.json.Decoder(Union[_Publish, _Schema]))
 
 
 def request(text: bytes) -> Request:
-    """What a client asks for. The data of a message are not read yet. Raises PacketError for what is no request."""
+    """Parse a client's document, but not the data of a message. Raises PacketError if it is not a request."""
     try:
         found = _read(text)
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""ROS messages as they came in, and the formats in which a gateway sends them: packets or JSON documents."""
+"""Received ROS messages, and the formats in which gateways send them: packets or JSON documents."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from router.table.units import LARGEST_DATAGRAM
 from router.types.model import MessageType
 
 LARGE = 64 << 10
-"""Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
+"""Bytes above which a message is converted in another thread, so that smaller ones need not wait for it."""
 
 
 class ReadyType:
-    """A message type that can be received: its definition, its class for rclpy, its schema as JSON."""
+    """A message type ready to be received: its definition, its rclpy class, its JSON schema."""
 
     def __init__(self, message: MessageType, message_class: Any) -> None:
         self.message = message
@@ -37,9 +37,9 @@ class ReadyType:
 
 
 class Sample:
-    """One message, whose JSON is made once for all gateways that send it. Any thread may convert it.
+    """One message. Its JSON is made once for all gateways that send it. Any thread may convert it.
 
-    `sent_ns` is the wall clock when it set out.
+    `sent_ns` is the wall clock when it was published.
     """
 
     __slots__ = ("_payloads", "_texts", "_type", "cdr", "sent_ns", "topic")
@@ -57,25 +57,25 @@ class Sample:
         return self._type.message.name
 
     def text(self, style: Style) -> bytes:
-        """As JSON in UTF-8. Raises UnreadableError."""
+        """Return the message as UTF-8 JSON. Raises UnreadableError."""
         if (text := self._texts.get(style)) is None:
             text = self._texts[style] = self._type.text(style, self.cdr)
         return text
 
     def payload(self, style: Style, level: int) -> bytes:
-        """The same, compressed with zstd unless `level` is 0. Raises UnreadableError."""
+        """Return the JSON, compressed with zstd unless `level` is 0. Raises UnreadableError."""
         if (payload := self._payloads.get((style, level))) is None:
             plain = self.text(style)
             payload = self._payloads[style, level] = compress(plain, level) if level else plain
         return payload
 
     def has_payload(self, style: Style, level: int) -> bool:
-        """Whether `payload` and `text` are made already."""
+        """Return whether `payload` and `text` have been made already."""
         return (style, level) in self._payloads
 
 
 class Encoding(ABC):
-    """How one gateway writes samples and schemas, and reads what clients send. Times are wall-clock seconds."""
+    """Writes samples and schemas, and reads requests of clients. Times are wall-clock seconds."""
 
     style: Style
     level: int
@@ -88,7 +88,7 @@ class Encoding(ABC):
 
     @abstractmethod
     def introduces(self, topic: str, type_name: str) -> Hashable:
-        """What a client must have a schema of before this topic's data."""
+        """Return the key of the schema that a client needs before this topic's data."""
 
     @abstractmethod
     def schema(self, topic: str, type_name: str, schema: str, time: float) -> bytes: ...
@@ -99,10 +99,10 @@ class Encoding(ABC):
 
     @abstractmethod
     def request(self, data: bytes) -> Request:
-        """What a client has sent. Raises PacketError for what has not the format."""
+        """Parse what a client has sent. Raises PacketError if the format is wrong."""
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
-        """The same frames as the transport is to send them."""
+        """Return the frames in the form in which the transport sends them."""
         return frames
 
 
@@ -129,7 +129,7 @@ class PacketEncoding(Encoding):
 
 
 class BatchEncoding(PacketEncoding):
-    """`gateway_v2`: packets share datagrams of at most `max_datagram` bytes."""
+    """`gateway_v2`: several packets share a datagram of at most `max_datagram` bytes."""
 
     def __init__(self, settings: Gateway) -> None:
         super().__init__(settings)

@@ -1,4 +1,4 @@
-"""What clients may publish: each request is checked, counted and handed to ROS, or refused."""
+"""Messages from clients: each is checked, counted, and published on ROS or rejected."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from router.gateway.packets import PacketError, TooLargeError, decompress
 from router.log import FloodLog, logger
 
 CLOCK_TOLERANCE_NS = 20_000_000
-"""By so much a client's clock may be ahead before that is counted: NTP keeps two computers closer than that."""
+"""How far a client's clock may be ahead before it counts: more than two computers with NTP differ."""
 
 
 class RefusedError(Exception):
-    """What a client sent is not published. `reason` is one of GATEWAY_REJECT_REASONS or of INBOUND_DROP_REASONS."""
+    """A client's message was rejected. `reason` is one of GATEWAY_REJECT_REASONS or INBOUND_DROP_REASONS."""
 
     def __init__(self, reason: str, detail: str, topic: str = "") -> None:
         super().__init__(detail)
@@ -31,9 +31,10 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class InboundOutputs:
-    """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
-    the deadman's route, each called once a message was published, with the time (boot clock) before that. Clocks in ns.
-    `library` is the carrier's.
+    """Outputs of an InboundPublisher. Clocks in ns. `library` is the carrier's.
+
+    `publish`, by topic, takes CDR bytes and may raise `publish_errors`. `feed_deadman`, by the deadman's route, is
+    called after each published message with the boot clock before publishing.
     """
 
     library: ctypes.CDLL
@@ -63,8 +64,8 @@ class _Topic:
 class InboundPublisher:
     """Reads the requests of one gateway's clients and publishes their messages.
 
-    For the thread that owns `counts`. Requests are short (`max_inbound`), so they are read at once.
-    `log` is to be flushed regularly.
+    Use it only in the thread that owns `counts`. Requests are short (`max_inbound`), so they are read at once.
+    Flush `log` regularly.
     """
 
     def __init__(
@@ -89,13 +90,13 @@ class InboundPublisher:
         }
 
     def refusal(self, reason: str, detail: str = "", topic: str = "") -> RefusedError:
-        """Count and report something that is not accepted, for one of GATEWAY_REJECT_REASONS. Return the error."""
+        """Count and report a rejection, for one of GATEWAY_REJECT_REASONS. Return the error."""
         self._counts[self._rejected[reason]] += 1
         self._outputs.report(Report("reject", self._gateway, "", reason, None, detail))
         return RefusedError(reason, detail, topic)
 
     def receive(self, data: bytes, arrived_ns: int) -> SchemaRequest | None:
-        """Publish the message that a client sent, or return what else it wants. `arrived_ns` is wall-clock time.
+        """Publish a client's message, or return its request for schemas. `arrived_ns` is wall-clock time.
 
         Raises RefusedError, which is counted and reported.
         """
@@ -116,7 +117,7 @@ class InboundPublisher:
         return None
 
     def _allowed(self, request: PublishRequest) -> _Topic:
-        """The topic of a request that may be published there. Raises RefusedError, InvalidMessageError."""
+        """Return the topic of a request, if it may be published there. Raises RefusedError, InvalidMessageError."""
         name = request.topic
         topic = self._topics.get(name)
         if topic is None:
@@ -129,13 +130,13 @@ class InboundPublisher:
         return topic
 
     def _text(self, request: PublishRequest) -> bytes:
-        """The JSON text of a message. Raises PacketError."""
+        """Return the JSON text of a message. Raises PacketError."""
         if len(request.data) > self._most:
             raise TooLargeError(f"{len(request.data)} bytes exceed the limit of {self._most}")
         return decompress(request.data, self._most) if request.is_compressed else request.data
 
     def _publish(self, topic: _Topic, cdr: bytes, sent: float | None, arrived_ns: int) -> None:
-        """`sent` is the client's wall clock in seconds."""
+        """Publish a message. `sent` is the client's wall clock in seconds."""
         self._counts[self._accepted] += 1
         self._counts[self._last] = self._outputs.wall_ns()
         now = self._outputs.clock_ns()
@@ -152,10 +153,10 @@ class InboundPublisher:
         self._counts[topic.published] += 1
 
     def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:
-        """The age counts from when the client says that it sent the message, or from its arrival if that is earlier.
+        """Raises RefusedError if a message is older than `ttl`, since `sent` or its arrival, whichever is earlier.
 
-        So a client whose clock is ahead gets its messages published up to that much later than `ttl` allows. How far
-        ahead it is counts from now, as `arrived_ns` is the earliest possible arrival where the gateway stood still.
+        If a client's clock is ahead, its messages stay valid for that much longer. The log compares `sent` with now,
+        since `arrived_ns` is the earliest possible arrival if the event loop was blocked.
         """
         wall = self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
@@ -178,6 +179,6 @@ class InboundPublisher:
     def _dropped(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
         """Count an accepted message that is not published, and report it. Return the error."""
         self._counts[topic.dropped[reason]] += 1
-        if reason != "rate_limited":  # which is what the table asks for
+        if reason != "rate_limited":  # the table asks for it
             self._outputs.report(Report("drop", self._gateway, topic.plan.label, reason, error, detail))
         return RefusedError(reason, detail, topic.plan.label)

@@ -1,8 +1,8 @@
-"""Messages between CDR bytes and JSON text, by functions that are made for each message type.
+"""Converts messages between CDR and JSON, with generated functions for each message type.
 
-`encoder` makes functions from CDR to JSON: the code reads the CDR fields in declared order and builds dictionaries with
-sorted keys, which orjson writes. `decoder` makes functions from JSON to CDR: msgspec checks and reads the text into
-Structs, whose fields are written one after the other, since clients send little.
+`encoder` makes functions from CDR to JSON. Their code reads the CDR fields in declared order and builds dictionaries
+with sorted keys, which orjson writes. `decoder` makes functions from JSON to CDR. msgspec checks the text and reads it
+into Structs, whose fields are written one by one: clients send little.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ T = TypeVar("T")
 Encode = Callable[[bytes], bytes]
 """From CDR bytes with their header to UTF-8 JSON. Raises UnreadableError."""
 Decode = Callable[[bytes], bytes]
-"""From UTF-8 JSON to CDR bytes with their header. Raises InvalidMessageError, and PacketError for what is no JSON."""
+"""From UTF-8 JSON to CDR bytes with their header. Raises InvalidMessageError, and PacketError if it is not JSON."""
 
 
 class UnreadableError(ValueError):
@@ -48,15 +48,15 @@ class InvalidMessageError(ValueError):
 # -- CDR to JSON ------------------------------------------------------------------------------------------------------
 
 _SHORT = 64
-"""Elements up to which `struct` is faster than an array of numpy."""
+"""Elements up to which `struct` is faster than a NumPy array."""
 _CHUNK = 4096
-"""Elements in one call of orjson, which holds the interpreter lock: other threads run in between."""
+"""Elements in one call of orjson, which holds the interpreter lock: other threads run between calls."""
 _NUMPY = orjson.OPT_SERIALIZE_NUMPY
 _LARGEST_UNIT = 0xFFFF
 
 
 def encoder(message: MessageType, style: Style) -> Encode:
-    """A function that writes messages of this type as JSON. Bytes behind the message are ignored: middlewares pad."""
+    """Make a function that writes messages of this type as JSON. It ignores trailing bytes: middlewares pad."""
     reading = _Reading(style)
     expression = reading.message(message)
     reading.unpack()
@@ -85,10 +85,10 @@ def encode(cdr):
 
 
 class _Reading:
-    """The lines that read a message from `cdr`, from the offset `at` on. Methods return expressions for orjson.
+    """Generates lines that read a message from `cdr`, starting at offset `at`. Methods return expressions for orjson.
 
-    Scalars that stand together are unpacked together. Where their alignment puts gaps depends on the last three bits of
-    `at`, so these select one of eight unpackers.
+    Adjacent scalars are unpacked together. Their padding depends on the last three bits of `at`, which select one of
+    eight unpackers.
     """
 
     def __init__(self, style: Style) -> None:
@@ -108,7 +108,7 @@ class _Reading:
         return "{" + ", ".join(f"{name!r}: {members[name]}" for name in sorted(members)) + "}"
 
     def unpack(self) -> None:
-        """Append the lines for all that was taken and is not unpacked yet."""
+        """Append the lines that unpack all pending scalars."""
         if self._together:
             layouts = (_layout(self._together, phase) for phase in range(8))
             unpackers = self._constant(tuple((struct.Struct(form).unpack_from, size) for form, size in layouts))
@@ -156,7 +156,7 @@ class _Reading:
         return elements
 
     def _stretch(self, size: int) -> str:
-        """The bytes of a string, or of a sequence of scalars of `size` bytes each."""
+        """Return the variable with the bytes of a string, or of a sequence of scalars of `size` bytes each."""
         length, stretch = self._take("I", 4), self._name("v")
         self.unpack()
         if size == 8:
@@ -166,7 +166,7 @@ class _Reading:
         return stretch
 
     def _take(self, form: str, alignment: int) -> str:
-        """The variable of what `struct` is to read."""
+        """Return the variable of a scalar that `struct` will read."""
         variable = self._name("v")
         self._together.append((form, alignment, variable))
         return variable
@@ -184,7 +184,7 @@ class _Reading:
 
 
 def _layout(takes: Sequence[tuple[str, int, str]], phase: int) -> tuple[str, int]:
-    """Format for struct, and size, of what begins at an offset with these last three bits."""
+    """Return the struct format and size of scalars at an offset with these last three bits."""
     whole, at = "<", phase
     for form, alignment, _ in takes:
         padding = (len(HEADER) - at) % alignment
@@ -202,7 +202,7 @@ def _cut_off(cdr: bytes) -> NoReturn:
 
 
 def _text(data: bytes) -> str:
-    """A string from its bytes. The final NUL may be missing, as Fast CDR takes it."""
+    """Decode a string. The final NUL may be missing: Fast CDR accepts that."""
     text = data.removesuffix(b"\0")
     try:
         return text.decode()
@@ -212,12 +212,12 @@ def _text(data: bytes) -> str:
 
 
 _MOST_SAID = 48
-"""Bytes of a text in an error."""
+"""Bytes of a text that an error quotes."""
 
 
 def _units(data: bytes) -> Any:
-    """The UTF-16 units of a wstring, which has 32 bits for each."""
-    import numpy as np  # for texts and lists that few messages have: it takes 0.1 s and 20 MB
+    """Return the UTF-16 units of a wstring, which stores each in 32 bits."""
+    import numpy as np  # only few messages need it, and it takes 0.1 s and 20 MB
 
     units = np.frombuffer(data, "<u4")
     if len(units) and units.max() > _LARGEST_UNIT:
@@ -235,7 +235,7 @@ def _wide_text(data: bytes) -> str:
 
 
 def _in_chunks(values: Any) -> Any:
-    """What orjson writes as the list `values`. Long lists are written here, a chunk at a time."""
+    """Return a value that orjson writes as a list. Long lists are serialized here, a chunk at a time."""
     if len(values) <= _CHUNK:
         return values
     chunks = (values[start : start + _CHUNK] for start in range(0, len(values), _CHUNK))
@@ -243,7 +243,7 @@ def _in_chunks(values: Any) -> Any:
 
 
 def _sequence(letter: str) -> Callable[[bytes], Any]:
-    """A function from the bytes of a list of scalars to what orjson writes."""
+    """Make a function from the bytes of a list of scalars to a value that orjson can write."""
     size = struct.calcsize(letter)
 
     def sequence(data: bytes) -> Any:
@@ -253,7 +253,7 @@ def _sequence(letter: str) -> Callable[[bytes], Any]:
         import numpy as np  # as in _units
 
         values = np.frombuffer(data, f"<{letter}" if letter != "?" else "u1")
-        # orjson would write the shortest text that is the same float32, and clients read doubles.
+        # orjson would write the shortest text of the float32, but clients read doubles.
         return _in_chunks(values.astype("<f8") if letter == "f" else values != 0 if letter == "?" else values)
 
     return sequence
@@ -279,15 +279,15 @@ _ENCODING: dict[str, object] = {
 # -- JSON to CDR ------------------------------------------------------------------------------------------------------
 
 _LARGEST_FLOAT32 = 3.4028235677973362e38
-"""The largest double that a float32 can hold once it is rounded."""
+"""The largest double that rounds to a float32."""
 _BEGIN, _END = 70, 50
-"""Characters of an error's text that are shown when it is long: what is wrong, and where."""
+"""Characters at the beginning and end of a long error text that are shown: what is wrong, and where."""
 
 
 def decoder(message: MessageType, style: Style) -> Decode:
-    """A function that reads messages of this type. Every field must be there and no other, each of its type and range.
+    """Make a function that reads messages of this type: all fields and no others, each with its type and range.
 
-    Nothing is converted: 3.0 is no integer, and 1 is no bool. An integer is a float where one is wanted.
+    Nothing is converted: 3.0 is not an integer, 1 is not a bool. Only integers are accepted as floats.
     """
     writing = _Writing(style)
     read: Callable[[bytes], Any] = reader(msgspec.json.Decoder(writing.struct(message)))
@@ -307,14 +307,14 @@ _AnyJson = msgspec.json.Decoder(msgspec.Raw)
 
 
 def reader(decoder: msgspec.json.Decoder[T]) -> Callable[[bytes], T]:
-    """A function that reads JSON. It raises PacketError for what is no JSON, ValidationError for any other."""
+    """Make a function that reads JSON. It raises PacketError for invalid JSON, ValidationError for any other fault."""
 
     def read(text: bytes) -> T:
         try:
             try:
                 return decoder.decode(text)
             except msgspec.ValidationError:
-                _AnyJson.decode(text)  # the fault may come before the end of what is JSON
+                _AnyJson.decode(text)  # raises DecodeError if what follows is not JSON
                 raise
         except msgspec.ValidationError:
             raise
@@ -325,20 +325,20 @@ def reader(decoder: msgspec.json.Decoder[T]) -> Callable[[bytes], T]:
 
 
 def shown(text: str) -> str:
-    """A text that may repeat what a client sent, cut short and safe in a line of a log."""
+    """Shorten and escape a text for the log; it may quote a client."""
     text = ascii(text)[1:-1]
     return text if len(text) <= _BEGIN + _END else f"{text[:_BEGIN]}...{text[-_END:]}"
 
 
 class _Writing:
-    """The Structs that msgspec reads messages into, and how their fields are written."""
+    """Makes the Structs that msgspec reads messages into, and writes their fields as CDR."""
 
     def __init__(self, style: Style) -> None:
         self._is_wrapped = style is Style.WRAPPED
         self._structs: dict[MessageType, type] = {}
 
     def struct(self, message: MessageType) -> type:
-        """The Struct of a message. Its attributes are `f0`, `f1` ..., since fields may be called as Python keywords."""
+        """Return the Struct of a message. Its attributes are `f0`, `f1` ..., as names may be Python keywords."""
         if (made := self._structs.get(message)) is None:
             fields = message.fields or (PLACEHOLDER,)
             members: list[Any] = [(f"f{index}", self._field(field.type)) for index, field in enumerate(fields)]
@@ -364,7 +364,7 @@ class _Writing:
                 return self.struct(declared)
             case Bool():
                 return bool
-            case Int(bits=64, signed=False):  # msgspec has no bound above int64: `struct` has
+            case Int(bits=64, signed=False):  # msgspec has no bounds above int64; `struct` checks
                 return Annotated[int, msgspec.Meta(ge=0)]
             case Int():
                 return Annotated[int, msgspec.Meta(ge=declared.low, le=declared.high)]
@@ -385,7 +385,7 @@ class _Writing:
                 raise TypeError(f"ROS has no type {declared}")
 
     def write(self, data: bytearray, declared: Type, value: Any, path: str) -> None:  # noqa: C901 - a case a type
-        """Append what msgspec has read. `path` names it in errors. Raises InvalidMessageError, UnicodeError."""
+        """Append a value as CDR. `path` names it in errors. Raises InvalidMessageError, UnicodeError."""
         match declared:
             case MessageType(fields=()):
                 data.append(0)
@@ -424,7 +424,7 @@ def _put_scalars(data: bytearray, declared: Type, values: Sequence[Any], path: s
     letter = scalar_format(declared)
     try:
         put_numbers(data, letter, struct.calcsize(letter), values)
-    except struct.error:  # msgspec has checked all others
+    except struct.error:  # only uint64: msgspec has checked the others
         raise InvalidMessageError(f"{path}: {max(values)} is out of range for {declared}") from None
 
 

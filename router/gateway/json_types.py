@@ -1,4 +1,4 @@
-"""Message types as clients of a gateway see them: the styles of their JSON, their schema, an example."""
+"""Message types for clients of a gateway: styles of JSON, schemas, and example messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLACEHOLDER = Field("structure_needs_at_least_one_member", Int(8, signed=False))
 
 
 class Style(enum.Enum):
-    """How values are written. There are no spaces in either style, and keys are sorted."""
+    """How values are written. Both styles have no spaces, and sorted keys."""
 
     WRAPPED = enum.auto()
     """The style of the C++ gateway: single values are arrays of one; a wstring is a list of UTF-16 units."""
@@ -23,7 +23,7 @@ class Style(enum.Enum):
 
 
 def schema_text(message: MessageType) -> str:
-    """The JSON schema of a type as the C++ gateway writes it: nested types inside, fields in declared order."""
+    """Return the JSON schema of a type as the C++ gateway writes it: nested types inline, fields in declared order."""
     return json.dumps(_schema(message), separators=(",", ":"), sort_keys=True)
 
 
@@ -45,7 +45,7 @@ def _field_schema(field: Field) -> dict[str, object]:
 
 
 def _type_name(element: Type) -> str:
-    """The name that rosidl uses: without bounds; `char` has become uint8 already."""
+    """Return the name that rosidl uses, without bounds; `char` is uint8 here already."""
     match element:
         case MessageType():
             return "message"
@@ -58,7 +58,7 @@ def _type_name(element: Type) -> str:
 
 
 def example(message: MessageType) -> dict[str, object]:
-    """A message in plain style with all fields at their declared defaults."""
+    """Return a message in plain style with all fields at their declared defaults."""
     return {field.name: _default(field.type, field.default) for field in message.fields}
 
 

@@ -1,4 +1,4 @@
-"""What publishers of a topic keep for late joiners (`transient_local`), as a subscriber gets it that comes now."""
+"""The messages that publishers of a topic keep for late joiners (`transient_local`)."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ if TYPE_CHECKING:  # which imports rclpy
 
 MOST_KEPT = 1000
 MOST_KEPT_BYTES = 64 << 20
-"""Messages of one topic, and their bytes, that late clients get; the newest ones."""
+"""The most messages of one topic, and bytes, that late joiners get; the newest ones."""
 
 POLL_S = 0.02
 QUIET_S = 0.1
-"""Publishers have delivered all that they keep if nothing came for so long."""
+"""Publishers have delivered everything when nothing has arrived for this long."""
 
 AT_MOST_S = 0.5
-"""How long it is waited for that, on a topic that is never quiet."""
+"""The longest wait on a topic that is never quiet."""
 
 PATIENCE_S = 2.0
-"""How long it is waited for publishers from which nothing came: they may have published nothing yet."""
+"""How long to wait for publishers that deliver nothing: they may have published nothing yet."""
 
 FRESH_S = 1.0
-"""So long the messages serve others who ask, unless another one came: clients that come often cost no subscriptions."""
+"""How long the messages are reused unless another one arrives, so that frequent clients cost no subscriptions."""
 
 
 class KeptMessages:
-    """Asks the publishers themselves, by a subscription of a moment.
+    """Fetches the messages from the publishers with a short-lived subscription.
 
-    How many messages a publisher keeps is not known to others, and what it keeps goes with it. So only the publishers
-    can tell. `arrived` is the number of messages that came on the topic so far.
+    Others do not know how many messages a publisher keeps, and they vanish with it, so they cannot be cached here.
+    `arrived` returns the number of messages that have arrived on the topic so far.
     """
 
     def __init__(
@@ -57,20 +57,20 @@ class KeptMessages:
         self._tap: TopicTap | None = None
         self._asking: asyncio.Task[None] | None = None
         self._found: Sequence[Sample] = ()
-        self._found_at: tuple[int, frozenset[bytes]] | None = None  # when so many had arrived, of these publishers
+        self._found_at: tuple[int, frozenset[bytes]] | None = None  # `arrived`, publishers
         self._forgetting: asyncio.TimerHandle | None = None
 
     async def get(self) -> Sequence[Sample]:
-        """Return the messages, those first that set out first. All who ask meanwhile share them.
+        """Return the messages in the order of publication. Concurrent calls share one subscription.
 
-        Nothing if publishers cannot be asked, which is logged, or if the subscription is closed meanwhile.
+        Returns nothing if the subscription fails, which is logged, or is closed meanwhile.
         """
         if self._asking is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
             if self._found_at != (self._arrived(), publishers):
                 self._asking = self._loop.create_task(self._ask(publishers))
         if asking := self._asking:
-            await asyncio.wait([asking])  # which goes on for others, even if this one is cancelled
+            await asyncio.wait([asking])  # it continues for others if this call is cancelled
             if not asking.cancelled():
                 asking.result()
         return self._found
@@ -104,7 +104,7 @@ class KeptMessages:
         self._asking = None
 
     async def _collect(self, tap: TopicTap, publishers: int) -> tuple[Sequence[Sample], int]:
-        """Return the messages, and how many had arrived on the topic when the last of them was taken."""
+        """Return the messages, and how many had arrived on the topic when the last one was taken."""
         samples: deque[Sample] = deque()
         size = 0
         begun = last = self._loop.time()

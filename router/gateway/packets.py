@@ -5,10 +5,10 @@ A packet is
     float64 LE   seconds since 1970
     uint8        1 when the payload is a zstd frame, else 0
     topic, NUL   UTF-8
-    type, NUL    as `sensor_msgs/msg/Imu`
-    payload      to the end; empty asks for schemas
+    type, NUL    for example `sensor_msgs/msg/Imu`
+    payload      to the end; empty requests schemas
 
-and a batch is time and the kind 2, then a uint16 LE length and a packet, again and again.
+and a batch is the time and the kind 2, followed by packets, each preceded by its length (uint16 LE).
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from typing import NamedTuple
 from backports import zstd
 
 HEAD = struct.Struct("<dB")
-"""Time and kind, with which packets and batches begin."""
+"""Time and kind: the beginning of packets and batches."""
 
 BATCH = 2
 """The kind of a batch."""
 
 LENGTH = struct.Struct("<H")
-"""Of a packet in a batch."""
+"""The length of a packet in a batch."""
 
 LONGEST_NAME = 255
-"""Bytes of a topic or a type. ROS allows no longer topics."""
+"""The most bytes of a topic or type. ROS allows no longer topics."""
 
 
 class PacketError(ValueError):
-    """What a client or gateway sent has not the format."""
+    """Data from a client or gateway has the wrong format."""
 
 
 class TooLargeError(PacketError):
-    """It holds more bytes than are accepted."""
+    """The data exceeds a size limit."""
 
 
 class Packet(NamedTuple):
@@ -62,7 +62,7 @@ def pack(packet: Packet) -> bytes:
 
 
 def unpack(data: bytes) -> Packet:
-    """Parse a packet; the names in it may be anything that is UTF-8. Raises PacketError."""
+    """Parse a packet; its names can be any UTF-8. Raises PacketError."""
     if len(data) < HEAD.size:
         raise PacketError(f"{len(data)} bytes are too short for a packet")
     time, kind = HEAD.unpack_from(data)
@@ -76,7 +76,7 @@ def unpack(data: bytes) -> Packet:
 
 
 def _name(data: bytes, start: int, what: str) -> tuple[str, int]:
-    """The text that ends with the next NUL, and the index behind that."""
+    """Return the text up to the next NUL, and the index after it."""
     end = data.find(0, start, start + LONGEST_NAME + 1)
     if end < 0:
         raise PacketError(f"the {what} does not end within {LONGEST_NAME} bytes")
@@ -90,7 +90,7 @@ def _name(data: bytes, start: int, what: str) -> tuple[str, int]:
 
 
 def datagrams(packets: Iterable[bytes], most: int, time: float) -> Iterator[bytes]:
-    """The packets in their order, in batches of at most `most` bytes; a packet that fits into none goes alone.
+    """Yield the packets in order, in batches of at most `most` bytes; a packet that fits into none goes alone.
 
     `time` is wall-clock seconds.
     """
@@ -118,7 +118,7 @@ def _batch(packets: list[bytes], time: float) -> Iterator[bytes]:
 
 
 def unbatched(datagram: bytes) -> list[bytes]:
-    """The packets of a datagram, which is a batch or a packet itself. Raises PacketError."""
+    """Return the packets of a datagram: a batch, or one packet. Raises PacketError."""
     if len(datagram) < HEAD.size:
         raise PacketError(f"{len(datagram)} bytes are too short for a packet")
     if datagram[HEAD.size - 1] != BATCH:
@@ -143,18 +143,18 @@ def unbatched(datagram: bytes) -> list[bytes]:
 # -- compression ------------------------------------------------------------------------------------------------------
 
 _SMALL = 1 << 16
-"""Bytes up to which a compressor is reused: creating one takes three times as long as its work. With longer data it
+"""Bytes up to which a compressor is reused: creating one takes three times as long as its work. After longer data it
 would keep up to hundreds of megabytes."""
 
 _LEAST_WINDOW_LOG = 23
-"""8 MiB, which RFC 8878 (3.1.1.1.2) wants every decoder to support."""
+"""8 MiB, which RFC 8878 (3.1.1.1.2) recommends that every decoder supports."""
 
 _MAGIC = b"\x28\xb5\x2f\xfd"
-"""Of a frame that has content; there are others that are to be skipped."""
+"""The beginning of a frame with content; there are also frames to skip."""
 
 
 class _Compressors(threading.local):
-    """By level, one for each thread: a second thread would have to wait for the first."""
+    """Compressors by level, one per thread: threads cannot share one at the same time."""
 
     def __init__(self) -> None:
         self.by_level: dict[int, zstd.ZstdCompressor] = {}
@@ -164,7 +164,7 @@ _compressors = _Compressors()
 
 
 def compress(data: bytes, level: int) -> bytes:
-    """One zstd frame with the content's size in its header, which some clients need; level 1 to 22."""
+    """Return one zstd frame with the content size in its header, which some clients need. `level`: 1 to 22."""
     if len(data) > _SMALL:
         return zstd.compress(data, level)
     compressor = _compressors.by_level.get(level)
@@ -175,9 +175,9 @@ def compress(data: bytes, level: int) -> bytes:
 
 
 def decompress(data: bytes, most: int) -> bytes:
-    """The content of one zstd frame, at most `most` bytes. The frame's window takes no more memory than that, or 8 MiB.
+    """Return the content of one zstd frame, at most `most` bytes. Its window is limited to that size, or 8 MiB.
 
-    Raises TooLargeError for more, PacketError for anything else: damage, a second frame, what needs a dictionary.
+    Raises TooLargeError for more; PacketError for damage, a second frame, or a frame that needs a dictionary.
     """
     if not data.startswith(_MAGIC):
         raise PacketError("the payload is not a zstd frame")
@@ -201,7 +201,7 @@ def decompress(data: bytes, most: int) -> bytes:
 
 
 def _declared_size(data: bytes) -> int:
-    """The size of a frame's content by its header; 0 where the header does not tell, or is none."""
+    """Return the content size in a frame's header; 0 if it is missing or the header is invalid."""
     try:
         return zstd.get_frame_info(data).decompressed_size or 0
     except zstd.ZstdError:

@@ -1,4 +1,4 @@
-"""Selection of a topic's publishers: which type a gateway serves, and with which QoS it subscribes."""
+"""Selects the type of a topic that a gateway serves, and the QoS of the subscription."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:  # which imports rclpy
 
 
 class Selection(NamedTuple):
-    """How a topic is subscribed to. `keeps` requests what publishers keep for late joiners, which all of them do.
+    """How to subscribe to a topic. `keeps` (`transient_local`) is set if all publishers keep messages for late joiners.
 
-    `others` are the types that are not served, most publishers first. `is_ours`: only this router publishes on it.
+    `others` are the types that are not served, most publishers first. `is_ours`: only this router publishes.
     `keepers` are the gids of the publishers that keep messages.
     """
 
@@ -26,15 +26,15 @@ class Selection(NamedTuple):
 
     @property
     def is_mixed(self) -> bool:
-        """Some keep messages and others do not: a subscription that hears all of them gets nothing that is kept."""
+        """Whether only some publishers keep messages. A subscription to all publishers then gets no kept messages."""
         return bool(self.keepers) and not self.keeps
 
 
 def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Selection | None:
-    """Return the type that most publishers have (of several the first by name), and a QoS compatible with all of them.
+    """Return the most frequent type (in a tie, the first by name), and a QoS compatible with all its publishers.
 
-    On an inbound topic this router's publishers do not count: clients would get back what they sent. None where no
-    publisher is left.
+    On an inbound topic this router's publishers do not count: clients would get back their own messages. Returns None
+    if no publisher is left.
     """
     counted = [publisher for publisher in publishers if not (is_inbound and publisher.is_ours)]
     if not counted:
@@ -48,7 +48,7 @@ def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Se
 
 
 def keepers(publishers: Iterable[DiscoveredPublisher], type_name: str) -> frozenset[bytes]:
-    """Return the gids of those that keep messages for late joiners."""
+    """Return the gids of the publishers that keep messages for late joiners."""
     kept = (each for each in publishers if each.type_name == type_name and each.keeps and each.is_reliable)
     return frozenset(each.gid for each in kept)
 

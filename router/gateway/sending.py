@@ -1,4 +1,4 @@
-"""What becomes of the messages of a gateway's topics: frames, the schema first, and each message counted once."""
+"""Turns the messages of a gateway's topics into frames, the schema first, and counts each message once."""
 
 from __future__ import annotations
 
@@ -19,22 +19,21 @@ from router.gateway.transport.base import PER_TURN, Frame
 from router.table.model import EACH, Gateway, Transport
 
 MOST_UNCONVERTED = 4
-"""Large messages of one topic that wait to be converted, where every message is sent."""
-
+"""The most large messages of one topic that wait to be converted, if every message is sent."""
 
 MOST_LOOKS = 20
-"""How often in vain it is looked whether a topic of several publishers is quiet."""
+"""How often to check whether a topic of several publishers is quiet, before giving up."""
 
 
 @dataclass(slots=True)
 class ServedTopic:
     """State of a topic that a gateway serves. `period` in ns, EACH for every message; `number` selects its turn in it.
 
-    `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` where every
-    message is sent), `reported` the part that clients were told as a rate. `sample` is the latest one that was looked
-    at, `readable` the latest that could be converted. `is_busy` while a large one is converted; `unconverted` wait.
-    `awaits_kept` until clients got what publishers keep, which comes to a new subscription as well. Of kept messages
-    up to `refused_ns` those that cannot be sent are counted.
+    `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` if every message
+    is sent), `reported` the part in the rates for clients. `sample` is the latest one taken, `readable` the latest that
+    could be converted. `is_busy` while a large one is being converted; `unconverted` ones wait. `awaits_kept` until
+    clients have the messages that publishers keep, which a new subscription also gets. Kept messages sent until
+    `refused_ns` have been counted if they cannot be sent.
     """
 
     subscription: TopicSubscription
@@ -57,8 +56,8 @@ class ServedTopic:
     def begin(cls, subscription: TopicSubscription, selection: Selection, period: int, number: int) -> ServedTopic:
         """Serve a topic from now on.
 
-        A latest value that is there already, because another gateway subscribes to the topic, counts as one that
-        arrives: publishers that keep it for late joiners do not send it again.
+        If another gateway already has a latest value of the topic, it counts as arriving now: publishers that keep it
+        for late joiners do not send it again.
         """
         known = subscription.latest() is not None and not selection.keeps
         arrived = subscription.arrived
@@ -66,9 +65,9 @@ class ServedTopic:
         return cls(subscription, selection, period, number, counted=counted, reported=arrived)
 
     def is_quiet(self) -> bool:
-        """Return whether nothing arrived since the last call.
+        """Return whether nothing has arrived since the last call.
 
-        Of several publishers one may never stop while another keeps what gave way: so that ends after some calls.
+        With several publishers, one may never stop while another keeps messages: after MOST_LOOKS calls this is true.
         """
         before, self.seen = self.seen, self.subscription.arrived
         self.looks = 0 if before == self.seen else self.looks + 1
@@ -77,14 +76,14 @@ class ServedTopic:
         return is_quiet
 
     def uncounted(self) -> int:
-        """Return, and mark as counted, the messages since the last call; with EACH, those that were missed."""
+        """Return the number of messages since the last call, and mark them as counted; with EACH, only missed ones."""
         total = self.subscription.missed if self.period == EACH else self.subscription.arrived
         new, self.counted = total - self.counted, total
         return new
 
 
 class TopicSender:
-    """Makes frames of messages."""
+    """Makes frames from messages."""
 
     def __init__(
         self,
@@ -102,13 +101,13 @@ class TopicSender:
         self._clients = clients
         self._introduced: set[Hashable] = set()
         self._pending: list[Frame] = []
-        # Datagrams get lost, and the existing gateway's clients expect values to be repeated.
+        # Datagrams get lost, and clients of the C++ gateway expect repeated values.
         self._repeats = settings.transport.value is Transport.UDP
         self._most = min(settings.max_outbound, encoding.most)
         self._remedy = "see `max_message`" if self._most < encoding.most else "use tcp, websocket or zenoh"
 
     def poll(self, served: ServedTopic, frames: list[Frame]) -> None:
-        """Append the topic's latest value to `frames`, if it is to be sent now."""
+        """Append the topic's latest value to `frames` if it is due."""
         if served.is_busy or served.has_ended:
             return
         new = served.uncounted()
@@ -129,7 +128,7 @@ class TopicSender:
             self._offer(served, served.readable, frames, is_new=False)
 
     def send(self, served: ServedTopic, sample: Sample) -> None:
-        """Send a message of a topic of which every one is sent."""
+        """Send a message of a topic with period EACH."""
         served.sample = sample
         self._counters.received(1)
         if not self._clients:
@@ -143,7 +142,7 @@ class TopicSender:
             self._clients.lack(sample.topic)
 
     def count_missed(self, served: ServedTopic) -> None:
-        """Count what arrived and gave way to newer messages before it was looked at."""
+        """Count messages that newer ones replaced before they were taken."""
         new = served.uncounted()
         self._counters.received(new)
         if served.period == EACH:
@@ -154,13 +153,13 @@ class TopicSender:
             self._counters.filtered(new)
 
     def end(self, served: ServedTopic) -> None:
-        """Send nothing more of the topic; should it come back, its schema comes first."""
+        """Stop sending the topic. If it comes back, its schema is sent first."""
         self.count_missed(served)
         served.has_ended = True
         self._introduced.discard(self._encoding.introduces(served.subscription.topic, served.subscription.type_name))
 
     def _queue(self) -> list[Frame]:
-        """Return the frames that go out together at the end of this turn of the loop."""
+        """Return the list of frames that are sent at the end of this turn of the loop."""
         if not self._pending:
             asyncio.get_running_loop().call_soon(self._flush)
         return self._pending
@@ -180,7 +179,7 @@ class TopicSender:
         return len(sample.cdr) <= LARGE or sample.has_payload(self._encoding.style, self._encoding.level)
 
     async def _convert(self, served: ServedTopic, sample: Sample, *, is_new: bool) -> None:
-        """Convert a large message in another thread: the topic's next value waits for it, other topics do not."""
+        """Convert a large message in another thread. Only the next value of the same topic waits for it."""
         try:
             await self._prepare(sample)
         finally:
@@ -194,13 +193,13 @@ class TopicSender:
 
     async def _prepare(self, sample: Sample) -> None:
         """Convert a message in another thread."""
-        with suppress(UnreadableError):  # raised, and counted, again when it is to be sent
+        with suppress(UnreadableError):  # raised again, and counted, when it is sent
             await asyncio.get_running_loop().run_in_executor(
                 self._context.converting, sample.payload, self._encoding.style, self._encoding.level
             )
 
     def _encode(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
-        """Append the value, and before the first of its kind the schema."""
+        """Append the value, preceded by the schema if it is the first of its kind."""
         if is_new:
             served.refused_ns = max(served.refused_ns, sample.sent_ns)
         if (data := self._checked(served, sample, is_new=is_new)) is None:
@@ -214,7 +213,7 @@ class TopicSender:
         frames.append(data)
 
     def _checked(self, served: ServedTopic, sample: Sample, *, is_new: bool) -> Frame | None:
-        """Return the value, or None if it cannot be sent, which counts if it is new."""
+        """Return the value, or None if it cannot be sent, which is counted if it is new."""
         try:
             data = self._frame(sample)
         except UnreadableError as error:
@@ -244,7 +243,7 @@ class TopicSender:
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 
     async def kept(self, served: ServedTopic) -> list[Frame]:
-        """Return what publishers keep for late joiners, oldest first, and the latest value if it may be another's."""
+        """Return the messages kept for late joiners, oldest first; then the latest value if others may have sent it."""
         topic = served.subscription
         samples = list(await topic.kept.get())
         if served.selection.is_mixed and (latest := topic.latest()):
@@ -266,10 +265,10 @@ class TopicSender:
         return frames
 
     def show(self, served: ServedTopic, frames: list[Frame]) -> None:
-        """Append schema and latest value; of a topic whose publishers keep messages, only the schema.
+        """Append schema and latest value; only the schema if publishers keep messages.
 
-        `served` stays as it is: other clients are still to get the value. A large value that is not converted yet goes
-        to everybody a little later.
+        Does not change `served`: other clients still get the value. A large value that has not been converted yet is
+        sent to all clients a little later.
         """
         if served.selection.keepers:
             frames.append(self.schema(served))
@@ -293,5 +292,5 @@ class TopicSender:
             frames.append(data)
 
     def introduced(self, frames: Iterable[Frame]) -> None:
-        """Record that all clients got the schemas among `frames`."""
+        """Record that all clients have the schemas among `frames`."""
         self._introduced |= {self._encoding.introduces(frame.topic, frame.type_name) for frame in frames}

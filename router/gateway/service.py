@@ -1,4 +1,4 @@
-"""One gateway: connects its topics, its clients and their requests. Runs in the thread of the event loop."""
+"""One gateway: connects its topics, clients and requests. Runs in the thread of the event loop."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from router.table.model import Transport as Way
 
 _TOPICS_S = _LOG_S = 1.0
 _ANSWER_NS = 100_000_000
-"""Between two answers to requests for schemas: a small request has a large answer."""
+"""ns between two answers to schema requests: a small request has a large answer."""
 
 
 class GatewayService:
-    """Implements Events, for its transport."""
+    """One gateway. Implements Events for its transport."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class GatewayService:
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
     def anew(self) -> GatewayService:
-        """Return a new service like this one, which was closed: the same limits and counters, no clients."""
+        """Return a new service to replace this closed one: with the same limits and counters, without clients."""
         return GatewayService(self.plan, self._context, self._counters, self._inbound, self._new_transport)
 
     async def open(self) -> None:
@@ -61,7 +61,7 @@ class GatewayService:
         await self._transport.open()
 
     def start(self) -> None:
-        """Look for topics and serve them from now on."""
+        """Start to discover and serve topics."""
         self._topics.start()
         self._tasks.each(_LOG_S, self._flush_logs)
         if self._has_page:
@@ -72,7 +72,7 @@ class GatewayService:
         if self.is_closed:
             return
         self.is_closed = True
-        async with AsyncExitStack() as closing:  # in reverse order: clients that come or send something start tasks
+        async with AsyncExitStack() as closing:  # in reverse order: clients that join or send start tasks
             closing.callback(self.clients.log.flush, final=True)
             closing.callback(self._inbound.log.flush, final=True)
             closing.push_async_callback(self._tasks.close)
@@ -143,7 +143,7 @@ class GatewayService:
         self.clients.send_to(queue, self._topics.snapshot(queue, type_name))
 
     def _hello(self) -> list[Frame]:
-        """Return what a client may send, for one that can show that to a person."""
+        """Return the topics that a client may publish on, for clients with a page."""
         if not self._has_page:
             return []
         types = {inbound.label: inbound.type for inbound in self.plan.inbound.values()}
@@ -154,5 +154,5 @@ class GatewayService:
         self.clients.send([self._document("topics", document)])
 
     def _document(self, kind: str, data: bytes) -> Frame:
-        """Make a frame of a document of no topic; for a slow client, a newer one of its `kind` replaces it."""
+        """Make a frame of a document without topic. For a slow client, a newer one of the same `kind` replaces it."""
         return Frame(data, kind, "", is_schema=False)

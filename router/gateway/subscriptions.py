@@ -1,7 +1,7 @@
 """Subscriptions to ROS topics, shared by all gateways of a router.
 
-A topic has at most two: one for gateways that send every message, one for those that send the latest value. All of it
-runs in the thread of the event loop, unless stated otherwise.
+A topic has at most two: one for gateways that send every message, one for gateways that send the latest value.
+Everything runs in the thread of the event loop, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:  # which imports rclpy
     from router.ros.topics import RosTopics, TopicTap
 
 DEPTH = 100
-"""Messages that wait on a topic of which every one is wanted; the oldest are dropped first."""
+"""Queue length of a subscription to every message; the oldest are dropped first."""
 
 
 class TopicSubscription:
-    """What arrives on one topic as one type: every message, or the latest value, for all gateways that want it so.
+    """A subscription to one topic as one type, to every message or the latest value, shared by gateways.
 
-    The two ways do not share a subscription: to subscribe anew with another depth would have publishers deliver again
-    what they keep for late joiners. Where the latest value is enough, the middleware keeps one message, and a message
-    that nobody asks for costs no Python.
+    The two modes do not share a subscription: after subscribing again with another depth, publishers would deliver the
+    messages for late joiners again. For the latest value, the middleware keeps one message, and messages that are never
+    taken cost no Python.
     """
 
     def __init__(
@@ -50,25 +50,25 @@ class TopicSubscription:
         self._is_reliable = self._keeps = False
         self._depth = DEPTH if is_each else 1
         self.missed = 0
-        """Messages for callbacks that newer ones replaced in the middleware's queue."""
+        """Messages for callbacks that were replaced by newer ones in the middleware's queue."""
         self._arrived = self._taken = 0
-        self._is_synchronised = False  # `_taken` counts from when it was equal to `_arrived`
+        self._is_synchronised = False  # `_taken` has once been equal to `_arrived`
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
         self.kept = KeptMessages(topic, ready, topics, loop, lambda: self.arrived)
-        """What publishers keep for late joiners."""
+        """The messages that publishers keep for late joiners."""
 
     @property
     def arrived(self) -> int:
-        """Messages that arrived since this was made, taken or not."""
+        """Messages that have arrived so far, taken or not."""
         if not self._callbacks:
             self._count()
         return self._arrived
 
     @property
     def is_open(self) -> bool:
-        """False once the topic is subscribed to as another type, or nobody uses this: then join again, or leave."""
+        """False once the topic is subscribed to as another type, or this has no users: then join again, or leave."""
         return self._tap is not None
 
     @property
@@ -76,7 +76,7 @@ class TopicSubscription:
         return self._users > 0
 
     def latest(self) -> Sample | None:
-        """Return the newest message that was taken. Takes what waits, unless callbacks get it anyway."""
+        """Return the newest message. Without callbacks, take waiting messages first."""
         if not self._callbacks:
             self._count()
             if self._waits:
@@ -85,9 +85,9 @@ class TopicSubscription:
         return self._last
 
     def add(self, wanted: Selection, callback: OnSample | None) -> None:
-        """Add a user, with a `callback` where every message is wanted. Subscribe, anew if that was with another QoS.
+        """Add a user, with a `callback` for every message. Subscribe, or subscribe again if the QoS changes.
 
-        What had arrived by then goes to the earlier users. Raises StartError.
+        Messages that have arrived by then go to the earlier users. Raises StartError.
         """
         if (wanted.is_reliable, wanted.keeps) != (self._is_reliable, self._keeps):
             self._take(self._depth)
@@ -128,13 +128,13 @@ class TopicSubscription:
         self._tap = None
 
     def _watch(self, tap: TopicTap) -> None:
-        """Have the loop handle messages when they arrive, if there are callbacks."""
+        """Let the loop handle messages on arrival, if there are callbacks."""
         if not self._callbacks:
             self._loop.remove_reader(tap.fd)
             return
         self._loop.add_reader(tap.fd, self._on_arrival)
         if self._turn is None:
-            self._turn = self._loop.call_soon(self._on_turn)  # for what was counted while there was no callback
+            self._turn = self._loop.call_soon(self._on_turn)  # for messages counted while there was no callback
 
     def _on_arrival(self) -> None:
         self._count()
@@ -147,7 +147,7 @@ class TopicSubscription:
         self._serve()
 
     def _serve(self) -> None:
-        """Take messages. Messages that were counted and cannot be taken were lost."""
+        """Take messages. Messages that were counted but cannot be taken are lost."""
         if self._take(PER_TURN) == PER_TURN:
             self._turn = self._loop.call_soon(self._on_turn)
         elif self._is_synchronised:
@@ -163,7 +163,7 @@ class TopicSubscription:
     def _take(self, most: int) -> int:
         """Take messages, call back for each, and remember the last one. Return how many were taken.
 
-        One that equals the last is skipped: its publisher keeps it, and delivered it again to a new subscription.
+        A message equal to the last one is skipped: its publisher keeps it, and has delivered it to a new subscription.
         """
         taken = 0
         while taken < most and self._tap and (message := self._tap.take()):
@@ -180,7 +180,7 @@ class TopicSubscription:
     def _call(self, callback: OnSample, sample: Sample) -> None:
         try:
             callback(self, sample)
-        except Exception as error:  # noqa: BLE001 reported; the next message and the next gateway matter as much
+        except Exception as error:  # noqa: BLE001 reported; other messages and gateways continue
             self._loop.call_exception_handler({"message": f"a message on {self.topic} was lost", "exception": error})
 
 
@@ -194,18 +194,18 @@ class Subscriptions:
         self._topics = ros
         self._interfaces = interfaces
         self._loop = loop
-        self._open: dict[tuple[str, bool], TopicSubscription] = {}  # by topic, and whether every message is wanted
-        self._types: dict[str, ReadyType | str] = {}  # or why a type cannot be received
+        self._open: dict[tuple[str, bool], TopicSubscription] = {}  # by topic, and whether to every message
+        self._types: dict[str, ReadyType | str] = {}  # or the reason why a type cannot be received
         self._loader = DaemonThread("gateway types")
 
     def resolved(self, names: Iterable[str]) -> frozenset[str]:
-        """Return the absolute names that ROS makes of these."""
+        """Return the absolute names of these topics, as ROS resolves them."""
         return frozenset(map(self._topics.resolved, names))
 
     async def discover(self, inbound: Collection[str], is_wanted: Callable[[str], bool]) -> dict[str, Selection]:
-        """Return the wanted topics that somebody publishes on; on `inbound` ones this router does not count.
+        """Return the wanted topics that have publishers; on `inbound` topics this router does not count.
 
-        Types are loaded here, so that `join` does not take long. Other work has its turn between topics.
+        Loads types, so that `join` is fast. Yields to other tasks between topics.
         """
         found: dict[str, Selection] = {}
         for topic in self._topics.names():
@@ -220,19 +220,19 @@ class Subscriptions:
         return found
 
     def is_joined(self, topic: str, callback: OnSample | None) -> bool:
-        """Return whether there is a subscription of the kind that this `callback`, or None, would join."""
+        """Return whether the subscription that `join` with this `callback` would use exists."""
         return (topic, callback is not None) in self._open
 
     def join(self, topic: str, wanted: Selection, callback: OnSample | None) -> TopicSubscription:
-        """Use a subscription: `callback` is called for every message; without it, ask for `latest`.
+        """Use a subscription. `callback` is called for every message; without one, call `latest`.
 
         To change the selection, join again and leave the old subscription, which may be the same, afterwards. A
-        subscription of another type is closed for all its users. Raises StartError, and then nobody uses it.
+        subscription of another type is closed for all its users. Raises StartError; then nothing was joined.
         """
         ready = self._ready(wanted.type_name)
         for key in ((topic, False), (topic, True)):
             if (other := self._open.get(key)) and other.type_name != wanted.type_name:
-                other.close()  # first: DDS has one type for a topic in a process
+                other.close()  # first: DDS allows one type per topic in a process
                 del self._open[key]
         key = topic, callback is not None
         if (subscription := self._open.get(key)) is None:
@@ -267,7 +267,7 @@ class Subscriptions:
         return ready
 
     def _load(self, type_name: str) -> ReadyType | str:
-        """Load a type, or return why it cannot be received. Runs in a thread of its own, mostly."""
+        """Load a type, or return why it cannot be received. Usually runs in a thread of its own."""
         try:
             message = self._declared(type_name) or self._topics.installed_type(type_name)
             return ReadyType(message, self._topics.load(type_name, definitions_of(message)))
@@ -275,7 +275,7 @@ class Subscriptions:
             return str(error)
 
     def _declared(self, type_name: str) -> MessageType | None:
-        """Return the type as a `.msg` file declares it; None where that cannot be read: the class may describe it."""
+        """Return the type as declared by a `.msg` file; None if that cannot be read. The class may then describe it."""
         try:
             return self._interfaces.get(type_name)
         except TableError:

@@ -1,4 +1,4 @@
-"""The thread of all gateways of a router, with its event loop."""
+"""The thread and event loop of all gateways of a router."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ if TYPE_CHECKING:  # which imports rclpy
 T = TypeVar("T")
 
 MOST_REQUEST = 4096
-"""Bytes of a message from a client that may publish nothing: it can only request schemas."""
+"""The most bytes of a message from a client that may not publish: it can only request schemas."""
 
 _PATIENCE_S = 5.0
-"""Seconds for which a change of gateways waits for the event loop: opening a Zenoh session takes some."""
+"""Seconds that a change of gateways may take in the event loop; opening a Zenoh session takes some."""
 _PATIENCE_OF_STOP_S = 2.5
 
 _CLOSED = "Invalid file descriptor: -1"
-"""What asyncio raises when it wants to accept again, a second after descriptors ran out, and the socket is closed."""
+"""Raised by asyncio when it retries `accept`, a second after descriptors ran out, and the socket has been closed."""
 
 PAGE = Path(__file__).with_name("page.html")
 
 
 @dataclass(frozen=True, slots=True)
 class GatewayChange:
-    """Services of the next program by gateway; those of them that are new, and those that it does not have."""
+    """`services` of the next program by gateway; `opened` ones are new, and it does not use those in `left`."""
 
     services: dict[str, GatewayService]
     opened: list[GatewayService]
@@ -65,10 +65,10 @@ class GatewayChange:
 class GatewayThread:
     """Serves the gateways of a program, and changes to those of another one.
 
-    `prepare` opens what is new, `retire` closes what is not wanted any more, `finish` starts the new services; or
-    `abandon` undoes the change. `library` is the carrier's. `counts` belong to this thread, in which all callbacks are
-    called. `kernel_drops` has, by gateway that receives datagrams, a thread-safe function that returns how many the
-    kernel dropped.
+    `prepare` opens new gateways, `retire` closes obsolete ones, `finish` starts the new services; `abandon` undoes the
+    change instead. `library` is the carrier's. `counts` belong to this thread, which calls all callbacks.
+    `kernel_drops` has, for each gateway that receives datagrams, a thread-safe function that returns how many the
+    kernel has dropped.
     """
 
     def __init__(
@@ -95,10 +95,10 @@ class GatewayThread:
         self._thread.start()
 
     def prepare(self, program: Program, feed: Mapping[str, Callable[[int], None]]) -> GatewayChange:
-        """Open the gateways of `program` that are not open. Raises StartError, and then all is as it was.
+        """Open the gateways of `program` that are not open yet. Raises StartError; then nothing has changed.
 
-        `feed` has what feeds a deadman, by the deadman's route. A gateway that is the same as before keeps its clients.
-        One that has changed loses them here: its socket has to be closed before the new one can be opened.
+        `feed` has the functions that feed deadmen, by the deadman's route. An unchanged gateway keeps its clients. A
+        changed one loses them here: its socket has to be closed before the new one can be opened.
         """
         outputs = InboundOutputs(
             library=self._library,
@@ -136,12 +136,12 @@ class GatewayThread:
         return change
 
     def abandon(self, change: GatewayChange) -> None:
-        """Close what `prepare` opened, and open again what it had to close."""
+        """Close the gateways that `prepare` opened, and reopen those that it closed."""
         self._call(self._abandon(change))
 
     async def _abandon(self, change: GatewayChange) -> None:
         await _close(change.opened)
-        async with AsyncExitStack() as opening:  # all of them, whatever one raises
+        async with AsyncExitStack() as opening:  # all of them, even if one raises
             for service in change.left:
                 if service.is_closed:
                     opening.push_async_callback(self._open_again, service)
@@ -153,7 +153,7 @@ class GatewayThread:
         self._services[again.name] = again
 
     def retire(self, change: GatewayChange) -> None:
-        """Close the services of `left`; `abandon` would still open them again."""
+        """Close the services of `left`. `abandon` can still reopen them."""
         self._call(_close(change.left))
 
     def finish(self, change: GatewayChange) -> None:
@@ -194,7 +194,7 @@ class GatewayThread:
                 yield (service.name, str(each.number)), value(each)
 
     def stop(self) -> None:
-        """Close all gateways and end the thread. If it is stuck in the middleware, that is logged, and it is left."""
+        """Close all gateways and end the thread. If the middleware blocks it, log that and continue."""
         try:
             self._call(_close(self._services.values()), _PATIENCE_OF_STOP_S)
         except StuckError as error:
@@ -207,7 +207,7 @@ class GatewayThread:
                 self._loop.close()
 
     def _call(self, work: Coroutine[Any, Any, T], patience: float = _PATIENCE_S) -> T:
-        """Do work in the loop. Raises StuckError if the loop is stuck, as when a client's message is published."""
+        """Run a coroutine in the loop. Raises StuckError if the loop is blocked, for example by a publish call."""
         done = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return done.result(patience)
@@ -215,7 +215,7 @@ class GatewayThread:
             raise StuckError("the gateways are blocked by the ROS middleware") from error
 
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Report what a callback of the loop raised: a fault of the router."""
+        """Report an exception of a callback of the loop: a fault of the router."""
         error = context.get("exception")
         if isinstance(error, ValueError) and str(error) == _CLOSED:
             return
@@ -223,20 +223,20 @@ class GatewayThread:
 
 
 async def _close(services: Iterable[GatewayService]) -> None:
-    """Close all of them, whatever one raises."""
+    """Close all services, even if one raises."""
     async with AsyncExitStack() as closing:
         for service in services:
             closing.push_async_callback(service.close)
 
 
 def _new_transport(settings: Gateway, events: Events) -> Transport:
-    """Return the transport that a gateway's settings ask for, not open yet."""
+    """Return the transport for a gateway's settings, not open yet."""
     most = settings.max_inbound if settings.inbound else MOST_REQUEST
     if settings.zenoh is not None:
         from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
 
         return ZenohTransport(settings.zenoh, events, most)
-    assert settings.address is not None  # noqa: S101 - the schema wants one for all others
+    assert settings.address is not None  # noqa: S101 - the schema requires one for all others
     address = settings.address.value
     if settings.transport.value is TransportKind.UDP:
         return UdpTransport(address, settings.receive.value if settings.receive else None, events)
@@ -248,12 +248,12 @@ def _new_transport(settings: Gateway, events: Events) -> Transport:
 
 
 def _page(name: str) -> bytes:
-    """Return the page with the gateway's name in its title, from where its script takes it."""
+    """Return the page with the gateway's name in its title, which its script reads."""
     return PAGE.read_bytes().replace(b"<title>Gateway</title>", b"<title>Gateway %b</title>" % escape(name).encode())
 
 
 def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
-    """Return whether both need the same name, address or key, and so cannot be open at a time."""
+    """Return whether both need the same name, address or key, so that only one can be open."""
     if one.zenoh and other.zenoh and one.zenoh.key.value == other.zenoh.key.value:
         return True
     wanted = {where.value for where in (other.address, other.receive) if where}

@@ -1,4 +1,4 @@
-"""The topics that one gateway serves: which there are, and when their latest values are due."""
+"""The topics that one gateway serves: discovers them, and sends their latest values when due."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
 
 MOST_TURNS = 20
-"""Parts of a period over which topics are spread where each packet is a datagram: receivers with the kernel's default
-buffer lose some of a burst of two hundred."""
+"""The most parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's
+default buffer lose some of a burst of two hundred."""
 
 SHORTEST_PAUSE_S = 0.1
-"""Seconds between two discoveries at least, also when many clients come."""
+"""The minimum time between two discoveries, even if many clients join."""
 
 MEND_S = 0.5
-"""Between two looks for clients that lack messages which publishers still keep."""
+"""The interval of checks for clients that lack messages which publishers still keep."""
 
 SHORTEST_TURN = 10_000_000
-"""ns between turns, at least: more often costs more than it spreads."""
+"""The minimum time between turns, ns: shorter ones cost more than they gain."""
 
 FIRST_PAUSES_S = (0.2, 0.5, 1.0, 2.0)
-"""Between discoveries after the start, as far as they are shorter than `discovery_period`: DDS needs a moment to find
-others."""
+"""Times between the first discoveries, if shorter than `discovery_period`: DDS takes a moment to find others."""
 
 
 class Topics:
-    """Runs in the loop's thread. A fault with one topic is reported, and keeps no other from its turn."""
+    """The topics of one gateway. Runs in the loop's thread. A fault in one topic is reported and affects no other."""
 
     def __init__(
         self,
@@ -88,7 +87,7 @@ class Topics:
     # -- which topics --------------------------------------------------------------------------------------------
 
     def discover_now(self) -> None:
-        """Look for topics that are served only while there are clients."""
+        """Discover again now: some topics are served only while there are clients."""
         self._discover_now.set()
 
     async def _discover(self, period_s: float) -> None:
@@ -101,10 +100,10 @@ class Topics:
                 await asyncio.wait_for(self._discover_now.wait(), pause - at_least)
 
     async def _update(self) -> None:
-        """Serve topics that appeared, forget those that went, and follow changes of types and QoS."""
+        """Serve new topics, forget those that are gone, and follow changes of types and QoS."""
         found = await self._subscriptions.discover(self._inbound, self._selector.selects)
         if not self._clients:
-            # The router fills topics that only itself publishes while they have subscribers: not without clients.
+            # While a topic has subscribers, the router publishes on it: do not subscribe without clients.
             found = {topic: selection for topic, selection in found.items() if not selection.is_ours}
         self._not_installed &= found.keys()
         for topic in self._served.keys() - found.keys():
@@ -128,11 +127,11 @@ class Topics:
             if topic not in self._not_installed:
                 self._not_installed.add(topic)
                 logger.warning("topic cannot be served", gateway=self._name, topic=topic, error=str(error))
-        except Exception as error:  # noqa: BLE001 reported; other topics are served all the same
+        except Exception as error:  # noqa: BLE001 reported; other topics are still served
             self._failed(error)
 
     def _serve(self, topic: str, selection: Selection) -> None:
-        """Serve a topic from now on, or with another selection than before. Raises StartError."""
+        """Serve a topic from now on, or with a new selection. Raises StartError."""
         before = self._served.get(topic)
         period = self._selector.period(topic)
         callback = self._on_sample if period == EACH else None
@@ -140,11 +139,11 @@ class Topics:
         subscription = self._subscriptions.join(topic, selection, callback)
         self._not_installed.discard(topic)
         if before and before.subscription is subscription:
-            self._subscriptions.leave(subscription, callback)  # it had been joined before
+            self._subscriptions.leave(subscription, callback)  # it was already joined
             if selection.is_mixed and selection.keepers - before.selection.keepers:
-                self._clients.lack(topic)  # this subscription does not get what they keep
+                self._clients.lack(topic)  # this subscription does not get their kept messages
             if before.selection.keepers - selection.keepers:
-                before.readable = None  # it may be of a publisher that is gone
+                before.readable = None  # its publisher may be gone
             before.selection = selection
             return
         if before:
@@ -171,14 +170,14 @@ class Topics:
     # -- when they are served ------------------------------------------------------------------------------------
 
     def _in_turns(self, period: int, serve: Callable[[Sequence[ServedTopic]], Awaitable[None]]) -> None:
-        """Have each topic served once in a `period` of ns, spread over the period or all at once."""
+        """Serve each topic once in a `period` (ns), spread over the period or all at once."""
         number = max(1, min(MOST_TURNS, period // SHORTEST_TURN)) if self._spreads else 1
         turn_s = period / number / 1e9
         clock = asyncio.get_running_loop().time
         begin, done = clock(), -1
 
         async def turn() -> None:
-            """Serve those whose turn is now, or was missed."""
+            """Serve the topics whose turn is now or was missed."""
             nonlocal done
             now = round((clock() - begin) / turn_s)
             turns = {each % number for each in range(max(done, now - number) + 1, now + 1)}
@@ -192,7 +191,7 @@ class Topics:
         for number, served in enumerate([each for each in due if each.period == period], 1):
             try:
                 self._sender.poll(served, frames)
-            except Exception as error:  # noqa: BLE001 reported; other topics are served all the same
+            except Exception as error:  # noqa: BLE001 reported; other topics are still served
                 self._failed(error)
             if number % PER_TURN == 0:
                 self._clients.send(frames)
@@ -207,14 +206,14 @@ class Topics:
     async def _repeat_schemas(self, due: Sequence[ServedTopic]) -> None:
         is_known = [served for served in due if served.readable is not None or served.selection.keepers]
         self._clients.send([self._sender.schema(served) for served in is_known])
-        if self._is_udp:  # whose client may have come unnoticed
+        if self._is_udp:  # a new client goes unnoticed
             for queue in self._clients.queues.values():
                 self._show_kept(queue, is_known)
 
-    # -- what publishers keep for late joiners -----------------------------------------------------------------
+    # -- messages kept for late joiners ------------------------------------------------------------------------
 
     def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic]) -> None:
-        """Send a client, a little later, what publishers of these topics keep."""
+        """Send a client the kept messages of these topics, a little later."""
         for served in topics:
             if served.selection.keepers:
                 self._tasks.run(self._show(queue, served))
@@ -240,7 +239,7 @@ class Topics:
             served.awaits_kept = False
 
     async def _mend(self) -> None:
-        """Show clients what they lack of a topic, once nothing comes on it and they keep up."""
+        """Send clients the messages that they lack of a topic, once it is quiet and they keep up."""
         lacking = [queue for queue in self._clients.queues.values() if queue.lacking and queue.keeps_up]
         for topic in {topic for queue in lacking for topic in queue.lacking}:
             served = self._served.get(topic)
@@ -256,8 +255,7 @@ class Topics:
     def snapshot(self, queue: ClientQueue, type_name: str | None = None, *, is_for_all: bool = False) -> list[Frame]:
         """Return schemas and latest values of all topics, or of those of one type. `is_for_all`: all clients get them.
 
-        What publishers keep goes to the client, and a large value that is not converted yet to everybody, a little
-        later.
+        A little later, kept messages are sent to the client, and large values that are not converted yet to all.
         """
         frames: list[Frame] = []
         topics = [served for served in self._served.values() if type_name in (None, served.subscription.type_name)]
@@ -269,7 +267,7 @@ class Topics:
         return frames
 
     async def everything(self) -> list[Frame]:
-        """Return all schemas, latest values, and what publishers keep."""
+        """Return all schemas, latest values and kept messages."""
         frames: list[Frame] = []
         topics = list(self._served.values())
         for served in topics:

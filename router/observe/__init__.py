@@ -1,1 +1,1 @@
-"""What a running router shows: metrics, HTTP with the status page, tap, Foxglove, `/diagnostics`."""
+"""Observing a running router: metrics, HTTP with the status page, tap, Foxglove, `/diagnostics`."""

@@ -1,4 +1,4 @@
-"""`/diagnostics`, once per second: one status for the router and each listener, endpoint, route and gateway."""
+"""Publishes `/diagnostics` once per second: a status for the router and each listener, endpoint, route and gateway."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from router.values import age_text
 
 
 class Level(enum.IntEnum):
-    """As in diagnostic_msgs/msg/DiagnosticStatus."""
+    """The levels of diagnostic_msgs/msg/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -43,7 +43,7 @@ _SEVERITY = (Level.OK, Level.WARN, Level.STALE, Level.ERROR)
 
 
 class Status(NamedTuple):
-    """One DiagnosticStatus; `name` without the node's."""
+    """One DiagnosticStatus. `name` does not include the node's."""
 
     level: Level
     name: str
@@ -75,7 +75,7 @@ class Diagnostics:
             try:
                 report = Report(self._health.look())
                 self._publish(diagnostic_array(wall_ns(), self._node, report.statuses()))
-            except Exception as error:  # noqa: BLE001 routing goes on without diagnostics
+            except Exception as error:  # noqa: BLE001 routing continues without diagnostics
                 if not has_failed:
                     logger.error("cannot publish diagnostics", problem=repr(error))
                 has_failed = True
@@ -84,7 +84,7 @@ class Diagnostics:
 
 
 class Report:
-    """The statuses that follow from a look at the router."""
+    """The statuses of a router at one time."""
 
     def __init__(self, look: Look) -> None:
         self._look = look
@@ -92,7 +92,7 @@ class Report:
         self._host = platform.node()
 
     def statuses(self) -> Iterator[Status]:
-        """The router's own first."""
+        """Yield all statuses, the router's own first."""
         table = self._program.table
         yield self._router()
         for listener in table.listeners:
@@ -106,7 +106,7 @@ class Report:
             yield self._gateway(gateway)
 
     def _router(self) -> Status:
-        """What is of nothing in particular is the router's."""
+        """Return the router's status, with the problems that belong to no listener, endpoint or route."""
         table = self._program.table
         places = {"listener", *_TO_ENDPOINTS}
         problems = (each for each in self._look.problems if not each.routes and not places & each.labels.keys())
@@ -141,7 +141,7 @@ class Report:
         ]
         sends = any(source.value == name for route in routes for source in route.sources)
         has_sent = self._look.now.total(LAST_SEEN, name)
-        well = "sends" if has_sent else "nothing came yet" if sends else "is not expected to send"
+        well = "sends" if has_sent else "nothing received yet" if sends else "is not expected to send"
         if any(name in away for away in self._look.away.values()):
             well = "is silent: nobody drives"
         problems = self._labelled(name, *_TO_ENDPOINTS)
@@ -160,7 +160,7 @@ class Report:
             *self._dropped(name),
             *((f"sent by the deadman to {to}", n) for (to,), n in self._counted("deadman_datagrams_sent", name)),
         ]
-        well = "routes" if received else "nothing came yet"
+        well = "routes" if received else "nothing received yet"
         return _status(f"route/{name}", self._host, self._concerning(name), well, values)
 
     def _gateway(self, gateway: GatewayPlan) -> Status:
@@ -187,7 +187,7 @@ class Report:
             yield f"dropped for {target}: {reason}", n
 
     def _dropped_for(self, endpoint: str) -> Iterator[tuple[str, int]]:
-        """Over all routes."""
+        """Yield reasons and numbers of drops, summed over all routes."""
         sums: Counter[str] = Counter()
         for (_, target, reason), n in self._look.now.counts("messages_dropped").items():
             if target == endpoint and n:
@@ -195,11 +195,11 @@ class Report:
         yield from sums.items()
 
     def _of_endpoint(self, metric: str, endpoint: str) -> int:
-        """Over all routes. The endpoint is the second label."""
+        """Return the sum over all routes of a metric whose second label is the endpoint."""
         return int(sum(value for labels, value in self._look.now.counts(metric).items() if labels[1] == endpoint))
 
     def _counted(self, metric: str, first: str) -> Iterator[tuple[Labels, int]]:
-        """The series that are not 0, by the labels behind the first."""
+        """Yield the series that are not 0, by their labels after the first."""
         return ((rest, int(value)) for rest, value in self._look.now.of(metric, first).items() if value)
 
 
@@ -210,7 +210,7 @@ _TO_ENDPOINTS = ("endpoint", "target", "destination")
 def _status(
     name: str, host: str, problems: Iterable[Problem], well: str, values: Iterable[tuple[str, object]]
 ) -> Status:
-    """The worst problem gives the level; the message has all of them."""
+    """Make a status. The worst problem gives the level; the message lists all."""
     found = sorted(problems, key=lambda problem: -_SEVERITY.index(_level(problem)))
     level = _level(found[0]) if found else Level.OK
     message = "; ".join(problem.text for problem in found) or well
@@ -223,7 +223,7 @@ def _level(problem: Problem) -> Level:
 
 
 def diagnostic_array(stamp: int, node: str, statuses: Iterable[Status]) -> bytes:
-    """CDR, with its header. `stamp` in ns of the wall clock."""
+    """Return a DiagnosticArray as CDR with its header. `stamp`: wall clock, ns."""
     every = list(statuses)
     data = bytearray(struct.pack("<iI", stamp // 10**9, stamp % 10**9))
     put_text(data, "")

@@ -1,6 +1,6 @@
-"""The live view in Foxglove: a WebSocket server with a channel for each payload case, named as in recordings.
+"""Live view in Foxglove: a WebSocket server with a channel for each payload case, named as in recordings.
 
-Only what a route took is shown. Foxglove decodes payloads by the descriptors that the channels carry. The mirror is
+Only accepted datagrams are shown. Foxglove decodes payloads with the descriptors in the channels. The mirror is
 attached while a client subscribes.
 """
 
@@ -29,13 +29,13 @@ from router.threads import Thread, background_threads, join_or_leave
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0
-"""The longest time until a reload is noticed."""
+"""The longest time until a reload is detected, s."""
 
 _OS_ERROR = re.compile(r"\(os error (\d+)\)")
 
 
 class _ChannelKey(NamedTuple):
-    """What makes a channel: a payload case, the full name of its message, and a FileDescriptorSet."""
+    """The identity of a channel: a payload case, the full name of its message, and a FileDescriptorSet."""
 
     case: str
     message: str
@@ -56,7 +56,7 @@ class _View(NamedTuple):
 
 
 class FoxgloveServer(ServerListener):
-    """Serves at `address` until it is closed. Clients cannot send anything. Opening raises StartError.
+    """Serves at `address` until it is closed. Clients cannot send. Raises StartError.
 
     The library's threads report subscriptions; the thread `foxglove` acts on them.
     """
@@ -90,7 +90,7 @@ class FoxgloveServer(ServerListener):
         self._changed.set()
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        """Also called when the client has left, or the channel was closed."""
+        """Also called when the client leaves or the channel is closed."""
         self._subscribed.discard((client.id, channel.id))
         self._changed.set()
 
@@ -107,7 +107,7 @@ class FoxgloveServer(ServerListener):
                 if is_well:
                     logger.error("Foxglove server is down; retrying", why=str(error))
                 is_well = False
-            except Exception as error:  # noqa: BLE001 a fault of the router, reported once; it may be over next time
+            except Exception as error:  # noqa: BLE001 a fault of the router, reported once; retry
                 if is_well:
                     fault(error, "stopped its updates", "the Foxglove server").log()
                 is_well = False
@@ -116,7 +116,7 @@ class FoxgloveServer(ServerListener):
         self._detach_from_mirror()
 
     def _listen_again(self) -> None:
-        """The library ceases to accept connections for good when descriptors run out. Raises StartError."""
+        """Reopen the server: when descriptors run out, the library stops accepting for good. Raises StartError."""
         if not is_listening(self.address.port):
             self._server.stop()
             self._subscribed.clear()
@@ -153,7 +153,7 @@ class FoxgloveServer(ServerListener):
         return _View(program, Classifier(program.envelope, program.table), channels)
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
-        """Log the accepted payloads of subscribed channels. Called by the mirror's thread."""
+        """Send the accepted payloads of subscribed channels. Called by the mirror's thread."""
         program, classifier, channels = self._view
         wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}
         for at, listener, _, _, reason, data in batch:
@@ -185,6 +185,6 @@ class _DebugLog(logging.Handler):
 
 
 _LOG = logging.getLogger("foxglove")
-"""Where the library reports clients that broke the protocol or were too slow: seldom of use to an operator."""
+"""The library logs clients that violate the protocol or are too slow, which seldom helps an operator."""
 _LOG.propagate = False
 _LOG.addHandler(_DebugLog())

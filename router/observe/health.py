@@ -187,7 +187,7 @@ class Look:
                 remedy = _OTHER_ADDRESS.format(endpoint=name, address=self._host(name), sender=sender)
                 labels = {"endpoint": name, "sender": sender}
                 problem = problem._replace(
-                    labels=labels, more=f"{more}; {sender} sends its messages instead", remedy=remedy
+                    labels=labels, more=f"{more}, while {sender} sends its messages", remedy=remedy
                 )
             elif len(silent) == len(self._limits) > 1:
                 problem = problem._replace(remedy=_ALL_SILENT)

@@ -1,17 +1,17 @@
-"""HTTP of a running router: metrics, health, the status page; and for programs on the same computer taps and orders.
+"""The HTTP server of a running router: metrics, health, status page; for local programs also taps and actions.
 
-    GET  /             the status page, which asks for /status.json, /recent.json and /map.json
+    GET  /             the status page, which requests /status.json, /recent.json and /map.json
     GET  /metrics      for Prometheus
-    GET  /health.json  what is wrong, for `router status`, `top` and doctor
-    GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck
+    GET  /health.json  problems, for `router status`, `top` and doctor
+    GET  /healthz      200, or 503 while the receive thread is stuck
     GET  /ready        200 while everything is open
-    GET  /tap          what is received (see tap): ?case=NAME&from=ENDPOINT&only=accepted, or rejected
-    POST /-/reload     {"ok", "text", "findings"}: 200, or 422 where nothing was changed
-    POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept; the status
-                       page may order this from any computer, gets the file's name only, and 429 within 10 s
+    GET  /tap          received datagrams (see tap): ?case=NAME&from=ENDPOINT&only=accepted, or rejected
+    POST /-/reload     {"ok", "text", "findings"}: 200, or 422 if the reload was rejected
+    POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 on failure, 404 if nothing is kept; the status page may
+                       do this from any computer, but gets only the file's name, and 429 within 10 s
 
-Each connection has a thread of low priority. Connections, sizes and times are bounded here; `responses` has what is
-answered.
+Each connection has a thread of low priority. Connections, sizes and times are bounded here; `responses` makes the
+responses.
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ from router.table.addresses import Address
 from router.threads import REST_S, Thread, join_or_leave
 
 MAX_PER_HOST = 16
-"""Connections. The router's own computer counts as one host, whatever its addresses."""
+"""Connections. The router's own computer counts as one host, with all its addresses."""
 MAX_FROM_OTHERS = 48
-"""Connections of all other computers together: what they do leaves those of the router's own computer alone."""
+"""Connections of all other computers together, so that they cannot exclude the router's own computer."""
 MAX_TAPS = 6
 MAX_ANSWERING = 4
 MAX_ORDERS = 4
 MAX_REQUEST = 1 << 14
 MAX_IN_QUERY = 200
 MAX_IN_KERNEL = 1 << 17
-"""Bytes that wait there for a slow client."""
+"""Bytes that wait in the kernel for a slow client."""
 
 IDLE_SECONDS = 30.0
-"""A connection ends when there is no whole request for so long, or nothing is taken of a tap."""
+"""A connection ends if there is no complete request for this long, or a tap's client reads nothing."""
 RESPONSE_SECONDS = 10.0
-"""A connection ends when a response is not taken as a whole within so long."""
+"""A connection ends if its client does not read a whole response within this time."""
 REST_SECONDS = 0.05
-"""Between two requests on a connection, so that who asks without end costs routing little."""
+"""The pause between two requests on a connection, so that endless requests cost routing little."""
 REFUSAL_SECONDS = 0.003
-"""After a connection was refused, so that who connects without end costs routing little."""
+"""The pause after a rejected connection, so that endless connections cost routing little."""
 
 OWN_COMPUTER = "own"
 
@@ -77,9 +77,9 @@ _BY_BROWSERS = ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode")
 
 
 class HttpServer:
-    """Serves at `address` until closed. `save` writes the last datagrams to a file; None where none are kept.
+    """Serves at `address` until closed. `save` writes the last datagrams to a file; None if none are kept.
 
-    Raises StartError where the address cannot be opened.
+    Raises StartError if the address cannot be opened.
     """
 
     def __init__(
@@ -115,9 +115,9 @@ class HttpServer:
 
 
 class _Server:
-    """A thread for each connection that is admitted; others are refused at once (503).
+    """Serves each admitted connection in a thread of its own; rejects others at once (503).
 
-    Where memory, threads or descriptors have run out, the connection is closed, and the next one accepted after a rest.
+    If memory, threads or descriptors run out, the connection is closed, and the next one accepted after a pause.
     """
 
     def __init__(self, address: Address, responder: Responder) -> None:
@@ -132,7 +132,7 @@ class _Server:
         while not self._is_ending:
             try:
                 self._accept()
-            except Exception as error:  # noqa: BLE001 reported; whatever it was, the next client is served
+            except Exception as error:  # noqa: BLE001 reported; the next client is still served
                 if not self._is_ending:
                     self._lost(error)
                     sleep(REST_S)
@@ -163,8 +163,8 @@ class _Server:
         except ConnectionError:
             pass  # the client has left
         except TimeoutError:
-            _reset(connection)  # what was not taken is dropped
-        except Exception as error:  # noqa: BLE001 reported, and lost to this client alone
+            _reset(connection)  # drop unread data
+        except Exception as error:  # noqa: BLE001 reported; affects only this client
             self._lost(error)
         finally:
             self._close(connection)
@@ -176,15 +176,15 @@ class _Server:
         connection.close()
 
     def _lost(self, error: Exception) -> None:
-        found = fault(error, "lost an answer over HTTP")
+        found = fault(error, "lost an HTTP response")
         self._log.note(type(error).__name__, found.emit, found.event, found.error)
         self._log.flush()
 
 
 class Connections:
-    """Those that are open, with their hosts, and those of them that are taps. Thread-safe.
+    """The open connections, with their hosts, and which of them are taps. Thread-safe.
 
-    Where all places are taken a new one is refused; the limits of time free places that nobody uses.
+    If there is no room, a new one is rejected. Timeouts close unused ones.
     """
 
     def __init__(self) -> None:
@@ -223,7 +223,7 @@ class Connections:
 
 
 def _reset(connection: socket.socket) -> None:
-    """Have the kernel drop, when the connection is closed, what the client has not taken."""
+    """Let the kernel drop data that the client has not read when the connection is closed."""
     with suppress(OSError):
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
@@ -231,8 +231,8 @@ def _reset(connection: socket.socket) -> None:
 class _Handler(BaseHTTPRequestHandler):
     """One connection, in a thread of its own until the client leaves.
 
-    A request is read as a whole, then answered into memory, which at most MAX_ANSWERING threads do at a time, and then
-    sent: a slow client holds up its own connection only.
+    Reads a whole request, makes the response in memory (at most MAX_ANSWERING threads at a time), then sends it: a slow
+    client delays only its own connection.
     """
 
     protocol_version = "HTTP/1.1"
@@ -245,7 +245,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._connections = connections
         self._ahead = bytearray()
         self._out = BytesIO()
-        self._slow: Callable[[], None] | None = None  # what is done outside of `_answering`
+        self._slow: Callable[[], None] | None = None  # called outside of `_answering`
         super().__init__(*connection)
 
     def setup(self) -> None:
@@ -273,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
             rested_at = monotonic() + REST_SECONDS
 
     def _request(self) -> bytes | None:
-        """The lines of the next request; None where no whole one comes, or one beyond MAX_REQUEST."""
+        """Return the lines of the next request; None if none is complete, or it exceeds MAX_REQUEST."""
         deadline, looked_at = monotonic() + IDLE_SECONDS, 0
         while (end := _END.search(self._ahead, looked_at)) is None:
             if len(self._ahead) > MAX_REQUEST:
@@ -293,7 +293,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self) -> None:
         self.connection.settimeout(RESPONSE_SECONDS)
-        self.connection.sendall(self._out.getvalue())  # the timeout is that of the whole
+        self.connection.sendall(self._out.getvalue())  # the timeout is for all of it
 
     def do_GET(self) -> None:
         path, _, asked = self.path.partition("?")
@@ -364,7 +364,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "HEAD":
             return
         with closing(Tap(running.mirror, is_wanted)) as tap:
-            self._send()  # now, so that a client with the response misses nothing that is sent after it
+            self._send()  # at once: after the response, the client misses nothing
             self._out = BytesIO()
             self._stream(tap.stream())
 
@@ -383,25 +383,24 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def refusal(peer: str, own: str, headers: Message) -> str | None:
-    """Return why a client at IP address `peer`, who reached us at `own`, may not order or tap; None where it may.
+    """Return why a client at IP address `peer`, connected to our address `own`, may not use taps and actions, or None.
 
-    A browser would call for any page that is open in it, and a name may have been made to lead here only after that
-    page was loaded (DNS rebinding): so no browsers, and no names.
+    Any page in a browser could send such requests. So browsers are rejected, and host names too (DNS rebinding).
     """
     if not is_own_computer(peer, own):
-        return f"only from the router's own computer, not from {peer}"
+        return f"only allowed from the router's own computer, not from {peer}"
     if any(name in headers for name in _BY_BROWSERS):
         return "not for browsers: use the command line"
     hosts = headers.get_all("Host", [])
     if len(hosts) != 1 or not _is_plain(hosts[0]):
-        return "only by an IP address or localhost, not by a name"
+        return "use an IP address or localhost, not a host name"
     return None
 
 
 def is_own_page(headers: Message) -> bool:
-    """Return whether a browser asks for a page that came from this server, by an IP address or localhost.
+    """Return whether a browser sends this from a page of this server, opened by IP address or as localhost.
 
-    Host names are not trusted: one may lead here only since a page of somebody else was loaded from it (DNS rebinding).
+    Host names are not trusted (DNS rebinding).
     """
     origins, hosts = headers.get_all("Origin", []), headers.get_all("Host", [])
     is_same = len(hosts) == 1 and _is_plain(hosts[0]) and origins == [f"http://{hosts[0]}"]
@@ -409,7 +408,7 @@ def is_own_page(headers: Message) -> bool:
 
 
 def is_own_computer(peer: str, own: str) -> bool:
-    """Return whether a client at IP address `peer`, who reached us at `own`, is on the router's computer."""
+    """Return whether a client at IP address `peer`, connected to our address `own`, is on the router's computer."""
     return ipaddress.ip_address(peer).is_loopback or peer == own
 
 

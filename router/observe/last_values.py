@@ -1,6 +1,6 @@
-"""The newest value of each payload case that a route took, for the status page.
+"""The newest accepted value of each payload case, for the status page.
 
-The mirror is attached while a page asks, and datagrams are decoded when it does.
+The mirror is attached while a page requests values; a request decodes the newest datagrams.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from router.recording.mirror import Classifier, Mirrored, first_field
 from router.threads import Thread
 
 LOOKED_AT_SECONDS = 5.0
-"""How long the mirror stays attached after a request; a page asks every second."""
+"""How long the mirror stays attached after a request; a page sends one every second."""
 
 MOST_ELEMENTS = 24
 MOST_CHARACTERS = 200
@@ -27,7 +27,7 @@ Value = dict[str, Any]
 
 
 class LastValues:
-    """The newest accepted datagram of each payload case since the first of requests that follow one another."""
+    """The newest accepted datagram of each payload case since the first of a series of requests."""
 
     def __init__(self, running: Running) -> None:
         self._running = running
@@ -40,7 +40,7 @@ class LastValues:
         self._closing = threading.Event()
 
     def of(self, program: Program) -> Mapping[str, Value]:
-        """Return by payload case: `at` (s), `source`, `bytes`, and its `fields`. The first request returns nothing."""
+        """Return `at` (s), `source`, `bytes` and `fields` by payload case. The first request returns nothing."""
         with self._lock:
             self._until = monotonic() + LOOKED_AT_SECONDS
             if self._detach is None and not self._closing.is_set():
@@ -98,7 +98,7 @@ class LastValues:
 
 
 def shortened(value: Any) -> Any:
-    """Return the value with long lists and long texts cut."""
+    """Return the value with long lists and texts truncated."""
     if isinstance(value, dict):
         return {key: shortened(inner) for key, inner in value.items()}
     if isinstance(value, list):

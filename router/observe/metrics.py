@@ -22,15 +22,14 @@ _EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
 _BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
-"""Returns the label values, in the metric's order, and the value of each series that there is now."""
+"""Returns label values, in the metric's order, and value of each current series."""
 
 
 class CountersCollector(Collector):
-    """All series of the counters, each from its first scrape on, at 0 while nothing has happened.
+    """Exports all series of the counters from the first scrape on, even at 0.
 
-    `counts()` copies the list of each thread that counts: a counter or level is their sum, a number or time the
-    largest.
-    `asked` has functions that are called at each scrape instead, by metric. `build`: the labels of `router_build_info`.
+    `counts()` copies the list of each counting thread: a counter or level is their sum, a number or time their maximum.
+    `asked` has, by metric, functions that are called at each scrape instead. `build`: labels of `router_build_info`.
     """
 
     def __init__(
@@ -80,7 +79,7 @@ class CountersCollector(Collector):
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
     """Pause every SAMPLES_PER_REST samples, so that a scrape does not hold the interpreter lock for its whole 5 ms.
 
-    A thread that needs the lock then mostly waits for 0.1 ms, and without rests for a whole switch interval.
+    A thread that needs the lock then usually waits 0.1 ms; without pauses it waits for a whole switch interval.
     """
     for number, sample in enumerate(samples, 1):
         if number % SAMPLES_PER_REST == 0:

@@ -1,4 +1,4 @@
-"""Logs what was lost and what deadmen do, and remembers who sends what no route takes from them."""
+"""Logs losses and deadmen, and remembers senders whose messages no route accepts from them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from router.table.addresses import Address
 from router.threads import Thread, join_or_leave
 
 MOST_MISMATCHES = 64
-"""Hosts are strangers': their number is bounded, and those of last come first."""
+"""The most mismatches remembered, the latest ones: any stranger can cause them."""
 
 
 class Reporter:
-    """Logs the first report of a kind at once and then at most one line per 10 s, from a thread of its own."""
+    """Logs the first report of a kind at once, then at most one line per 10 s, in a thread of its own."""
 
     def __init__(self, address_of: Callable[[str], Address | None]) -> None:
         """`address_of` returns the address of an endpoint of the running table, None for any other target."""
@@ -27,19 +27,19 @@ class Reporter:
         self._mismatches: dict[Mismatch, int] = {}
         self._lock = threading.Lock()
         self._lost: dict[tuple[str, str], tuple[int, Report]] = {}
-        """By route and target, when a message was lost last, and how."""
+        """The time and report of the last loss, by route and target."""
         self._stopped = threading.Event()
         self._thread = Thread(self._summarise, "log")  # the start may fail
         self._thread.start()
 
     def close(self) -> None:
-        """Log what has not been logged yet."""
+        """Log the remaining reports."""
         self._stopped.set()
         join_or_leave(self._thread)
         self._floods.flush(final=True)
 
     def mismatches(self) -> Mapping[Mismatch, int]:
-        """When each of the latest mismatches was seen last: ns of the boot clock."""
+        """Return when each of the latest mismatches last occurred (boot clock, ns)."""
         with self._lock:
             return self._mismatches.copy()
 
@@ -92,7 +92,7 @@ class Reporter:
         self._floods.note(("bug", type(error)), found.emit, found.event, found.error)
 
     def deadman_changed(self, route: str, active: bool, plan: DeadmanPlan | None) -> None:
-        """Log that the deadman of a route has tripped or was released; `plan` is that of the running table."""
+        """Log that the deadman of a route has tripped or was released. `plan` is its plan in the running table."""
         if not active:
             logger.warning("commands arrive again; the deadman has stopped sending", route=route)
         elif lost := self._lost_for(plan):
@@ -102,12 +102,12 @@ class Reporter:
             logger.warning("no commands arrive; the deadman sends in their place", route=route)
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
-        """The last command that was lost since the last one left; None if there was none."""
+        """Return the last command that was lost within the timeout, or None."""
         if plan is None:
             return None
         since, last = boottime_ns() - plan.timeout, None
         for target, _ in plan.datagrams:
-            place = plan.route.removesuffix(f":{target}")  # of a client's deadman, its gateway
+            place = plan.route.removesuffix(f":{target}")  # for a client's deadman, the gateway
             at, lost = self._lost.get((place, target), (0, None))
             if at >= since:
                 since, last = at, lost

@@ -1,4 +1,4 @@
-"""The responses to HTTP requests, but for taps: metrics, health, the status page, and orders to the router."""
+"""The responses to HTTP requests, except for taps: metrics, health, the status page, and actions."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from router.observe.watch import Health
 PAGE = Path(__file__).with_name("status_page.html")
 
 KEPT_SECONDS = 0.5
-"""How long a response that is costly to make is reused for the same request."""
+"""How long an expensive response is reused for the same request."""
 
 SAVE_SECONDS = 10.0
-"""From one order of a page to save until the next."""
+"""The minimum time between two saves by pages."""
 
 SAVE = "/record/save"
 
 GZIP_FROM = 1000
-"""Bytes of a response that are worth compressing."""
+"""The least bytes of a response that is compressed."""
 
 OPEN_METRICS = "application/openmetrics-text"
 
@@ -56,7 +56,7 @@ class Response:
 
     @cached_property
     def zipped(self) -> Response:
-        """The same, compressed where that is worth it."""
+        """The response, compressed if that is worth it."""
         if len(self.body) < GZIP_FROM:
             return self
         headers = {**self.headers, "Content-Encoding": "gzip"}
@@ -72,10 +72,10 @@ def _json(status: HTTPStatus, value: Mapping[str, Any]) -> Response:
 
 
 class _Cache:
-    """Responses that are costly to make, each made at most every KEPT_SECONDS, and one at a time."""
+    """Expensive responses, each made at most every KEPT_SECONDS, and one at a time."""
 
     def __init__(self) -> None:
-        self._responses: dict[str, tuple[float, Response]] = {}  # with when each was made (monotonic, s)
+        self._responses: dict[str, tuple[float, Response]] = {}  # time of making (monotonic, s), response
         self._making = threading.Lock()
 
     def get(self, key: str, make: Callable[[], Response]) -> Response:
@@ -89,7 +89,7 @@ class _Cache:
 
 
 class Responder:
-    """Thread-safe. `save` as for HttpServer."""
+    """Makes responses. Thread-safe. `save`: see HttpServer."""
 
     def __init__(self, running: Running, health: Health, status: Status, save: Callable[[str], Path] | None) -> None:
         self.running = running
@@ -124,7 +124,7 @@ class Responder:
         return plain(HTTPStatus.NOT_FOUND, "not found; there are /, /metrics, /healthz, /ready and /tap")
 
     def metrics(self, accepts: str) -> Response:
-        """In one of two formats: each version and escaping, which clients may make up, would be encoded anew."""
+        """Return the metrics in one of two formats: with more, clients could defeat the cache."""
         asked = OPEN_METRICS if OPEN_METRICS in accepts else ""
         return self._cache.get(f"metrics {asked}", partial(self._collected, asked))
 
@@ -169,7 +169,7 @@ class Responder:
             return _json(HTTPStatus.CONFLICT, {"ok": False, "text": str(error)})
 
     def save_for_page(self) -> Response:
-        """As POST /record/save, for a page in a browser anywhere: at most every SAVE_SECONDS, and without paths."""
+        """Like POST /record/save, for a page in any browser: at most every SAVE_SECONDS, and without paths."""
         with self._page_saving:
             wait = self._page_saved + SAVE_SECONDS - monotonic()
             if wait > 0 and self._save is not None:

@@ -1,7 +1,7 @@
-"""The map of a route table: what sends what to whom, for the status page and `router graph`.
+"""The map of a route table: sources, payload cases and targets, for the status page and `router graph`.
 
-Sources are on the left, payload cases in the middle, targets on the right. Edges carry the labels under which the
-metrics count what goes over them.
+Sources are on the left, payload cases in the middle, targets on the right. Edges have the labels with which
+metrics count their messages.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class NodeKind(enum.Enum):
 class Node:
     """An endpoint, a topic, a payload case, a gateway or its clients, in a column of the map.
 
-    `key` is unique in a map. `about` says in a few words what the name does not: an address, a type, a ttl.
-    Endpoints have an `address` and a `role`, as in `kind: board`; clients of a gateway have an `address`. A
-    payload case `is_guarded` by a ttl or a deadman.
+    `key` is unique in a map. `about` adds a few words to the name: an address, a type, a ttl. Endpoints have an
+    `address` and a `role` (their `kind`); clients of a gateway have an `address`. A payload case `is_guarded` by a ttl
+    or a deadman.
     """
 
     key: str
@@ -52,9 +52,9 @@ class Node:
 class Edge:
     """Messages go from one node to another, named by their keys.
 
-    `route` and `label` are those of the metrics. An edge to a case is counted as
-    `messages_received{route, source=label}`, for ANY the sum over all sources; one from a case as `datagrams_sent`
-    or `messages_published`; a gateway's to its clients as `messages_sent`. `about` says under which conditions.
+    `route` and `label` are labels of metrics. An edge to a case is counted by `messages_received{route, source=label}`,
+    summed over all sources for ANY; an edge from a case by `datagrams_sent` or `messages_published`; an edge from a
+    gateway to its clients by `messages_sent`. `about` has the conditions.
     """
 
     start: str
@@ -65,7 +65,7 @@ class Edge:
 
 
 def nodes_and_edges(table: RouteTable) -> tuple[list[Node], list[Edge]]:
-    """Everything that the table names in a route or a gateway, each once in a column, in the order of the table."""
+    """Return everything that routes and gateways name, once per column, in the order of the table."""
     nodes: dict[str, Node] = {}
     edges: list[Edge] = []
     for route in table.routes:

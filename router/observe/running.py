@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ReloadResult(NamedTuple):
-    """The outcome of a reload: the findings of the table, and in a line what changed or why nothing did."""
+    """The result of a reload: the findings of the table, and one line that says what changed, or why nothing did."""
 
     ok: bool
     findings: tuple[Diagnostic, ...]
@@ -29,7 +29,7 @@ class Running(Protocol):
 
     @property
     def program(self) -> Program:
-        """What runs now; a reload replaces it."""
+        """The running program; a reload replaces it."""
 
     @property
     def is_ready(self) -> bool:
@@ -39,10 +39,10 @@ class Running(Protocol):
         """All metrics, for prometheus_client."""
 
     def mismatches(self) -> Mapping[Mismatch, int]:
-        """What came from a host that no route takes it from, and when last: ns of the boot clock."""
+        """Return messages from hosts that no route accepts them from, and their latest time (boot clock, ns)."""
 
     def progress(self) -> int:
         """Return a number that changes at least every half second unless the receive thread is stuck."""
 
     def reload(self) -> ReloadResult:
-        """Read the table anew and swap; one at a time. What is wrong with the table is returned, not raised."""
+        """Read the table again and switch to it; one call at a time. Errors of the table are returned, not raised."""

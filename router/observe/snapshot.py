@@ -1,4 +1,4 @@
-"""The router's numbers at one time, by metric and label values: for status page, `/diagnostics` and `router top`."""
+"""Snapshots of all metrics of a router, for the status page, `/diagnostics` and `router top`."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric as Family
 
 PREFIX = "router_"
-"""Of the exported names."""
+"""The prefix of exported names."""
 
 COLLECTED_AT = "X-Collected-At"
-"""Header of /metrics: when the numbers were read, in seconds of the router's wall clock."""
+"""A header of /metrics: when they were collected, in seconds of the router's wall clock."""
 
 BUCKETS = "_bucket"
-"""Suffix of a histogram's name. Its values are cumulative, as in Prometheus: how many were not slower than `le`."""
+"""The suffix of a histogram's name. Its values are cumulative, as in Prometheus: the number at or below `le`."""
 
 DELIVERED = ("datagrams_sent", "messages_published", "messages_sent")
-"""The metrics that count what targets got; their second label is the target."""
+"""The metrics that count deliveries to targets; the second label is the target."""
 
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
@@ -30,7 +30,7 @@ Counts = Mapping[Labels, float]
 SERIES: Mapping[str, Labels] = {metric.name: metric.labels for metric in METRICS} | {
     f"{metric.name}{BUCKETS}": (*metric.labels, "le") for metric in METRICS if metric.kind == "histogram"
 }
-"""Labels by the name of the metric, as a snapshot has it: without prefix and `_total`."""
+"""The labels of each metric, by its name in snapshots: without prefix and `_total`."""
 
 _EXPORTED = {PREFIX + name: name for name in SERIES} | {
     f"{PREFIX}{metric.name}_total": metric.name for metric in METRICS if metric.kind == "counter"
@@ -39,7 +39,7 @@ _EXPORTED = {PREFIX + name: name for name in SERIES} | {
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Values by a name of SERIES and label values, in the metric's order. `at`: seconds of any clock."""
+    """Values by a name in SERIES and label values, in the metric's order. `at`: seconds of any clock."""
 
     at: float
     values: Mapping[str, Counts]
@@ -51,7 +51,7 @@ class Snapshot:
         return self.values.get(metric, {})
 
     def of(self, metric: str, first: str = "") -> Counts:
-        """The series whose first label is `first`, by their other labels. A metric without labels has one, at `()`."""
+        """Return the series whose first label is `first`, by their other labels: `()` if there are none."""
         if metric not in self._by_first:
             groups: dict[str, dict[Labels, float]] = defaultdict(dict)
             for labels, value in self.counts(metric).items():
@@ -60,7 +60,7 @@ class Snapshot:
         return self._by_first[metric].get(first, {})
 
     def total(self, metric: str, *labels: str) -> int:
-        """The sum over all series whose labels begin so."""
+        """Return the sum over all series that begin with these labels."""
         if not labels:
             return int(sum(self.counts(metric).values()))
         first, *others = labels
@@ -69,7 +69,7 @@ class Snapshot:
 
 
 def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | None = None) -> Snapshot:
-    """Read what a collector gives, or the parser of the text format. None: all `metrics`; of others nothing is made."""
+    """Make a snapshot from the output of a collector, or of the text format's parser. `metrics`: only these."""
     values: dict[str, dict[Labels, float]] = defaultdict(dict)
     for family in families:
         if metrics is not None and family.name.removeprefix(PREFIX) not in metrics:
@@ -82,7 +82,7 @@ def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | N
 
 
 def parse_metrics(text: str, at: float) -> Snapshot:
-    """The snapshot in the text of /metrics. Raises ValueError or KeyError where it is not that of a router."""
+    """Parse the text of /metrics. Raises ValueError or KeyError if it is not the text of a router."""
     from prometheus_client.parser import text_string_to_metric_families
 
     return snapshot(text_string_to_metric_families(text), at)

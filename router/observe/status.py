@@ -1,4 +1,4 @@
-"""What the status page asks for, as JSON: the map of the running table, its numbers, and the last values."""
+"""The JSON for the status page: the map of the running table, its numbers, and the last values."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PATHS = {
     "kernel_drops": "listeners {listener} kernel_drops",
     "datagrams_rejected": "listeners {listener} rejected {reason}",
 }
-"""Where the values of each metric stand in the numbers: keys, and labels in braces."""
+"""The place of each metric in `numbers`: keys, and labels in braces."""
 
 IF_ANY = {
     "messages_dropped",
@@ -45,11 +45,11 @@ IF_ANY = {
     "client_messages_dropped",
     "datagrams_rejected",
 }
-"""Left out where they are 0."""
+"""Metrics that are omitted while they are 0."""
 
 
 class Status:
-    """Thread-safe. Times are seconds of the router's wall clock. `can_save`: whether the last datagrams are kept."""
+    """Makes the JSON. Thread-safe. Times are wall-clock seconds. `can_save`: whether the last datagrams are kept."""
 
     def __init__(self, running: Running, health: Health, can_save: bool = False) -> None:
         self._running = running
@@ -59,9 +59,9 @@ class Status:
         self._values = LastValues(running)
 
     def numbers(self) -> Json:
-        """Everything that changes. `map` says to which map it belongs, which changes with the table.
+        """Return everything that changes. `map` identifies the map, which changes with the table.
 
-        `started` is different for each run of the router: counters begin again there.
+        `started` differs for each run of the router, since counters restart at zero.
         """
         running = self._running
         program = running.program
@@ -78,12 +78,12 @@ class Status:
         }
 
     def recent(self) -> Json:
-        """The numbers of the last seconds, oldest first and without latencies: a page that opens has rates at once."""
+        """Return the numbers of the last seconds, oldest first, without latencies: a new page has rates at once."""
         booted = (wall_ns() - boottime_ns()) / 1e9  # snapshots of a look have the boot clock
         return {"numbers": [{"at": booted + each.at, **numbers(each)} for each in self._health.look().snapshots]}
 
     def health(self) -> Json:
-        """What is wrong. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
+        """Return all problems. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
         look = self._health.look()
         return {
             "table": look.program.table.sha256,
@@ -92,8 +92,8 @@ class Status:
         }
 
     def map(self) -> Json:
-        """What does not change while a table runs. `keeps`: how many seconds can be saved, None where none. `intended`:
-        the reasons of losses that the table asks for."""
+        """Return everything that is fixed while a table runs. `keeps`: seconds that can be saved, or None. `intended`:
+        reasons of losses that the table asks for."""
         table = self._running.program.table
         kept = table.record.last if self._can_save and table.record is not None else None
         return {
@@ -108,9 +108,9 @@ class Status:
 
 
 def numbers(now: Snapshot) -> Json:
-    """All that is counted, by route, endpoint and listener. Times in seconds, counts since the start.
+    """Return all metrics by route, endpoint and listener. Times in seconds, counts since the start.
 
-    `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
+    `routes` includes gateways. A route's `buckets` are cumulative, in the order of bounds.
     """
     groups = ("routes", "endpoints", "listeners")
     found: Json = {group: {} for group in groups}
@@ -134,7 +134,7 @@ def numbers(now: Snapshot) -> Json:
 
 
 def _steps(metric: str, path: str) -> tuple[str | int, ...]:
-    """The keys of a path; in place of labels their indexes."""
+    """Return the keys of a path, with indexes in place of labels."""
     return tuple(SERIES[metric].index(key[1:-1]) if key.startswith("{") else key for key in path.split())
 
 
@@ -142,8 +142,8 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
 def _map_json(table: RouteTable) -> Json:
-    """`pages`: the gateways that are a page for browsers, with the address that they wait at. `deadmen`: the payload
-    case that each route's deadman sends, and the endpoints that get it."""
+    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: the
+    payload case that each route's deadman sends, and its endpoints."""
     nodes, edges = nodes_and_edges(table)
     deadmen = {route.name: route.deadman for route in table.routes if route.deadman is not None}
     halted = [endpoint_node(table.endpoints[to.value], "to", 2) for each in deadmen.values() for to in each.to]

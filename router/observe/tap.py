@@ -1,13 +1,13 @@
-"""A tap on a running router: what it receives, and what it decides about it, as a stream of bytes over HTTP.
+"""A tap on a running router: a stream of received datagrams and the decisions about them, over HTTP.
 
-The stream is MAGIC and then records, each behind its length: `<uint32 length> <uint8 kind> ...`, all little-endian.
+The stream is MAGIC, then records, each preceded by its length: `<uint32 length> <uint8 kind> ...`, little-endian.
 
     SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <listener> <endpoint> <reason> <datagram>
-    LOST   <uint64 count>    so many were not sent, because the reader of the stream is too slow
-    ALIVE                    nothing was seen: once a second where there is nothing to send
+    LOST   <uint64 count>    the number of datagrams not sent, because the reader of the stream is too slow
+    ALIVE                    once a second if there is nothing else to send
 
-Listener, endpoint and reason, as in MirroredDatagram, are texts behind their lengths (uint16). A datagram longer than
-the router takes is cut to one byte more than that.
+Listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16). A datagram longer
+than the router accepts is cut to one byte more than that.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CONTENT_TYPE = "application/x-router-tap"
 SEEN, LOST, ALIVE = 1, 2, 3
 
 MAX_WAITING = 4 << 20
-"""Bytes that wait for a slow reader."""
+"""The most bytes in the queue of a slow reader."""
 
 ALIVE_SECONDS = 1.0
 
@@ -46,21 +46,20 @@ Wanted = Callable[[Mirrored], bool]
 
 ACCEPTED, REJECTED = "accepted", "rejected"
 DECISIONS = (ACCEPTED, REJECTED)
-"""What a tap may be limited to."""
+"""The decisions that a tap can be limited to."""
 
 
 class TapRequestError(RouterError):
-    """A payload case, an endpoint or a decision was asked for that there is not."""
+    """A request names a payload case, endpoint or decision that does not exist."""
 
 
 def wanted(
     program: Program, cases: Sequence[str], sources: Sequence[str], decisions: Sequence[str] = ()
 ) -> Wanted | None:
-    """Return what tells whether a datagram is of these payload cases, from these endpoints, and was decided about in
-    this way; None: all are wanted.
+    """Return a filter for datagrams of these payload cases, sources and decisions; None if all are wanted.
 
-    What does not begin with the field of a payload case is wanted in any case: only a decoder can say what it is.
-    A source may be an IPv4 address as well. Raises TapRequestError.
+    A datagram that does not begin with the field of a payload case always passes: only a decoder can classify it. A
+    source is an endpoint or an IPv4 address. Raises TapRequestError.
     """
     asked = [
         *([_of_decision(decisions)] if decisions else []),
@@ -108,7 +107,7 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
 
 
 class Tap:
-    """What is received from now until `close`, as a stream. A reader that is too slow misses datagrams."""
+    """A stream of the datagrams received until `close`. A slow reader misses some."""
 
     def __init__(self, mirror: Mirror, is_wanted: Wanted | None) -> None:
         self._mirror = mirror
@@ -122,7 +121,7 @@ class Tap:
         self._detach = mirror.attach(self._take)
 
     def stream(self) -> Iterator[bytes]:
-        """Piece by piece, each as soon as there is one; at least one a second. Ends after `close`."""
+        """Yield pieces as soon as there are any, at least one per second. Ends after `close`."""
         yield MAGIC
         while not self._is_closed:
             with self._changed:
@@ -155,7 +154,7 @@ class Tap:
 
 
 def encode(batch: Iterable[Mirrored]) -> bytes:
-    """One record for each."""
+    """Return a SEEN record for each datagram."""
     pieces: list[bytes] = []
     for at, listener, peer, endpoint, reason, data in batch:
         head = _head(listener, peer, endpoint, reason)
@@ -180,20 +179,20 @@ def _head(listener: str, peer: tuple[str, int], *texts: str) -> bytes:
 
 
 class Lost(NamedTuple):
-    """So many were received and are not in the stream."""
+    """A number of datagrams that are missing from the stream."""
 
     number: int
 
 
 class StreamReader:
-    """Reads the stream, in whatever pieces it comes."""
+    """Reads the stream, in pieces of any size."""
 
     def __init__(self) -> None:
         self._waiting = bytearray()
         self._has_begun = False
 
     def take(self, piece: bytes) -> Iterator[MirroredDatagram | Lost]:
-        """Yield what is complete with this piece. Raises TransportError for what is no stream of a tap."""
+        """Yield the records that this piece completes. Raises TransportError if this is not a tap stream."""
         waiting = self._waiting
         waiting += piece
         if not self._has_begun:
@@ -217,7 +216,7 @@ class StreamReader:
 
 
 def _record(record: bytes) -> Iterator[MirroredDatagram | Lost]:
-    """Kinds that are not known are left out: a newer router may have more."""
+    """Yield the content of a record. Unknown kinds are skipped: a newer router may have more."""
     if record[0] == LOST:
         yield Lost(int.from_bytes(record[1:9], "little"))
     elif record[0] == SEEN:

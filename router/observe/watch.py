@@ -1,4 +1,4 @@
-"""Looks at a running router once a second, so that whoever asks is told what was lost in the last seconds."""
+"""Takes a snapshot of a running router once a second, to find losses of the last seconds."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ METRICS = {kind.metric for kind in Kind} | {
     "mirror_dropped",
     *DELIVERED,
 }
-"""What is read each second. Histograms, which are most of what is counted, are not."""
+"""The metrics read each second. Histograms, which have most of the series, are not among them."""
 
 
 class Watch:
-    """The last snapshots, and since when endpoints are silent, deadmen send and the receive thread stands still.
+    """Keeps the last snapshots, and since when endpoints are silent, deadmen send and the receive thread is stuck.
 
     Thread-safe.
     """
@@ -36,13 +36,13 @@ class Watch:
     def __init__(self, running: Running) -> None:
         self._running = running
         self._snapshots: deque[Snapshot] = deque()
-        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (boot clock)
-        self._tripped: dict[str, tuple[float, int]] = {}  # by route: the number of trips, and when this was seen first
+        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and its boot clock
+        self._tripped: dict[str, tuple[float, int]] = {}  # by route: number of trips, and when it was first seen
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
     def look(self, now: int, wall: int) -> Look:
-        """Look at it at `now`, of the boot clock, and `wall`, in ns. One snapshot in PERIOD is kept for later looks."""
+        """Return the state at `now` (boot clock) and `wall`, ns. One snapshot per PERIOD is kept for later calls."""
         with self._lock:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
             earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
@@ -63,7 +63,7 @@ class Watch:
         return Look(program, snapshots, silence, self.standing(now), tripped, recent)
 
     def standing(self, now: int) -> float:
-        """For how long the receive thread has made no progress, s, as far as it was looked at."""
+        """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""
         progress = self._running.progress()
         with self._lock:
             if progress != self._progress:
@@ -71,7 +71,7 @@ class Watch:
             return (now - self._progressed) / 1e9
 
     def _seen(self, endpoint: str, latest: Snapshot, earlier: int, now: int, wall: int) -> int:
-        """When it was last heard of, or first looked for. Stamps are of the wall clock, which jumps."""
+        """Return when an endpoint was last heard, or first looked for (boot clock, ns). Stamps: wall clock."""
         stamp = latest.of(LAST_SEEN, endpoint).get((), 0.0)
         if endpoint not in self._last_seen or self._last_seen[endpoint][0] != stamp:
             age = min(max(0, wall - int(stamp * 1e9)), now - earlier)
@@ -80,7 +80,7 @@ class Watch:
 
 
 class Health:
-    """Thread-safe. A thread looks once in PERIOD until it is closed."""
+    """Looks at the router once per PERIOD in a thread, until it is closed. Thread-safe."""
 
     def __init__(self, running: Running) -> None:
         self._watch = Watch(running)
@@ -106,7 +106,7 @@ class Health:
         while not self._stopping.wait(PERIOD):
             try:
                 self.look()
-            except Exception as error:  # noqa: BLE001 routing goes on without health
+            except Exception as error:  # noqa: BLE001 routing continues without health
                 if not has_failed:
                     logger.error("cannot determine the router's health", problem=repr(error))
                 has_failed = True

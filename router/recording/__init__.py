@@ -1,1 +1,1 @@
-"""What listeners receive, in MCAP files: the mirror, the last minute in memory, the writer, the reader."""
+"""Recordings of received datagrams in MCAP files: the mirror, the last minute in memory, writer and reader."""

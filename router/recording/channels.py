@@ -1,7 +1,7 @@
 """Schemas and channels of recordings. The files of one router use the same numbers for them.
 
-A channel is what one sender sends of one payload case to one listener, and what routing decided about it. Its metadata
-says so; together with a message's data that is the whole datagram (see `Holds`).
+A channel has the datagrams of one payload case from one sender to one listener with one decision of routing. These are
+its metadata; together with a message's data they give the whole datagram (see `Holds`).
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ DATAGRAMS = "raw/datagrams"
 """The topic of datagrams as received. No payload case can have a slash in its name."""
 
 REJECTED = "rejected/{reason}/{topic}"
-"""The topic of what no route took, so that viewers do not mix it with what one did."""
+"""The topic of rejected datagrams, so that viewers do not mix them with accepted ones."""
 
 MOST_CHANNELS = 4096
-"""Senders beyond that, as of a client that changes its port each time, are recorded as raw datagrams."""
+"""Beyond that, for example if a client often changes its port, datagrams are recorded raw."""
 
 
 class Holds(enum.Enum):
-    """What a channel's messages are."""
+    """The content of a channel's messages."""
 
     PAYLOAD = "payload"
     """Payloads of datagrams with one field, encoded as protobuf encodes it: tag and length follow from number and
@@ -37,7 +37,7 @@ class Holds(enum.Enum):
     DATAGRAM = "datagram"
     """All other datagrams, byte for byte."""
     VIEW = "view"
-    """Payloads of datagrams that are recorded raw as well: to be looked at, not to be sent again."""
+    """Payloads of datagrams that are also recorded raw: for viewers, not for replay."""
 
 
 class Channels:
@@ -50,7 +50,7 @@ class Channels:
         self._channel_ids: dict[tuple[object, ...], int] = {}
 
     def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str, reason: str) -> int | None:
-        """`endpoint` and `reason` are those of a MirroredDatagram. None where there are too many channels."""
+        """Return the channel of a payload; None if there are too many. `endpoint`, `reason`: as in MirroredDatagram."""
         sender = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
         topic, metadata = _decided(case.name, {**_metadata(case, Holds.PAYLOAD), **sender}, reason)
         if len(self.channels) >= MOST_CHANNELS and self._key(topic, _payload(case), metadata) not in self._channel_ids:
@@ -90,7 +90,7 @@ def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
 
 
 def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:
-    """Return topic and metadata of a channel for datagrams that were rejected for `reason`, if there is one."""
+    """Return topic and metadata, changed for rejected datagrams if there is a `reason`."""
     if not reason:
         return topic, metadata
     return REJECTED.format(reason=reason, topic=topic), {**metadata, "reason": reason}
@@ -101,7 +101,7 @@ def _payload(case: PayloadCase) -> Descriptor:
 
 
 def descriptor_set(message: Descriptor) -> bytes:
-    """Return a serialised FileDescriptorSet: the file of a message behind all that it imports."""
+    """Return a serialized FileDescriptorSet: the file of a message, preceded by its imports."""
     files: dict[str, bytes] = {}
     _collect(message.file, files)
     return FileDescriptorSet(file=[FileDescriptorProto.FromString(data) for data in files.values()]).SerializeToString()
@@ -126,4 +126,4 @@ def _datagram() -> Descriptor:
 
 DATAGRAM = _datagram()
 Datagram = GetMessageClass(DATAGRAM)
-"""`listener` by its name, `peer` as HOST:PORT, `data` as received, `endpoint` as the table calls the sender."""
+"""`peer` is HOST:PORT, `data` the bytes as received, `endpoint` the sender's name in the table."""

@@ -1,6 +1,6 @@
-"""Mirrored datagrams, encoded as MCAP messages into compressed chunks.
+"""Encodes mirrored datagrams as MCAP messages in compressed chunks.
 
-The messages of a batch are built together, by C functions that map over it: 0.9 us each, against 2.8 us for a call of
+The messages of a batch are built together, by C functions mapped over it: 0.9 us each, compared to 2.8 us for a call of
 `mcap.writer.Writer`. The writer of foxglove-sdk sets neither the publish time nor the sequence of a message.
 """
 
@@ -29,10 +29,10 @@ from router.types.protobuf import PayloadCase
 from router.types.wire import LEN, varint
 
 LONGEST_CHUNK = 4 << 20
-"""Bytes, not compressed."""
+"""Uncompressed bytes."""
 
 _HEAD = struct.Struct("<BQHIQQ")
-"""A message record up to its data: opcode, length of what follows, channel, sequence, log time, publish time."""
+"""A message record up to its data: opcode, length of the remainder, channel, sequence, log time, publish time."""
 _OPCODE_AND_LENGTH = 9
 _BEHIND_LENGTH = _HEAD.size - _OPCODE_AND_LENGTH
 _INDEX_HEAD = struct.Struct("<BQHI")
@@ -40,15 +40,15 @@ _SEQUENCE = 0xFFFFFFFF
 _TAG = itemgetter(slice(2))
 _MOST_SHAPES = 8192
 _CLOCK_WAS_SET = 1_000_000
-"""ns. A larger step of the wall clock against the monotonic one is a clock that was set; a smaller one is slewing."""
+"""ns. If the wall clock steps more than this against the monotonic one, it was set; otherwise it is being slewed."""
 _DATA_TAG = varint(Datagram.DESCRIPTOR.fields_by_name["data"].number << 3 | LEN)
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Messages as they go into a file. `indexes` has the message index records by channel.
+    """Messages as written to a file. `indexes` has the message index records by channel.
 
-    `messages` counts them by channel; `datagrams` and `size` (bytes) are those that were received. `monotonic` is when
+    `messages` counts messages by channel; `datagrams` and `size` (bytes) count received datagrams. `monotonic` is when
     the last batch was received (ns).
     """
 
@@ -61,14 +61,14 @@ class Chunk:
 
     @property
     def size_in_file(self) -> int:
-        """Bytes, about, with what a file says of the chunk in its summary."""
+        """Approximate bytes in a file, with its part of the summary."""
         return len(self.record.data) + sum(map(len, self.indexes.values())) + 200 + 10 * len(self.indexes)
 
 
 class _Shape(NamedTuple):
-    """What datagrams of one sender, length, payload case and decision have in common.
+    """Common values of datagrams with the same sender, length, payload case and decision.
 
-    `header` is the envelope's tag and length. `length` is that of the message record behind its length field,
+    `header` is the envelope's tag and length. `length` is that of the message record after its length field,
     `message_index` the index of its channel.
     """
 
@@ -93,7 +93,7 @@ class _Record(NamedTuple):
 
 
 class _Records(NamedTuple):
-    """Message records by column, each in the order of the records, with the fields of `_Record`."""
+    """Columns of message records, with the fields of `_Record`, all in the same order."""
 
     lengths: Sequence[int]
     channels: Iterable[int]
@@ -105,10 +105,10 @@ class _Records(NamedTuple):
 
 
 class Encoder:
-    """`add` takes datagrams in the order of their arrival, `take` returns them as a chunk.
+    """Collects datagrams in the order of arrival (`add`), and returns them as a chunk (`take`).
 
-    A message's log time is the wall clock. Its publish time is the same until somebody sets that clock, and never goes
-    back. The sequence counts datagrams.
+    A message's log time is the wall clock. Its publish time is the same until that clock is set, and never goes back.
+    The sequence counts datagrams.
     """
 
     def __init__(self, channels: Channels) -> None:
@@ -129,11 +129,11 @@ class Encoder:
 
     @property
     def size(self) -> int:
-        """Bytes that the next chunk has so far, not compressed."""
+        """Uncompressed bytes of the next chunk so far."""
         return self._offset
 
     def add(self, batch: Sequence[Mirrored], classifier: Classifier, wall: int, monotonic: int) -> None:
-        """`wall` and `monotonic` are the two clocks when the batch was received (ns)."""
+        """Add a batch. `wall` and `monotonic` are the two clocks when it was received (ns)."""
         if not batch:
             return
         if classifier is not self._classifier:
@@ -167,7 +167,7 @@ class Encoder:
         self._append(records)
 
     def take(self) -> Chunk | None:
-        """Return what was added since the last time, None for nothing."""
+        """Return the datagrams since the last call, None if there are none."""
         if not self._pieces:
             return None
         data = b"".join(self._pieces)
@@ -187,7 +187,7 @@ class Encoder:
         return chunk
 
     def drop(self) -> int:
-        """Forget what was added since the last time, which a fault may have left half done. Return how many it was."""
+        """Discard the datagrams since the last `take`, for example after a fault. Return their number."""
         dropped, self._datagrams, self._bytes = self._datagrams, 0, 0
         self._pieces.clear()
         self._offset = 0
@@ -205,7 +205,7 @@ class Encoder:
         self._raw.clear()
 
     def _steady_times(self, times: Sequence[int], wall: int, monotonic: int) -> Sequence[int]:
-        """Return the publish times: `times`, without the steps of a wall clock that was set."""
+        """Return the publish times: `times` without the steps of the wall clock."""
         if self._first_ahead is None:
             self._first_ahead = wall - monotonic
         now = monotonic + self._first_ahead
@@ -220,7 +220,7 @@ class Encoder:
         return found
 
     def _append(self, records: _Records) -> None:
-        """Add message records. A loop here would double the cost of recording."""
+        """Append message records. A loop here would double the cost of recording."""
         heads = map(
             _HEAD.pack,
             repeat(Opcode.MESSAGE.value),
@@ -242,7 +242,7 @@ class Encoder:
         reasons: Sequence[str],
         data: Sequence[bytes],
     ) -> Sequence[_Shape | None]:
-        """Return the shape of each, None for one that has to be recorded raw."""
+        """Return the shape of each datagram, None if it has to be recorded raw."""
         keys = zip(listeners, peers, endpoints, reasons, map(len, data), map(_TAG, data), strict=True)
         shapes = list(map(self._shapes.get, keys))
         if None in shapes:
@@ -281,7 +281,7 @@ class Encoder:
         return self._payload_channels[key]
 
     def _other_channel(self, case: PayloadCase | None, reason: str) -> int:
-        """Return the channel of a case's views, or that of raw datagrams."""
+        """Return the channel of a case's views, or the channel of raw datagrams."""
         key = case.name if case is not None else "", reason
         if key not in self._other_channels:
             channels = self._channels
@@ -295,7 +295,7 @@ class Encoder:
     def _records_of(
         self, classifier: Classifier, datagram: Mirrored, shape: _Shape | None, sequence: int, publish_time: int
     ) -> Iterator[_Record]:
-        """Yield the payload where that is the whole datagram; else the datagram, and its payload if there is one."""
+        """Yield the payload if it is the whole datagram; else the datagram, and its payload if there is one."""
         at, listener, peer, endpoint, reason, data = datagram
         if shape is not None and _parses(shape.parse, data[shape.payload]):
             payload = data[shape.payload]
@@ -310,7 +310,7 @@ class Encoder:
             yield _Record(length, channel, sequence, at, publish_time, message, self._index(channel))
 
     def _datagram(self, listener: str, peer: Peer, endpoint: str, data: bytes) -> bytes:
-        """Encode a `Datagram`; fields before and behind `data` are encoded once for a sender."""
+        """Encode a `Datagram`. The fields before and after `data` are encoded once per sender."""
         key = listener, peer, endpoint
         if key not in self._raw:
             if len(self._raw) >= _MOST_SHAPES:
@@ -330,7 +330,7 @@ def _parses(parse: Callable[[bytes], Message], data: bytes) -> bool:
 
 
 def _header(tag: bytes, data: bytes) -> bytes | None:
-    """Return tag and length, where the length is encoded as short as it can be and that of all that follows."""
+    """Return tag and length; None unless the length is minimally encoded and covers the remaining bytes."""
     behind = len(data) - len(tag)
     size = 1 if behind <= 0x80 else 2 if behind <= 0x4001 else 3
     header = tag + varint(max(0, behind - size))

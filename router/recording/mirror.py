@@ -1,4 +1,4 @@
-"""The mirror: what listeners receive, and what routing decided about it, for recordings, taps and pages.
+"""The mirror: received datagrams and what routing decided about them, for recordings, taps and pages.
 
 While no consumer is attached, the receive thread does nothing for it.
 """
@@ -22,15 +22,15 @@ from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import LEN, varint
 
 PERIOD = 0.05
-"""Seconds between two batches: waking a consumer for each datagram would cost more than routing it."""
+"""Seconds between two batches: waking consumers for each datagram would cost more than routing it."""
 
 
 class MirroredDatagram(NamedTuple):
-    """A datagram: when the router took it (wall clock, ns), on which listener, from whom, and its bytes as received.
+    """A datagram. `at`: when the router received it (wall clock, ns). `data`: the bytes as received.
 
-    `endpoint` is what the table calls the sender, "" for a stranger. `reason` is why no route took the datagram, one of
-    REJECT_REASONS, "" for one that a route took. Of one longer than MAX_DATAGRAM there are as many bytes and one
-    more.
+    `endpoint` is the sender's name in the table, "" for a stranger. `reason` is the one of REJECT_REASONS for which no
+    route accepted the datagram, "" for an accepted one. A datagram longer than MAX_DATAGRAM is cut to one byte more
+    than that.
     """
 
     at: int
@@ -48,13 +48,13 @@ Consumer = Callable[[Sequence[Mirrored]], None]
 
 
 class Source(Protocol):
-    """What receives."""
+    """A source of mirrored datagrams."""
 
     def observe(self, *, is_observed: bool) -> None:
         """Called when the first consumer has attached, and when the last one has detached."""
 
     def take(self) -> Sequence[Mirrored]:
-        """What was received since the last call."""
+        """Return the datagrams since the last call."""
 
     @property
     def lost(self) -> int:
@@ -62,9 +62,9 @@ class Source(Protocol):
 
 
 class Mirror:
-    """One thread calls the consumers, up to PERIOD after a datagram; none may keep it for long.
+    """One thread calls the consumers, at most PERIOD after a datagram; they must return quickly.
 
-    What a consumer raises goes to `failed`.
+    Exceptions of consumers go to `failed`.
     """
 
     def __init__(self, source: Source, failed: Callable[[Exception], None]) -> None:
@@ -86,9 +86,9 @@ class Mirror:
         return bool(self._consumers)
 
     def attach(self, consumer: Consumer) -> Callable[[], None]:
-        """Call `consumer` with all that is received from now on. Returns a function that detaches it.
+        """Call `consumer` with all datagrams from now on. Returns a function that detaches it.
 
-        A consumer must not detach itself; one that is being called while it is detached finishes that call.
+        A consumer must not detach itself. A call in progress when it is detached still finishes.
         """
         with self._attaching:
             if not self._consumers:
@@ -114,7 +114,7 @@ class Mirror:
         return detach
 
     def close(self) -> None:
-        """Deliver what waits, and end the thread. To be called when nothing is received any more."""
+        """Deliver waiting datagrams, and end the thread. Call this when nothing is received any more."""
         with self._attaching:
             if self._consumers:
                 self._end()
@@ -130,19 +130,19 @@ class Mirror:
             self._deliver()
 
     def _deliver(self) -> None:
-        """Called by the thread, and after its end by the thread that joined it: never by two at once."""
+        """Called by the thread, and after its end by the thread that joined it; never concurrently."""
         batch = self._source.take()
         if not batch:
             return
         for consumer in self._consumers:
             try:
                 consumer(batch)
-            except Exception as error:  # noqa: BLE001 a fault of the router, reported loudly; the other consumers go on
+            except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
                 self._failed(error)
 
 
 class Classifier:
-    """What a datagram is to a table: its payload and its sender, as in routing. Any thread may use it."""
+    """Finds payload and sender of a datagram as routing does. Any thread may use it."""
 
     def __init__(self, envelope: Envelope, table: RouteTable) -> None:
         self.envelope = envelope
@@ -166,7 +166,7 @@ class Classifier:
         return (self.envelope.cases[case], getattr(envelope, case)) if case else None
 
     def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
-        """As `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
+        """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
         if listener in self._trimming and (found := self._single_field(data)) is not None:
             return found
         if (decoded := self.payload(listener, data)) is None:
@@ -175,7 +175,7 @@ class Classifier:
         return case, payload.SerializeToString()
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
-        """Return None where anything but zeros follows the first field, or its length has more than two bytes."""
+        """Return None if anything but zeros follows the first field, or its length has more than two bytes."""
         try:
             tag_size = 1 if data[0] < 0x80 else 2
             case, size, start = self.cases_by_tag[data[:tag_size]], data[tag_size], tag_size + 1
@@ -197,7 +197,7 @@ class Classifier:
         return case, payload
 
     def sender(self, listener: str, peer: Peer) -> str:
-        """Return the table's name of who sent to this listener; empty for a stranger."""
+        """Return the sender's name in the table; "" for a stranger."""
         by_host, by_address = self._recognisers.get(listener, _NOBODY)
         return by_address.get(peer) or by_host.get(peer[0]) or ""
 
@@ -206,9 +206,9 @@ _NOBODY: tuple[dict[str, str], dict[Peer, str]] = {}, {}
 
 
 def first_field(data: bytes) -> int:
-    """Return the number of the field that a message begins with, below 2048; 0 where there is none.
+    """Return the number (below 2048) of the first field of a message, 0 if there is none.
 
-    Most often that is the payload's, at a fraction of the cost of `Classifier.payload`.
+    Usually that is the payload's, at a fraction of the cost of `Classifier.payload`.
     """
     if not data:
         return 0

@@ -1,6 +1,6 @@
-"""Reads a recording: the datagrams, byte for byte, in the order in which the router took them.
+"""Reads a recording: the datagrams, byte for byte, in the order in which the router received them.
 
-Of a file whose writer was killed it reads all chunks that were written whole.
+If the writer was killed, it reads all complete chunks of the file.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from router.recording.writer import LIBRARY, METADATA
 from router.types.wire import LEN, varint
 
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
-"""What reading raises for what no recorder wrote; lz4, which `mcap recover` may have used, a RuntimeError."""
+"""Errors in files that no recorder wrote; lz4, which `mcap recover` may have used, raises RuntimeError."""
 
 
 class Recorded(NamedTuple):
-    """A datagram: when the router took it by the wall clock and by one that nobody set (ns), where, from whom.
+    """A datagram, with its time of reception (ns): `at` by the wall clock, `steady` without steps of that clock.
 
-    `endpoint` is what the table of that time called the sender, empty for a stranger. `reason` is why no route took the
-    datagram, empty if one did.
+    `endpoint` is the sender's name in the table of that time, "" for a stranger. `reason` is why no route accepted the
+    datagram, "" if one did.
     """
 
     at: int
@@ -44,13 +44,13 @@ class Recorded(NamedTuple):
 
 
 class Recording:
-    """`about` says what was recorded and why. Raises UsageError for a file that is no recording of a router."""
+    """A recording. `about` is its metadata. Raises UsageError if the file is not a recording of a router."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.about: dict[str, str] = {}
         self.is_whole = self.ends_early = False
-        """Once all was read: the writer finished the file; it was killed, or the file is damaged."""
+        """Set when all is read: the writer finished the file; or it was killed, or the file is damaged."""
         self._decoders: dict[int, Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]] = {}
         try:
             self._file: BinaryIO = path.open("rb")
@@ -66,14 +66,14 @@ class Recording:
 
     @property
     def position(self) -> int:
-        """Bytes of `size` that have been read."""
+        """The number of bytes read, out of `size`."""
         return self._file.tell()
 
     def close(self) -> None:
         self._file.close()
 
     def datagrams(self) -> Iterator[Recorded]:
-        """Yield each datagram, once, until the file ends or is damaged."""
+        """Yield each datagram once, until the end of the file or damage."""
         try:
             for record in self._records:
                 if isinstance(record, Message):
@@ -103,7 +103,7 @@ class Recording:
 
 
 def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]:
-    """Return what makes a datagram of a message of the channel with this metadata: the fields of Recorded from
+    """Return a function that turns the messages of the channel with this metadata into the fields of Recorded from
     `listener` on."""
     holds, reason = metadata.get("holds"), metadata.get("reason", "")
     if holds == Holds.DATAGRAM.value:

@@ -1,7 +1,6 @@
-"""The recorder: mirrored datagrams to disk, and the newest chunks in memory until somebody wants them saved.
+"""The recorder: writes mirrored datagrams to disk, and keeps the newest chunks in memory to save on request.
 
-The mirror's thread encodes each datagram once, into chunks for both; so saving copies bytes. The thread `recorder`
-writes them.
+The mirror's thread encodes each datagram once, into chunks for both; the thread `recorder` writes them.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from router.table.model import RecordSettings
 from router.threads import Thread, WakeEvent
 
 PERIOD = 500_000_000
-"""ns from chunk to chunk: what a kill costs, with what the mirror still has; more only where the disk is slow."""
+"""ns from chunk to chunk. A kill loses this much and the mirror's PERIOD; more only if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""Bytes of chunks that may wait for a disk that is slow."""
+"""The most bytes of chunks in the queue to the disk."""
 
 STOP_SECONDS = 2.5
-"""How long a stop waits for the disk. A service manager kills after 10 s, and there is more to close."""
+"""How long shutting down waits for the disk. A service manager kills after 10 s, and there is more to close."""
 
 _PATIENCE = 30.0
-"""Seconds in which saving has to be done."""
+"""Timeout of `save`, s."""
 
 
 class RecordError(RouterError):
@@ -43,7 +42,7 @@ class RecordError(RouterError):
 
 
 class Ring:
-    """Chunks of the last `last` ns, of at most `most` bytes together: of a flood it keeps less than `last`."""
+    """The chunks of the last `last` ns, at most `most` bytes in total: in a flood, of less time."""
 
     def __init__(self, last: int, most: int) -> None:
         self._last = last
@@ -59,14 +58,14 @@ class Ring:
             self._size -= self._chunks.popleft().size_in_file
 
     def chunks(self) -> list[Chunk]:
-        """Return them, the oldest first."""
+        """Return the chunks, oldest first."""
         return list(self._chunks)
 
 
 class Recorder:
-    """Records from its making until it is closed. Raises StartError where nothing can be written.
+    """Records from creation until it is closed. Raises StartError if the directory is not writable.
 
-    `program` returns what runs now; a reload puts another one in its place.
+    `program` returns the running program, which a reload replaces.
     """
 
     def __init__(self, mirror: Mirror, program: Callable[[], Program], settings: RecordSettings) -> None:
@@ -100,7 +99,7 @@ class Recorder:
         self._detach = mirror.attach(self._take)
 
     def save(self, reason: str) -> Path:
-        """Write what is in memory to a file of its own. Any thread may call it; raises RecordError."""
+        """Write the datagrams in memory to a new file, and return its path. Thread-safe. Raises RecordError."""
         if self._ring is None:
             raise RecordError("nothing is kept in memory: give the table's `record` a `last`")
         done: Future[Path] = Future()
@@ -115,13 +114,13 @@ class Recorder:
             raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
 
     def deadman_tripped(self, route: str) -> None:
-        """Have what is in memory saved soon. Returns at once."""
+        """Request to save the datagrams in memory. Returns at once."""
         if self._ring is not None:
             self._trips.append(route)
             self._wake()
 
     def samples(self) -> Mapping[str, Sequence[tuple[tuple[str, ...], float]]]:
-        """Return the metrics that are counted here: for each its series, by label values."""
+        """Return the metrics of the recorder: for each its label values and values."""
         continuous = self._continuous
         write_errors = self._lost_by_faults + (continuous.lost if continuous else 0)
         return {
@@ -131,9 +130,9 @@ class Recorder:
         }
 
     def close(self) -> None:
-        """Write all that was received, and finish the file: within STOP_SECONDS, or as far as the disk gets by then."""
+        """Write everything received and finish the file, or as much as the disk accepts within STOP_SECONDS."""
         self._detach()
-        with self._requesting:  # what was requested before is done in the last turn
+        with self._requesting:  # the last turn serves earlier requests
             self._closing = True
         self._wake()
         self._thread.join(STOP_SECONDS)
@@ -157,11 +156,11 @@ class Recorder:
                 self._encoder.add(batch, self._classifier, wall_ns(), boottime_ns())
                 if self._encoder.size > LONGEST_CHUNK:
                     self._finish_chunk()
-            except Exception as error:  # noqa: BLE001 of the router itself, and no reason to stop recording
+            except Exception as error:  # noqa: BLE001 a fault of the router; keep recording
                 self._encoding_failed(error)
 
     def _finish_chunk(self) -> None:
-        """To be called with the lock `_encoding`."""
+        """Call this with the lock `_encoding`."""
         chunk = self._encoder.take()
         if chunk is None:
             return
@@ -194,7 +193,7 @@ class Recorder:
             self._save_trips()
 
     def _write(self) -> None:
-        """Finish a chunk, and write all that are queued."""
+        """Finish a chunk, and write all queued ones."""
         self._due = boottime_ns() + PERIOD
         with self._encoding:
             try:
@@ -218,12 +217,12 @@ class Recorder:
             self._continuous.write(chunk, boottime_ns())
 
     def _encoding_failed(self, error: Exception) -> None:
-        """To be called with the lock `_encoding`."""
+        """Call this with the lock `_encoding`."""
         self._lost_by_faults += self._encoder.drop()
         self._report(error)
 
     def _report(self, error: Exception) -> None:
-        """Log a fault, and not those that follow it."""
+        """Log the first of several faults."""
         if self._is_well:
             fault(error, "lost datagrams", "the recorder").log()
         self._is_well = False
@@ -237,8 +236,8 @@ class Recorder:
                 done.set_exception(error)
 
     def _may_save_trips(self) -> bool:
-        """Once in the time that is kept: a deadman that trips again and again fills no disk, and nothing is missed."""
-        assert self._settings.last is not None  # noqa: S101 - or nobody has noted a trip
+        """Return True at most once per `last`: then nothing is missed, and frequent trips do not fill the disk."""
+        assert self._settings.last is not None  # noqa: S101 - `deadman_tripped` checks
         now = boottime_ns()
         if self._trips_saved_at is not None and now - self._trips_saved_at < self._settings.last:
             return False
@@ -265,8 +264,8 @@ class Recorder:
         return path
 
     def _write_ring(self, reason: str) -> Path:
-        """What is received meanwhile is written as ever."""
-        assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` look before
+        """Write the ring to a file. Meanwhile, continuous recording continues."""
+        assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` check
         self._write()
         chunks = self._ring.chunks()
         coming = sum(chunk.size_in_file for chunk in chunks)
@@ -285,6 +284,6 @@ class Recorder:
         return file.path
 
     def _about(self, reason: str) -> dict[str, str]:
-        """Return what a file says of itself."""
+        """Return the metadata of a file."""
         program = self._running_program()
         return {"reason": reason, "table": program.table.path.name, "protos_sha256": program.protos_sha256}

@@ -1,6 +1,6 @@
-"""Writes recordings: one MCAP file of chunks, the directory of such files, and files that follow one another.
+"""Writes recordings: a single MCAP file of chunks, the directory of the files, and continuous recording.
 
-What was written of a file can be read whenever writing ends, for whatever reason.
+However writing ends, the written part of a file is readable.
 """
 
 from __future__ import annotations
@@ -43,14 +43,11 @@ SUFFIX = ".mcap"
 
 _TIME = "%Y%m%dT%H%M%S.%fZ"
 _RETRY = 10_000_000_000
-"""ns until a disk that failed is tried again."""
+"""ns until the next attempt after a disk error."""
 
 
 class RecordingFile:
-    """A file that was not there before. Everything raises OSError.
-
-    `about` says what is recorded, and why; it is the file's metadata.
-    """
+    """A new recording file. All methods raise OSError. `about` is its metadata: what is recorded, and why."""
 
     def __init__(self, path: Path, channels: Channels, about: Mapping[str, str]) -> None:
         self.path = path
@@ -72,14 +69,14 @@ class RecordingFile:
 
     @property
     def is_gone(self) -> bool:
-        """Whether its path leads elsewhere: it was removed or moved, or its file system was unmounted."""
+        """Whether the file at its path is another one or missing: moved, removed or unmounted."""
         try:
             return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
         except OSError:
             return True
 
     def write(self, chunk: Chunk) -> None:
-        """Append a chunk. What could not be written whole is cut off again."""
+        """Append a chunk. A partial write is truncated again."""
         new = sorted(chunk.messages.keys() - self._messages.keys())
         channels = [self._channels.channels[number] for number in new]
         schemas = sorted({channel.schema_id for channel in channels} - self._written_schemas)
@@ -108,11 +105,11 @@ class RecordingFile:
         )
 
     def sync(self) -> None:
-        """Return when what was written outlasts a loss of power."""
+        """Return when the written data survives a power loss."""
         os.fdatasync(self._descriptor)
 
     def close(self) -> None:
-        """Write what readers seek by. A file without it can be read from the start."""
+        """Write the index and close. A file without index is readable from the start."""
         try:
             self._append(self._end())
             self.sync()
@@ -120,7 +117,7 @@ class RecordingFile:
             os.close(self._descriptor)
 
     def abandon(self) -> None:
-        """Close a file that could not be written further; remove it where there is no chunk in it."""
+        """Close a file after a write error; remove it if it has no chunk."""
         if not self._indexes:
             self.path.unlink(missing_ok=True)
         with suppress(OSError):
@@ -182,9 +179,9 @@ def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
 
 
 class RecordingDirectory:
-    """The files `STEM_TIME[_REASON].mcap` below a table's `record.directory`; others are left alone.
+    """The files `STEM_TIME[_REASON].mcap` in a table's `record.directory`; others are not touched.
 
-    They have at most `retention` bytes. Creates the directory; raises StartError.
+    They have at most `retention` bytes in total. Creates the directory. Raises StartError.
     """
 
     def __init__(self, settings: RecordSettings, stem: str) -> None:
@@ -199,7 +196,7 @@ class RecordingDirectory:
         self._retention = settings.retention
 
     def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
-        """Create a file. Equal names, as where the clock begins anew at each start, get numbers. Raises OSError."""
+        """Create a file. Equal names, as with a clock that restarts at each boot, get numbers. Raises OSError."""
         time = datetime.fromtimestamp(wall_ns() / 1e9, timezone.utc).strftime(_TIME)
         words = [self._stem, time, *([re.sub(r"[^a-z0-9_.-]+", "-", reason.lower())] if reason else [])]
         for number in range(1, 1000):
@@ -211,9 +208,9 @@ class RecordingDirectory:
         raise FileExistsError(errno.EEXIST, f"there are already a thousand recordings of {time}", str(self.path))
 
     def make_room(self, coming: int, writing: Path | None = None) -> None:
-        """Remove the oldest, by name, until there is room for `coming` bytes beside the file `writing`. Raises OSError.
+        """Remove the oldest files, by name, until there is room for `coming` bytes in addition to the file `writing`.
 
-        The directory is created anew where somebody has removed it.
+        Recreates the directory if it was removed. Raises OSError.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         sizes = {path: size for path, size in recording_sizes(self.path, self._stem).items() if path != writing}
@@ -227,23 +224,23 @@ class RecordingDirectory:
 
 
 def recording_sizes(path: Path, stem: str) -> dict[Path, int]:
-    """Return the bytes of each recording of a table below `path`, the oldest first."""
+    """Return the bytes of each recording of a table in `path`, oldest first."""
     name = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
     sizes: dict[Path, int] = {}
     for file in sorted(path.iterdir()) if path.is_dir() else ():
         if name.fullmatch(file.name):
             try:
                 sizes[file] = file.stat().st_size
-            except FileNotFoundError:  # somebody has removed it meanwhile
+            except FileNotFoundError:  # removed meanwhile
                 continue
     return sizes
 
 
 class ContinuousWriter:
-    """Writes all chunks to files that follow one another; what the disk does not take is counted in `lost`.
+    """Writes all chunks to a series of files, and counts datagrams that the disk does not accept in `lost`.
 
-    A file is begun when there is something to write and the last one is full or old enough. `about` is called for each.
-    Times are of the boot clock, in ns.
+    Starts a file if there is something to write and the last one is full or old enough; calls `about` for each. Times
+    are of the boot clock, in ns.
     """
 
     def __init__(
@@ -265,11 +262,11 @@ class ContinuousWriter:
 
     @property
     def path(self) -> Path | None:
-        """Of the file that is being written."""
+        """The path of the file that is being written."""
         return self._file.path if self._file is not None else None
 
     def write(self, chunk: Chunk, now: int) -> None:
-        """Write and sync. Raises nothing that the disk is to blame for."""
+        """Write and sync. Disk errors are logged, not raised."""
         if self._retry_at is not None and now < self._retry_at:
             self.lost += chunk.datagrams
             return

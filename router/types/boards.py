@@ -283,7 +283,7 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
     findings = [_unbounded_finding(case, found, schema, span) for found in unbounded]
     if case.max_size is not None and (size := framed_size(case.number, case.max_size)) > limit:
         message = f"an envelope with {case.name} takes up to {size} bytes; boards reject more than {limit}"
-        hint = f"see {schema.span(case.type.name)}; make it smaller, or flash the boards and record it in the lock"
+        hint = f"see {schema.span(case.type.name)}; make the message smaller, or flash the boards and lock the new size"
         findings.append(Diagnostic(span, Code.BOARD_PAYLOAD, message, hint))
     return findings
 

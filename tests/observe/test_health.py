@@ -197,10 +197,10 @@ def test_a_board_with_another_address_is_named_with_the_one_that_it_should_have(
     assert told.routes == ("imu_info", "gps_info")
     silent = found["sensor_board"]
     assert silent.text == (
-        "sensor_board has not been heard since the router started; 192.168.0.20 sends its messages instead"
+        "sensor_board has not been heard since the router started, while 192.168.0.20 sends its messages"
     )
     assert "If 192.168.0.20 is sensor_board, give it the address 192.168.0.30, or correct `endpoints`" in silent.remedy
-    assert "instead" not in found["basestation"].text
+    assert "sends its messages" not in found["basestation"].text
     router.count("datagrams_rejected", "rover", "source_mismatch", to=10)
     assert "192.168.0.20" not in "; ".join(router.told(WINDOW))
 

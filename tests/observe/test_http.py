@@ -576,7 +576,7 @@ def test_a_connection_without_a_thread_is_closed_and_the_next_is_served(
                 with pytest.raises((ConnectionError, http.client.RemoteDisconnected)):
                     ask(server, "/ready")
         assert ask(server, "/ready").status == 200
-    what = "memory, threads or descriptors have run out, which lost an answer over HTTP: can't start new thread"
+    what = "memory, threads or descriptors have run out, which lost an HTTP response: can't start new thread"
     assert [(each["event"], each["log_level"]) for each in logs] == [(what, "error")]
 
 

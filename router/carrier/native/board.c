@@ -7,7 +7,7 @@
 #include "numbers.h"
 #include "wire.h"
 
-enum { MOST_LEVELS = 100 /* as many as a well-formed message has */ };
+enum { MOST_LEVELS = 100 /* the limit of envelope.c */ };
 
 struct level {
     const uint8_t *end;
@@ -61,7 +61,7 @@ static bool takes_more(struct check *check, const struct board_field *field, uin
     return true;
 }
 
-/* Whether the lists of a message that has been read are complete. */
+/* Whether the lists of a completely read message have all their elements. */
 static bool has_all_elements(struct check *check, const struct board_message *message) {
     for (uint32_t index = 0; index < message->count; index++) {
         const struct board_field *field = &message->fields[index];
@@ -98,7 +98,7 @@ static bool takes_packed(struct check *check, const struct board_field *field, s
     return true;
 }
 
-/* Enter a message. An element of a list begins with empty lists; what comes twice without being in one is merged. */
+/* Enter a message. A list element begins with empty lists; a repeated singular message is merged. */
 static bool enter(struct check *check, const struct board_field *field, const uint8_t *end) {
     const struct board_message *message = &check->board->messages[field->message];
     if (check->depth == MOST_LEVELS) return too_large(check, field->path, MOST_LEVELS + 1, "level", MOST_LEVELS);
@@ -149,7 +149,7 @@ static bool takes_fields(struct check *check) {
 }
 
 bool board_takes(const struct board *board, const uint8_t *data, size_t size, struct board_refusal *refusal) {
-    struct check check; /* not initialized as a whole: only what is counted and entered is read */
+    struct check check; /* initialized only where needed, as it is large */
     check.board = board;
     check.refusal = refusal;
     if (size > board->longest) return too_large(&check, "the envelope", size, "byte", board->longest);

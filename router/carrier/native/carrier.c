@@ -17,7 +17,7 @@
 #include "route.h"
 #include "threads.h"
 
-static const int64_t PYTHON_TIMEOUT = 30000000000; /* ns for which the watchdog is fed while Python is stuck */
+static const int64_t PYTHON_TIMEOUT = 30000000000; /* in ns: how long the watchdog is fed while Python is stuck */
 static const char ALIVE[] = "WATCHDOG=1";
 
 enum {
@@ -27,7 +27,7 @@ enum {
 };
 
 struct carrier {
-    /* Of the receive thread alone: */
+    /* For the receive thread only: */
     struct share share;
     int epoll;
     /* Shared: */
@@ -37,20 +37,20 @@ struct carrier {
     _Atomic(const struct change *) next, adopted;
     _Atomic bool is_stopping, is_closing;
     _Atomic uint64_t turns;
-    _Atomic int64_t pulse; /* when Python was alive, monotonic */
-    /* Of the timer thread: */
+    _Atomic int64_t pulse; /* the last sign of life of Python, monotonic */
+    /* For the timer thread: */
     _Atomic int notify; /* a socket, or -1 */
     _Atomic int64_t interval;
     int wake; /* eventfd */
     uint64_t turns_seen;
     pthread_t receiving, timing;
     bool has_started, has_stopped;
-    struct routing routing; /* of the receive thread, too; last, as it is large */
+    struct routing routing; /* also for the receive thread; last, as it is large */
 };
 
 /* ---- the mirror ---- */
 
-/* `reason`: why no route took it, or ROUTED. */
+/* `reason` is ROUTED, or the reason for rejecting the datagram. */
 static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
     struct mirror_record *record = (struct mirror_record *)carrier->routing.record;
     size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
@@ -71,8 +71,8 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
 
 static int64_t nanoseconds(struct timespec time) { return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec; }
 
-/* The time at which the kernel got the datagram that was just received, by the wall clock; 0 if it does not say. Where the
- * time does not come with each datagram, as in qemu-user, an ioctl returns it. */
+/* The wall-clock time at which the last received datagram arrived in the kernel; 0 if unknown. If the time does not come with
+ * each datagram, as in qemu-user, an ioctl returns it. */
 static int64_t arrival(int fd, struct msghdr *message) {
     struct timespec stamp;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(message); each; each = CMSG_NXTHDR(message, each))
@@ -83,8 +83,8 @@ static int64_t arrival(int fd, struct msghdr *message) {
     return ioctl(fd, SIOCGSTAMPNS, &stamp) ? 0 : nanoseconds(stamp);
 }
 
-/* As recvmsg, but errors about datagrams that were sent from the listener's port go to their senders, and keep no datagram
- * waiting. While more of them arrive, each attempt may fail. */
+/* As recvmsg, but errors about datagrams sent from the listener's port go to their senders, and do not delay received
+ * datagrams. While more errors arrive, each attempt may fail. */
 static ssize_t receive(int fd, struct msghdr *message, int flags) {
     enum { ATTEMPTS = 3 };
     ssize_t length = recvmsg(fd, message, flags);
@@ -92,11 +92,11 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     bool is_about_sent = sender_note_errors(fd);
     for (int left = ATTEMPTS; left && length < 0 && errno != EAGAIN; left--)
         length = recvmsg(fd, message, flags | MSG_DONTWAIT);
-    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* a fault: no busy loop */
+    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* another error: avoid a busy loop */
     return length;
 }
 
-/* There was nothing to receive: so what is still to come was not stamped under a setting of the clock that has passed. */
+/* The queues were empty, so no later datagram was stamped under a past setting of the clock. */
 static void found_empty(struct carrier *carrier) {
     freshness_forget_past(&carrier->routing.freshness);
     int64_t now = boottime_ns();
@@ -126,7 +126,7 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
                              .msg_control = &control, .msg_controllen = sizeof control};
     ssize_t length = receive(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
     if (length < 0) return errno == EAGAIN ? FOUND_EMPTY : RECEIVE_FAILED;
-    if (!message.msg_namelen) { /* input has ended; an empty datagram has a sender */
+    if (!message.msg_namelen) { /* end of input; an empty datagram has a sender */
         if (!(flags & MSG_DONTWAIT)) usleep(1000);
         return FOUND_EMPTY;
     }
@@ -169,7 +169,7 @@ static void adopt(struct carrier *carrier, const struct change *change) {
     atomic_store(&carrier->adopted, change);
 }
 
-/* Adopt the next program if there is one. The caller must not use the earlier one any more: its memory may go. */
+/* Adopt the next program if there is one. The caller must no longer use the earlier one, whose memory may be freed. */
 static void adopt_next(struct carrier *carrier) {
     const struct change *next = atomic_exchange(&carrier->next, NULL);
     if (next) adopt(carrier, next);
@@ -181,12 +181,12 @@ static bool is_stopping(struct carrier *carrier) {
 
 static bool goes_on(struct carrier *carrier) {
     serve_due(carrier);
-    /* Release: a thread that sees the next turn may free what was read in this one. */
+    /* Release order: a thread that sees the next turn may free memory that was read in this one. */
     atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_release);
     return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
 }
 
-/* With one system call per datagram: a receive that blocks, unless the clock was set since nothing was waiting. */
+/* Receive with one system call per datagram, which blocks unless the clock was set since the queue was empty. */
 static void receive_from_one(struct carrier *carrier) {
     const struct listener *listener = carrier->routing.program->listeners;
     do {
@@ -195,7 +195,7 @@ static void receive_from_one(struct carrier *carrier) {
     } while (goes_on(carrier));
 }
 
-/* One datagram of each listener that has some per turn, so that none starves the others. */
+/* Receive one datagram per turn of each listener that has some, so that no listener starves the others. */
 static void receive_from_many(struct carrier *carrier, int waiting) {
     const struct program *program = carrier->routing.program;
     for (uint32_t index = 0; index < program->listener_count; index++) {
@@ -212,7 +212,7 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
             if (ready[index].events & EPOLLERR) has_noted |= sender_note_errors(listener->fd);
             empty += receive_one(carrier, listener, MSG_DONTWAIT) == FOUND_EMPTY;
         }
-        if (count > 0 && empty == count && !has_noted) usleep(1000); /* input has ended, which epoll says again and again */
+        if (count > 0 && empty == count && !has_noted) usleep(1000); /* end of input, which epoll reports again and again */
         if (count >= 0 && empty == count && count < LISTENERS_PER_WAIT) found_empty(carrier);
     } while (goes_on(carrier));
     for (uint32_t index = 0; index < program->listener_count; index++)
@@ -235,7 +235,7 @@ static void *receive_thread(void *of) {
 
 /* ---- the timer thread ---- */
 
-/* Feed the service manager's watchdog while receiving makes progress and Python does something now and then. */
+/* Feed the service manager's watchdog while receiving makes progress and Python gives signs of life. */
 static void feed_watchdog(struct carrier *carrier) {
     uint64_t turns = carrier_turns(carrier);
     if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;
@@ -243,14 +243,14 @@ static void feed_watchdog(struct carrier *carrier) {
     send(atomic_load(&carrier->notify), ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
 }
 
-/* Return how long to wait for the watchdog's next turn, in ms for `poll`. */
+/* Return the time until the watchdog's next turn, in ms for `poll`. */
 static int until_turn(struct carrier *carrier, int64_t turn) {
     if (atomic_load(&carrier->notify) < 0) return -1;
     int64_t wait = turn - monotonic_ns();
     return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
 }
 
-/* Serves what is due when nothing is received, and the watchdog. */
+/* Serves timers while nothing is received, and the watchdog. */
 static void *timer_thread(void *of) {
     struct carrier *carrier = of;
     int64_t turn = 0;
@@ -269,7 +269,7 @@ static void *timer_thread(void *of) {
     return NULL;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
 struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published) {
     struct carrier *carrier = calloc(1, sizeof *carrier);

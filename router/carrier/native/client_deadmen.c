@@ -12,11 +12,11 @@
 #include "threads.h"
 
 struct client_deadmen {
-    struct stage stage; /* first: `brake` is given this */
+    struct stage stage; /* first: `brake` gets a pointer to it */
     struct timers *group;
     pthread_t thread;
     pthread_cond_t changed;
-    bool has_started, has_stopped; /* of the thread that starts and stops it */
+    bool has_started, has_stopped; /* for the thread that starts and stops it */
     bool has_ended;                /* under the lock of the group */
     int wake;                      /* eventfd */
     _Atomic bool is_stopping;
@@ -24,14 +24,14 @@ struct client_deadmen {
     /* Written by the thread: */
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
     struct publishing publishing;
-    /* Of the thread: */
-    bool has_message;              /* a deadman was served, and sends the machine's output there: */
-    struct deadman_destination to; /* its `datagram` is not used: the deadman may go */
+    /* For the thread: */
+    bool has_message;              /* a served deadman sends the machine's output to: */
+    struct deadman_destination to; /* its `datagram` is not used, as the deadman may be closed */
 };
 
 /* ---- with the lock held ---- */
 
-/* Keep what a deadman sends as the output of the machine. Only one is served at a time. */
+/* Keep the datagram of a deadman as the output of the machine. Only one deadman is served at a time. */
 static int keep_message(struct stage *stage, const struct deadman_destination *to) {
     struct client_deadmen *of = (struct client_deadmen *)stage;
     stage->machine.output.size = 0;
@@ -41,7 +41,7 @@ static int keep_message(struct stage *stage, const struct deadman_destination *t
     return BRAKE_LATER;
 }
 
-/* Publish what was kept of a deadman; without the lock meanwhile. */
+/* Publish the kept datagram of a deadman, with the lock released meanwhile. */
 static void publish_message(struct client_deadmen *of, struct timer *from) {
     of->has_message = false;
     const char *why = publish_unlocked(&of->publishing, &of->group->lock, of->to.publisher, of->to.id,
@@ -55,7 +55,7 @@ static struct timer *find_due(const struct timers *group, int64_t now) {
     return NULL;
 }
 
-/* Serve each deadman that is due by now once. One that is fed while another one publishes is not due any more. */
+/* Serve each deadman that is due now, once. One that is fed while another one publishes is no longer due. */
 static void serve_all(struct client_deadmen *of) {
     int64_t now = boottime_ns();
     struct timer *due;
@@ -100,7 +100,7 @@ static void *run(void *argument) {
     return NULL;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
 static void wake_up(struct client_deadmen *of) { eventfd_write(of->wake, 1); }
 

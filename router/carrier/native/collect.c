@@ -12,7 +12,7 @@
 #include "timers.h"
 #include "wire.h"
 
-/* What the messages of a sender call a frame: an integer, or text. The hash tells most of them apart. */
+/* The name of a frame, unique for a sender: an integer or text. The hash distinguishes most names. */
 struct name {
     uint64_t hash;
     uint32_t sender, size; /* `size` of the text, or IS_INTEGER */
@@ -26,7 +26,7 @@ struct name {
 /* A datagram of a frame. */
 struct part {
     struct name name;
-    uint64_t count; /* may be more than a frame can have */
+    uint64_t count; /* may exceed the limit of a frame */
     uint32_t index;
 };
 
@@ -34,16 +34,16 @@ struct frame {
     struct name name;
     bool is_open;
     int64_t ends_at;
-    uint32_t count, held; /* parts: of the frame, and those that are there */
+    uint32_t count, held; /* parts: of the frame, and present ones */
     uint32_t bytes;       /* of their payloads */
     uint32_t stored;      /* and of their records */
-    uint32_t places[MOST_PARTS]; /* where the record of each part begins in the store, plus 1; 0 if it is not there */
+    uint32_t places[MOST_PARTS]; /* offset of each part's record in the store, plus 1; 0 if missing */
 };
 
-/* In the store, in front of a payload. */
+/* In the store, before a payload. */
 struct record {
     uint32_t size;         /* of the payload */
-    uint32_t frame, index; /* whose it is: it is kept while that place of the frame says so */
+    uint32_t frame, index; /* the owner: the record is kept while that place of the frame points to it */
 };
 
 enum {
@@ -61,12 +61,12 @@ struct collector {
     const struct targets *to;
     struct frame *order[MOST_FRAMES]; /* open frames, the oldest first, then the others */
     uint32_t open, parts, bytes;      /* frames, their parts, and the bytes of those */
-    uint32_t first_closed, closed;    /* of a ring, the earliest first */
+    uint32_t first_closed, closed;    /* of a ring, the oldest first */
     uint64_t closed_hashes[MOST_CLOSED];
     int64_t closed_until[MOST_CLOSED];
     struct name closed_names[MOST_CLOSED];
-    uint8_t *store;          /* records, one behind the other; those that are not kept any more are skipped */
-    uint32_t used, stored;   /* bytes of it, and of records that are kept */
+    uint8_t *store;          /* consecutive records; those that are no longer kept are skipped */
+    uint32_t used, stored;   /* bytes in use, and bytes of kept records */
     struct frame frames[MOST_FRAMES];
 };
 
@@ -74,7 +74,7 @@ struct collector {
 
 enum { LONGEST_DETAIL = 80 };
 
-/* All topics of the route lose a datagram or a frame. */
+/* Report the loss of a datagram or a frame for all topics of the route. */
 static void lose_for_all(struct stage *stage, const struct targets *to, int64_t now, struct lost_event lost,
                          const char *detail) {
     for (uint32_t index = 0; index < to->count; index++)
@@ -91,7 +91,7 @@ static void lose_large(const struct collector *collector, uint64_t count, int64_
     lose(collector, now, detail);
 }
 
-/* Count a datagram that is kept in a frame, or is a copy. */
+/* Count a datagram that is kept in a frame or is a duplicate. */
 static void count_all(const struct collector *collector, bool is_kept) {
     const struct targets *to = collector->to;
     for (uint32_t index = 0; index < to->count; index++) {
@@ -158,7 +158,7 @@ static struct value payload_of(const struct collector *collector, const struct f
     return (struct value){.bytes = (const uint8_t *)(record + 1), .size = record->size};
 }
 
-/* Move records that are kept to the beginning. */
+/* Move kept records to the beginning. */
 static void compact(struct collector *collector) {
     uint32_t kept = 0;
     for (uint32_t at = 0, length; at < collector->used; at += length) {
@@ -188,7 +188,7 @@ static uint32_t write_payload(const struct datagram *from, uint8_t *to) {
     return size;
 }
 
-/* Keep the payload of a datagram. There is room: what is kept never takes more than half of the store. */
+/* Keep the payload of a datagram. There is room: kept records never take more than half of the store. */
 static void keep(struct collector *collector, struct frame *frame, uint32_t index, const struct datagram *from) {
     uint32_t longest = length_of(from->size);
     if (collector->used + longest > 2 * (collector->stored + longest) + SLACK) compact(collector);
@@ -218,7 +218,7 @@ static struct frame *open_frame(struct collector *collector, const struct part *
     return frame;
 }
 
-/* What it holds can be read until another part is kept. */
+/* The contents of the frame can be read until another part is kept. */
 static void remove_frame(struct collector *collector, struct frame *frame) {
     uint32_t at = 0;
     while (collector->order[at] != frame) at++;
@@ -253,7 +253,7 @@ static void end_what_is_due(struct collector *collector, int64_t now) {
     while (collector->closed && collector->closed_until[collector->first_closed] <= now) forget_first_closed(collector);
 }
 
-/* Return the frame that this part completes, which is removed then, or NULL. */
+/* Return the frame that this part completes, which is then removed, or NULL. */
 static struct frame *offer(struct collector *collector, const struct part *part, const struct datagram *from, int64_t now) {
     struct frame *frame = find_frame(collector, &part->name);
     if (frame && frame->count != part->count) {
@@ -365,7 +365,7 @@ static bool set_name(struct name *name, const struct collect *of, const struct v
     return true;
 }
 
-/* Find out which part of which frame a datagram is. Return false, with all losses counted, if it is none. */
+/* Determine the frame and the part of a datagram. Return false, with all losses counted, if there is none. */
 static bool identify(struct stage *stage, const struct targets *to, const struct message *message, struct part *part) {
     const struct collect *of = to->collect;
     struct machine *machine = &stage->machine;
@@ -389,11 +389,11 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
         return refuse(stage, to, message, LOSS_MAPPING_ERROR, detail);
     }
     part->count = count.bits;
-    part->index = (uint32_t)order.bits; /* of a frame that is too large, it means nothing */
+    part->index = (uint32_t)order.bits; /* has no meaning for a frame that is too large */
     return true;
 }
 
-/* Keep a part. Return the frame if it is complete then, else NULL. */
+/* Keep a part. Return its frame if that is now complete, else NULL. */
 static struct frame *take(struct timers *timers, struct collector *collector, const struct part *part,
                           const struct message *message) {
     struct frame *complete = NULL;
@@ -406,7 +406,7 @@ static struct frame *take(struct timers *timers, struct collector *collector, co
     return complete;
 }
 
-/* Read the first payload of a frame, and put all of them into the slot for `items`. */
+/* Read the first payload of a frame, and store the list of all payloads in the slot for `items`. */
 static bool read_frame(struct machine *machine, const struct targets *to, const struct frame *frame,
                        const struct datagram *last) {
     const struct collect *of = to->collect;

@@ -8,31 +8,30 @@
 
 enum { MOST_REACHED = 64 };
 
-/* In ns: after what time a payload of the start that could not leave is sent again; for how long after the start a new
- * subscriber may be one that was there before, as discovery takes less; and after what time a subscriber that was
- * discovered has discovered the publisher as well. */
+/* In ns: the delay before a failed payload of the start is sent again; how long after the start a new subscriber may have
+ * existed before, as discovery takes less; and the time within which a discovered subscriber discovers the publisher. */
 static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 500000000;
 
 struct deadman {
-    struct timer timer;      /* not due while it is unarmed, unless it starts again, and once it is replaced */
-    struct deadman *acting;  /* the deadman that has replaced it, with no other one between; or itself */
-    struct deadman *fellow;  /* the next one for which the same one acts, in a circle */
+    struct timer timer;      /* not due while unarmed, unless it repeats the start, and never once replaced */
+    struct deadman *acting;  /* the last deadman that has replaced it, or itself */
+    struct deadman *fellow;  /* the next one with the same `acting`, in a circular list */
     int64_t timeout, repeat; /* ns */
-    bool is_armed;           /* or tripped: it sends when it ends */
+    bool is_armed;           /* or tripped: sends when it ends */
     bool has_tripped;
     bool starts;             /* sends when the router starts */
-    bool is_kept_back;       /* a datagram that was sent last has not left */
-    bool is_ending;          /* it ends when it is served next */
-    int64_t greets_until;    /* it greets new subscribers before that, while it is unarmed */
-    int64_t greets_again;    /* when it is due after the next time, while it is unarmed; or NEVER */
+    bool is_kept_back;       /* the last attempt to send a datagram failed */
+    bool is_ending;          /* ends when it is served next */
+    int64_t greets_until;    /* until then, and while unarmed, it greets new subscribers */
+    int64_t greets_again;    /* the due time after the next one, while unarmed; or NEVER */
     uint32_t active, trips, id;
     uint32_t count;
     struct deadman_destination destinations[];
 };
 
-/* What follows, up to the public functions, is called with the lock held. */
+/* The functions up to the public ones are called with the lock held. */
 
-/* Report what no limit applies to: where there is no room, the oldest event goes. */
+/* Report an event without a limit: if there is no room, drop the oldest event. */
 static void report_with(struct timers *timers, struct deadman_event event, const char *why) {
     struct deadman_event oldest;
     struct ring *events = timers->stage->reporter.events;
@@ -44,14 +43,14 @@ static void report(struct timers *timers, enum event_kind kind, const struct dea
     report_with(timers, (struct deadman_event){.kind = kind, .deadman = deadman->id}, "");
 }
 
-/* A datagram has not left: `error` is an errno, or 0 and `why` says more. */
+/* Report that a datagram failed: `error` is an errno, or 0 and `why` is the reason. */
 static void report_error(struct timers *timers, const struct deadman *deadman, const struct deadman_destination *to,
                          int error, const char *why) {
     report_with(timers, (struct deadman_event){0, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, why);
 }
 
-/* Send the datagrams. Return a bit for each of the first 64 destinations reached. One that is refused has left: whoever
- * refuses it obeys no earlier command either. */
+/* Send the datagrams. Return a bit for each of the first 64 destinations reached. A refused one counts as sent: a receiver
+ * that refuses it does not execute earlier commands either. */
 static uint64_t send_all(struct timers *timers, struct deadman *deadman) {
     uint64_t reached = 0;
     deadman->is_kept_back = false;
@@ -81,8 +80,8 @@ static void feed_one(struct timers *timers, const struct feed *feed, int64_t now
     release(timers, deadman);
 }
 
-/* A command has left, and the board is said to have refused an earlier one. Nobody knows whether it obeys this one, and the
- * ICMP message may be forged: so the deadman is armed, and nothing is put off. */
+/* A command was sent, and an ICMP message says that the board refused an earlier one. The message may be forged, and whether
+ * the board executes this command is unknown: so arm the deadman, but do not extend its deadline. */
 static void arm_one(struct timers *timers, const struct feed *feed, int64_t now) {
     struct deadman *deadman = feed->deadman->acting;
     if (feed->disarms || deadman->is_armed) return;
@@ -90,7 +89,7 @@ static void arm_one(struct timers *timers, const struct feed *feed, int64_t now)
     timer_set_due(timers, &deadman->timer, now + deadman->timeout);
 }
 
-/* Send what is sent when the router starts. A network that is not there yet keeps it back: then do so again. */
+/* Send the datagrams of the start. If that fails, for example because the network is not up yet, repeat it. */
 static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t now) {
     uint64_t reached = send_all(timers, deadman);
     int64_t again = deadman->is_kept_back ? now + START_AGAIN : NEVER;
@@ -99,7 +98,7 @@ static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t no
     return reached;
 }
 
-/* Send a last time if it is armed or has tripped. */
+/* Send a last time if the deadman is armed or tripped. */
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deadman *deadman = (struct deadman *)timer;
     (void)now;
@@ -120,7 +119,7 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
         start(timers, deadman, now);
         return;
     }
-    /* Repetitions that a stalled process has missed are left out. */
+    /* Skip repetitions that a stalled process has missed. */
     timer_set_due(timers, timer, timer->due + deadman->repeat * ((now - timer->due) / deadman->repeat + 1));
     if (deadman->has_tripped) {
         send_all(timers, deadman);
@@ -157,7 +156,7 @@ static void leave_fellows(struct deadman *deadman) {
     deadman->fellow = deadman;
 }
 
-/* Let `next` act for `earlier` and for all that this one has replaced. */
+/* Let `next` act for `earlier`, and for all deadmen that `earlier` acts for. */
 static void redirect(struct deadman *next, struct deadman *earlier) {
     leave_fellows(next);
     next->fellow = earlier->fellow;
@@ -166,7 +165,7 @@ static void redirect(struct deadman *next, struct deadman *earlier) {
     for (struct deadman *each = next->fellow; each != next; each = each->fellow) each->acting = next;
 }
 
-/* Deadline and state pass to `next`, unless a later command has fed it already. */
+/* Pass deadline and state to `next`, unless a later command has already fed it. */
 static void take_over(struct timers *timers, struct deadman *next, struct deadman *earlier) {
     redirect(next, earlier);
     keep_others_than(earlier, next);

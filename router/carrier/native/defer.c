@@ -7,22 +7,22 @@
 #include "limit.h"
 
 struct deferral {
-    struct timer timer; /* due while it holds a message: when that may pass */
+    struct timer timer; /* due when a held message may pass */
     struct route_target of;
     struct pacer *pacer;  /* NULL without a bandwidth */
-    struct limit limit;   /* of `on_limit: latest`; its period is 0 without */
+    struct limit limit;   /* for `on_limit: latest`; otherwise its period is 0 */
     struct output held;
-    int64_t expires; /* of what is held */
+    int64_t expires; /* of the held message */
     bool is_held;
-    bool has_ended; /* holds nothing any more */
+    bool has_ended; /* no longer holds messages */
 };
 
-/* All but the public functions is called with the lock held. */
+/* All functions but the public ones are called with the lock held. */
 
 static void pass_on(struct timers *timers, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
                     int64_t now) {
     const struct route_target *of = &deferral->of;
-    bool can_leave = size <= LONGEST_SENT; /* else sending it fails, and that is counted */
+    bool can_leave = size <= LONGEST_SENT; /* otherwise sending fails, which is counted */
     if (deferral->pacer && !deferral->has_ended && can_leave)
         pacer_queue(timers, deferral->pacer, of, data, size, expires, now);
     else if (!deliver_now(timers->stage, of->to, of->target, data, size, expires, now))
@@ -40,7 +40,7 @@ static void forget(struct timers *timers, struct deferral *deferral) {
     timer_set_due(timers, &deferral->timer, NEVER);
 }
 
-/* Keep a message until it may pass. What the machine has written is not copied. */
+/* Keep a message until it may pass. The machine's output is not copied. */
 static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires) {
     struct output *written = &stage->machine.output;
     deferral->held.size = 0;

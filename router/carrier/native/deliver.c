@@ -15,13 +15,13 @@ struct delivery {
     const struct target *target;
     struct message *message;
     int64_t expires; /* boot clock, ns; NEVER without `ttl` */
-    const uint8_t *data; /* what is sent */
+    const uint8_t *data; /* the bytes to send */
     size_t size;
 };
 
 /* ---- losses ---- */
 
-enum { LONGEST_REFUSED = 48 /* bytes of a text that are reported */ };
+enum { LONGEST_REFUSED = 48 /* reported bytes of a text */ };
 
 static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
 
@@ -51,13 +51,13 @@ void lose_stale(struct stage *stage, const struct targets *to, const struct targ
     lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_STALE, .refusal = refusal}, "");
 }
 
-/* Returns false. */
+/* Report a loss. Returns false. */
 static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
     lose_message(of->stage, of->to, of->target, of->message->now, lost, text);
     return false;
 }
 
-/* A place in the table refuses the message. */
+/* Report that a place in the table refuses the message. Returns false. */
 static bool refuse(const struct delivery *of, int reason, uint32_t place) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = of->to->generation, .place = place};
     lose_refused(of->stage, of->to, of->target, of->message->now, lost);
@@ -79,7 +79,7 @@ bool read_datagram(struct machine *machine, const struct targets *to, const stru
                            : machine_read_pieces(machine, payload, from->length);
 }
 
-/* Read the message unless that was done for another target. */
+/* Read the message, unless it was already read for another target. */
 static bool is_readable(const struct delivery *of) {
     struct message *message = of->message;
     if (!message->is_read) {
@@ -90,7 +90,7 @@ static bool is_readable(const struct delivery *of) {
     return message->outcome == EVALUATED || refuse(of, message->outcome, message->place);
 }
 
-/* ---- the steps: each returns whether the message goes on; else it is counted ---- */
+/* ---- the steps: each returns whether to continue; otherwise the message is counted ---- */
 
 static bool is_wanted(const struct delivery *of) {
     const struct topic *topic = of->target->topic;
@@ -108,7 +108,7 @@ static bool meets_condition(const struct delivery *of) {
     return is_true;
 }
 
-/* The age of a message is uncertain: for a command to a board the oldest reading counts, for others the youngest. */
+/* The age of a message is uncertain: the oldest reading counts for a command to a board, the youngest for others. */
 static int64_t expiry(const struct delivery *of) {
     struct born born = of->message->born;
     return of->to->ttl ? (of->target->board ? born.oldest : born.youngest) + of->to->ttl : NEVER;
@@ -146,7 +146,7 @@ static bool fits_board(const struct delivery *of) {
 
 /* ---- the last step ---- */
 
-/* The size of an envelope without its trailing zeros, if the rest tells how many there were. */
+/* The size of an envelope without its trailing zeros, if their number follows from the remaining bytes. */
 static size_t trimmed_size(const uint8_t *data, size_t size) {
     size_t trimmed = size;
     while (trimmed && !data[trimmed - 1]) trimmed--;
@@ -228,7 +228,7 @@ static int64_t clock_now(struct stage *stage) {
     return boottime_ns();
 }
 
-/* The age was checked in `deliver`; it is checked again only where the lock of deadmen is waited for. */
+/* `deliver` has checked the age; it is checked again only after waiting for the lock of deadmen. */
 static int send_by_socket(struct stage *stage, const struct target *target, const uint8_t *data, size_t size,
                           int64_t expires) {
     if (!target->feed_count) return sender_send(target->sender, data, size);

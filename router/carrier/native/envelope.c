@@ -1,6 +1,6 @@
-/* The wire format of protobuf (wire.h), as far as it decides whether the protobuf library (upb) parses a message.
+/* Checks the wire format of protobuf (wire.h) as the protobuf library (upb) does to parse a message.
  *
- * A field whose number or wire type is not the declared one is unknown: it is skipped, and has to be well formed. */
+ * A field whose number or wire type is not declared is unknown: it is skipped, but must be well formed. */
 #include "envelope.h"
 
 #include "utf8.h"
@@ -8,11 +8,11 @@
 
 #include <string.h>
 
-enum { MOST_LEVELS = 100 /* of messages and groups within a message, known or unknown */ };
+enum { MOST_LEVELS = 100 /* of nested messages and groups, known or unknown */ };
 
 static const struct wire_field *find_field(const struct wire_type *type, uint32_t number) {
     const struct wire_field *fields = type->fields;
-    /* Most types number their fields from 1 without gaps. For 0 the index wraps around. */
+    /* Most types number their fields from 1 without gaps. For number 0 the index wraps around. */
     if (number - 1 < type->count && fields[number - 1].number == number) return &fields[number - 1];
     uint32_t low = 0, high = type->count;
     while (low < high) {
@@ -40,7 +40,7 @@ static bool is_packed(uint8_t kind, struct bytes values) {
 
 /* A message or group whose fields are being read. */
 struct level {
-    const uint8_t *end;           /* of a group: of the message around it */
+    const uint8_t *end;           /* for a group: of the enclosing message */
     const struct wire_type *type; /* NULL in an unknown group */
     int64_t group;                /* the group's number, or NO_GROUP */
 };
@@ -62,7 +62,7 @@ static bool enter(struct walk *walk, const uint8_t *end, const struct wire_type 
 
 static void leave(struct walk *walk) { walk->rest.end = walk->levels[--walk->depth].end; }
 
-/* Read the value of a LEN field. That of a message is entered. */
+/* Read the value of a LEN field, or enter it if it is a message. */
 static bool read_known_len(struct walk *walk, const struct wire_type *type, uint32_t number) {
     struct bytes value;
     if (!read_len(&walk->rest, &value)) return false;
@@ -88,7 +88,7 @@ static bool read_field(struct walk *walk) {
     uint32_t tag;
     if (!read_tag(&walk->rest, &tag)) return false;
     uint32_t number = tag >> 3, wire_type = tag & 7;
-    /* protobuf does not look at field numbers in unknown groups, nor in messages that declare no fields. */
+    /* protobuf ignores field numbers in unknown groups and in messages that declare no fields. */
     if (number == 0 && level->type != NULL && !level->type->accepts_zero) return false;
     if (wire_type == LEN) return read_known_len(walk, level->type, number);
     if (wire_type == GROUP) return enter_group(walk, level->type, number);
@@ -101,7 +101,7 @@ static bool read_field(struct walk *walk) {
 }
 
 static bool is_well_formed(const struct wire_schema *schema, const struct wire_type *type, struct bytes message) {
-    struct walk walk; /* not initialized as a whole: only levels that were entered are read */
+    struct walk walk; /* only entered levels are initialized, as it is large */
     walk.schema = schema;
     walk.rest = message;
     walk.depth = 0;
@@ -119,7 +119,7 @@ static bool is_well_formed(const struct wire_schema *schema, const struct wire_t
     }
 }
 
-/* Whether an envelope's field has the wire type that is declared. */
+/* Whether an envelope's field has the declared wire type. */
 static bool is_known(const struct wire_field *field, uint32_t wire_type) {
     if (field == NULL) return false;
     switch (wire_type) {
@@ -133,7 +133,7 @@ static bool is_known(const struct wire_field *field, uint32_t wire_type) {
     }
 }
 
-/* Find the payload case of an envelope that is well formed: the last one that is there. */
+/* Find the payload case of a well-formed envelope: the last one present. */
 static int find_case(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
     struct bytes rest = {data, data + envelope->size};
     uint32_t pieces = 0, unknown = 0, no_message = 0, first = 0;
@@ -166,8 +166,8 @@ static int find_case(const struct wire_schema *schema, const uint8_t *data, stru
     return no_message ? MALFORMED : UNKNOWN_CASE;
 }
 
-/* Whether the datagram is nothing but the payload of a routed case, with a tag and a size of at most two bytes. The
- * payload is then parsed alone, and may have one level more than within the envelope. This is the usual datagram. */
+/* Whether the datagram contains only the payload of a routed case, with a tag and a size of at most two bytes, as usual. The
+ * payload is then parsed alone, and may have one level more than within the envelope. */
 static bool is_usual(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
     struct bytes rest = {data, data + envelope->size};
     uint64_t tag, size;

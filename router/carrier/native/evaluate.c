@@ -12,7 +12,7 @@
 
 /* ---- lists ---- */
 
-/* Make one list in cells of the `size` values from `first` on. */
+/* Make a list in cells from `size` values, beginning with `first`. */
 static bool collect(struct machine *machine, const struct value *first, uint32_t size, struct value *list) {
     struct value made = {.size = 0};
     for (uint32_t index = 0; index < size; index++)
@@ -39,7 +39,7 @@ static struct refusal real(enum refused kind, double number) {
     return (struct refusal){.kind = kind, .flags = 1, .values = {(int64_t)float64_bits(number)}};
 }
 
-/* What an operation has refused, whose operands are at `top` and behind it. */
+/* The refusal of an operation, whose operands are at `top` and after it. */
 static struct refusal refusal_of(const struct operation *op, const struct value *top) {
     switch ((enum op)op->kind) {
     case OP_CHECKED_ADD:
@@ -83,7 +83,7 @@ static struct refusal refusal_of(const struct operation *op, const struct value 
     return (struct refusal){.kind = REFUSED_ROOM};
 }
 
-/* Note what an operation has refused, unless that was noted before, by what it has called. */
+/* Record the refusal of an operation, unless a function that it called has already done so. */
 static void explain(struct machine *machine, const struct operation *op, const struct value *top) {
     if (op->kind == OP_ENTER || op->kind == OP_OCTETS) return;
     machine_refuse(machine, refusal_of(op, top));
@@ -104,12 +104,12 @@ static int outcome_of(const struct refusal *refusal) {
 
 struct loop {
     const struct operation *repeat;
-    int64_t left; /* times, this one included */
+    int64_t left; /* iterations, including this one */
     uint32_t cell_count;
     size_t text_size;
 };
 
-/* Free the cells and text that a turn has taken, unless they are kept. */
+/* Free the cells and text of an iteration, unless they are kept. */
 static void end_turn(struct machine *machine, const struct loop *loop) {
     if (loop->repeat->flag) return;
     machine->cell_count = loop->cell_count;
@@ -121,7 +121,7 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
     if (!(condition)) goto refused; \
     break
 
-/* A function of one real number, which stays if the function has no result. */
+/* Apply a function of one real number, which is kept if the function has no result. */
 #define FUNCTION(function)                   \
     {                                        \
         double of = top->real;               \
@@ -131,21 +131,21 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
         goto refused;                        \
     }
 
-/* A real number as the integer that `function` rounds it to. */
+/* Convert a real number to the integer that `function` rounds it to. */
 #define ROUNDED(function)                   \
     if (!isfinite(top->real)) goto refused; \
     top->real = function(top->real);        \
     WANT(to_integer(top))
 
-/* Execute operations. What they leave on the stack is in its second value. */
+/* Execute operations. Their result is the second value of the stack. */
 static int execute(struct machine *machine, const struct routine *routine, uint32_t *at) {
     const struct operation *operations = routine->operations;
     const uint8_t *literals = machine->layout->literals;
     struct value *slots = machine->slots;
     struct output *output = &machine->output;
-    struct value *top = machine->stack; /* the first one is never used; `top[1]` is what an operation has taken off */
+    struct value *top = machine->stack; /* the first value is never used; `top[1]` is the value that an operation has popped */
     const struct operation *op = operations, *end = op + routine->count;
-    struct loop loops[MOST_LOOPS + 1], *loop = loops; /* nor is the first of these */
+    struct loop loops[MOST_LOOPS + 1], *loop = loops; /* the first one is never used either */
     struct opened opened[MOST_OPEN + 1], *open = opened;
     for (; op < end; op++) {
         switch ((enum op)op->kind) {
@@ -276,7 +276,7 @@ int evaluate_list(struct machine *machine, const struct routine *routine, struct
     return outcome;
 }
 
-/* Execute a routine, and free the cells and text that it takes. */
+/* Execute a routine, and free its cells and text. */
 static int run(struct machine *machine, const struct routine *routine, uint32_t *at) {
     uint32_t cell_count = machine->cell_count;
     size_t text_size = machine->text_size;

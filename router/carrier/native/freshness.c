@@ -26,10 +26,10 @@ static bool is_possible(int64_t time, int64_t since, int64_t until) {
 
 static int64_t earlier(int64_t one, int64_t other) { return one < other ? one : other; }
 
-/* What is found of the times that are possible. */
+/* The possible times found so far. */
 struct found {
     struct born born;
-    int64_t oldest_in_order; /* not before what is known */
+    int64_t oldest_in_order; /* not before `not_before` */
     bool is_any, is_in_order;
 };
 
@@ -42,7 +42,7 @@ static void find(struct found *found, int64_t time, int64_t not_before) {
     found->is_in_order = true;
 }
 
-/* `event` is what the stamp means under the present setting. */
+/* `event` is the time of the stamp under the present setting. */
 static struct born possible(const struct freshness *freshness, int64_t stamp, int64_t event, int64_t now,
                             int64_t not_before) {
     struct found found = {0};

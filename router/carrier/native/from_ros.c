@@ -13,14 +13,14 @@
 #include "threads.h"
 
 enum {
-    TURN = 32, /* messages of one topic before others have their turn */
+    TURN = 32, /* messages of one topic before other topics are served */
     TOPICS_PER_WAIT = 16,
-    LOOK_MS = 250, /* the longest time between two looks at the clocks */
+    LOOK_MS = 250, /* the longest time between two comparisons of the clocks */
 };
 
 struct from_ros {
     pthread_t thread;
-    pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
+    pthread_mutex_t lock; /* held by the thread, except while it waits or is in the middleware */
     pthread_cond_t changed;
     /* Under the lock: */
     const struct ros_set *current, *offered;
@@ -28,7 +28,7 @@ struct from_ros {
     /* Written by the thread: */
     edition edition; /* of the counters */
     _Atomic uint64_t failures;
-    /* Of the thread: */
+    /* For the thread: */
     take_function *take;
     reset_function *reset;
     int epoll, wake;
@@ -51,10 +51,10 @@ static void serve_message(struct from_ros *thread, const struct ros_topic *topic
 
 /* ---- the middleware ---- */
 
-/* Take a message, without the lock, and serve it. Return whether there was one. */
+/* Take a message, without the lock, and handle it. Return whether there was one. */
 static bool serve_one(struct from_ros *thread, const struct ros_topic *topic) {
     struct message_info info = {0};
-    const void *subscription = topic->subscription; /* the topic may be gone when an abandoned thread returns */
+    const void *subscription = topic->subscription; /* the topic may be freed when an abandoned thread returns */
     pthread_mutex_unlock(&thread->lock);
     int error = thread->take(subscription, &thread->message, &info, NULL);
     bool has_failed = error && error != TAKE_FAILED;
@@ -78,8 +78,8 @@ static bool has_subscription(const struct ros_set *set, const void *subscription
     return false;
 }
 
-/* Serve what has arrived on the subscriptions of `set` that `next` does not have; NULL for none. `next` may be taken back
- * meanwhile. */
+/* Handle the messages that have arrived on the subscriptions of `set` which `next` does not have; `next` is NULL for none,
+ * and may be withdrawn meanwhile. */
 static void serve_rest(struct from_ros *thread, const struct ros_set *set, const struct ros_set *next) {
     for (uint32_t index = 0; set && !thread->is_abandoned && index < set->count; index++) {
         const struct ros_topic *topic = &set->topics[index];
@@ -89,21 +89,21 @@ static void serve_rest(struct from_ros *thread, const struct ros_set *set, const
     }
 }
 
-/* Serve another set if there is one. Return whether there was. */
+/* Switch to another set if there is one. Return whether there was. */
 static bool adopt(struct from_ros *thread) {
     const struct ros_set *next = thread->offered;
     if (!next) return false;
     serve_rest(thread, thread->current, next);
-    if (thread->offered != next) return true; /* it was taken back */
+    if (thread->offered != next) return true; /* it was withdrawn */
     thread->current = next;
     thread->offered = NULL;
     for (uint32_t index = 0; index < next->count; index++)
-        eventfd_write(next->topics[index].eventfd, 1); /* for messages that have come before */
+        eventfd_write(next->topics[index].eventfd, 1); /* for messages that arrived earlier */
     pthread_cond_broadcast(&thread->changed);
     return true;
 }
 
-/* Whether the thread may go on with what it serves. */
+/* Whether the thread may go on with its set. */
 static bool goes_on(struct from_ros *thread) {
     return !thread->is_abandoned && !thread->is_stopping && !adopt(thread);
 }
@@ -114,7 +114,7 @@ static const struct ros_topic *find_topic(const struct ros_set *set, int eventfd
     return NULL;
 }
 
-/* Serve up to TURN messages. Return false if the set has changed, or the thread is to end. */
+/* Handle up to TURN messages. Return false if the set has changed or the thread is to end. */
 static bool serve_turn(struct from_ros *thread, const struct ros_topic *topic) {
     for (int left = TURN; left; left--) {
         bool was_one = serve_one(thread, topic);
@@ -142,7 +142,7 @@ static void serve_arrivals(struct from_ros *thread) {
 static void *run(void *of) {
     struct from_ros *thread = of;
     if (thread->is_urgent) run_first();
-    else run_in_turn(); /* Fast DDS wakes it with the lock of its reader in hand */
+    else run_in_turn(); /* Fast DDS wakes it while it holds the lock of its reader */
     pthread_mutex_lock(&thread->lock);
     while (!thread->is_stopping && !thread->is_abandoned) serve_arrivals(thread);
     serve_rest(thread, thread->current, NULL);
@@ -152,9 +152,9 @@ static void *run(void *of) {
     return NULL;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
-/* Free a thread that does not run. */
+/* Free a thread that is not running. */
 static void from_ros_close(struct from_ros *thread) {
     if (thread->epoll >= 0) close(thread->epoll);
     if (thread->wake >= 0) close(thread->wake);

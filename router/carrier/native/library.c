@@ -1,12 +1,12 @@
-/* What Python asks of the library when it loads it: library.py. */
+/* Checks that Python makes when it loads the library (library.py). */
 #include "rcl_types.h"
 
 const char *carrier_checksum(void);
 
-/* The checksum of the sources that this library was made of. */
+/* The checksum of the sources of this library. */
 const char *carrier_checksum(void) { return CARRIER_CHECKSUM; }
 
-/* rcl_types.h is compared with the headers of rcl, where they are when the library is made. */
+/* Compares rcl_types.h with the headers of rcl, if they exist at the build. */
 
 #if defined(__has_include) && __has_include("rcl/types.h")
 #include "rcl/types.h"

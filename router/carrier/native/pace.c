@@ -3,21 +3,21 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const int64_t SECOND = 1000000000;      /* ns, as are: */
-static const int64_t BURST = 20000000;         /* what a pause saves up */
-static const int64_t OVERDRAFT = 100000000;    /* what commands may overdraw */
-enum { LEAST_OVERDRAFT = 2048 };               /* bytes, where the budget is so small that this is more */
+static const int64_t SECOND = 1000000000;      /* in ns, like: */
+static const int64_t BURST = 20000000;         /* the budget that a pause accumulates */
+static const int64_t OVERDRAFT = 100000000;    /* the overdraft of commands */
+enum { LEAST_OVERDRAFT = 2048 };               /* bytes, if that is more than OVERDRAFT */
 
-/* A datagram that waits. It follows, filled up to a multiple of 8 bytes. */
+/* The header of a waiting datagram, which follows, padded to a multiple of 8 bytes. */
 struct waiting_datagram {
     const struct route_target *of;
     int64_t expires;
-    int64_t cost; /* the time in which the budget earns it */
+    int64_t cost; /* ns of budget */
     size_t size;
 };
 enum { LONGEST_WAITING = sizeof(struct waiting_datagram) + LONGEST_SENT + 8 };
 
-/* Datagrams of one priority, the oldest first: between `first` and `end`, or if they go round, between `first` and `limit`
+/* Datagrams of one priority, the oldest first: between `first` and `end`, or if they wrap around, between `first` and `limit`
  * and between 0 and `end`. */
 struct lane {
     uint8_t *bytes;
@@ -31,9 +31,9 @@ struct pacer {
     struct lane lanes[PRIORITIES];
     int64_t bandwidth; /* bytes per second */
     int64_t overdraft;
-    int64_t bytes_left, datagrams_left; /* that may wait still; below 0 until the oldest was dropped */
-    int64_t paid_at; /* when the budget has paid for all that was sent; what lies before now is saved up */
-    bool has_ended;  /* nothing waits any more */
+    int64_t bytes_left, datagrams_left; /* that may still wait; below 0 until the oldest is dropped */
+    int64_t paid_at; /* when the budget has paid for everything sent; the time from then to now is accumulated */
+    bool has_ended;  /* datagrams no longer wait */
 };
 
 /* ---- lanes ---- */
@@ -44,7 +44,7 @@ static struct waiting_datagram *first_of(const struct lane *lane) {
     return (struct waiting_datagram *)(lane->bytes + lane->first);
 }
 
-/* Add a datagram. There always is room, also while the first one stays: lane_open. */
+/* Add a datagram. There is always room, even while the first one stays: see lane_open. */
 static void put(struct lane *lane, const struct waiting_datagram *waiting, const uint8_t *data) {
     size_t size = whole_size(waiting->size);
     if (!lane->count) {
@@ -62,7 +62,7 @@ static void put(struct lane *lane, const struct waiting_datagram *waiting, const
     lane->count++;
 }
 
-/* Take off the first datagram. It stays where it is until another one is put. */
+/* Remove the first datagram. It stays valid until another one is added. */
 static const struct waiting_datagram *take(struct lane *lane) {
     const struct waiting_datagram *taken = first_of(lane);
     lane->first += whole_size(taken->size);
@@ -74,7 +74,7 @@ static const struct waiting_datagram *take(struct lane *lane) {
     return taken;
 }
 
-/* Room for all that may wait, of one datagram more, and so much that a free piece is long enough for another one. */
+/* Room for all datagrams that may wait, one more, and so much that a free piece is long enough for another one. */
 static bool lane_open(struct lane *lane, int64_t bytes, int64_t datagrams) {
     lane->capacity = (size_t)bytes + (size_t)datagrams * (sizeof(struct waiting_datagram) + 8) + 4 * LONGEST_WAITING;
     lane->bytes = malloc(lane->capacity);
@@ -87,7 +87,7 @@ static int64_t cost_of(const struct pacer *pacer, size_t size) {
     return ((int64_t)size * SECOND + pacer->bandwidth - 1) / pacer->bandwidth;
 }
 
-/* Cap what is saved up. To be called before the first datagram of a lane changes. */
+/* Limit the accumulated budget. Call it before the first datagram of a lane changes. */
 static void limit_savings(struct pacer *pacer, int64_t now) {
     int64_t first = 0;
     for (int index = PRIORITY_COMMAND + 1; index < PRIORITIES; index++) {
@@ -118,7 +118,7 @@ static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *
     return true;
 }
 
-/* Send what the budget is enough for. Return when to go on, or NEVER if nothing waits any more. */
+/* Send what the budget allows. Return when to continue, or NEVER if nothing waits. */
 static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64_t now) {
     for (int index = 0; index < PRIORITIES; index++) {
         struct lane *lane = &pacer->lanes[index];
@@ -127,7 +127,7 @@ static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64
             int64_t may_go_at = pacer->paid_at + (index == PRIORITY_COMMAND ? -pacer->overdraft : first->cost);
             if (now < may_go_at && now <= first->expires) {
                 int64_t due = may_go_at + BURST / 2; /* later than necessary: one call then sends several */
-                /* One that has expired no longer counts in the savings. */
+                /* An expired one no longer raises the limit of the accumulated budget. */
                 return first->expires != NEVER && first->expires + 1 < due ? first->expires + 1 : due;
             }
             if (!send_first(timers, pacer, lane, now)) limit_savings(pacer, now);
@@ -152,11 +152,11 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
 }
 
 static void adopt(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target) {
-    (void)to, (void)target; /* it delivers to those for which datagrams wait */
+    (void)to, (void)target; /* each waiting datagram has its target */
     timers_add(timers, timer);
 }
 
-/* Send all that waits, whatever the budget: at most what there is room for. */
+/* Send all waiting datagrams, whatever the budget. */
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct pacer *pacer = (struct pacer *)timer;
     pacer->has_ended = true;

@@ -7,7 +7,7 @@
 
 #include "clock.h"
 
-/* `struct sched_attr` of sched_setattr(2), which C libraries declare since 2024 only. */
+/* `struct sched_attr` of sched_setattr(2), which C libraries declare only since 2024. */
 struct scheduling {
     uint32_t size, policy;
     uint64_t flags;
@@ -16,7 +16,7 @@ struct scheduling {
     uint64_t runtime, deadline, period;
 };
 
-static const uint64_t SLICE = 100000; /* ns, the shortest that Linux takes */
+static const uint64_t SLICE = 100000; /* ns, the shortest that Linux accepts */
 static const int64_t TURN = 100000000; /* ns */
 
 static bool take_priority(void) {
@@ -33,8 +33,7 @@ static void take_short_slices(void) {
     take_usual_policy();
 }
 
-/* Whether the router was started without a policy of its own. A thread of Python that opens ROS passes on the batch
- * policy. */
+/* Whether the router was started with the default policy. A Python thread that opens ROS passes on the batch policy. */
 static bool has_usual_policy(void) {
     int inherited = sched_getscheduler(0);
     return inherited == SCHED_OTHER || inherited == SCHED_BATCH;
@@ -45,7 +44,7 @@ void run_in_turn(void) {
 }
 
 void run_soon(void) {
-    if (has_usual_policy()) take_short_slices(); /* before Linux 6.12 they change nothing */
+    if (has_usual_policy()) take_short_slices(); /* has no effect before Linux 6.12 */
 }
 
 bool run_first(void) {

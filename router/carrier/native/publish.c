@@ -11,26 +11,26 @@
 #include "threads.h"
 
 struct publish_thread {
-    struct stage stage; /* first: what it calls is given this */
+    struct stage stage; /* first: its functions get a pointer to it */
     pthread_t thread;
-    pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
+    pthread_mutex_t lock; /* held by the thread, except while it waits or is in the middleware */
     pthread_cond_t changed;
     bool has_ended, is_abandoned; /* under the lock */
-    struct publish_change *changes; /* likewise: those that it has not reached, in order */
+    struct publish_change *changes; /* likewise: those not reached yet, in order */
     _Atomic bool is_stopping;
     _Atomic uint32_t latest; /* generation */
     /* Written by the thread: */
     edition edition;             /* of the counters */
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
     struct publishing publishing;
-    /* Of the thread: */
+    /* For the thread: */
     struct ring *ring;
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
 };
 
 /* ---- the middleware ---- */
 
-/* Publish what was written, without the lock. The counters balance meanwhile: the message waits. */
+/* Publish the written message, without the lock. The counters balance meanwhile, as the message counts as waiting. */
 static enum publication publish_written(struct stage *stage, const struct target *target, const char **why) {
     struct publish_thread *thread = (struct publish_thread *)stage;
     edition_end(&thread->edition);
@@ -41,7 +41,7 @@ static enum publication publish_written(struct stage *stage, const struct target
 
 /* ---- the thread ---- */
 
-/* For how long to wait for messages, in ns: until the next timer is due, or for ever (-1). */
+/* How long to wait for messages, in ns: until the next timer is due, or for ever (-1). */
 static int64_t patience_of(const struct publish_thread *thread) {
     int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return -1;
@@ -49,7 +49,7 @@ static int64_t patience_of(const struct publish_thread *thread) {
     return wait > 0 ? wait : 0;
 }
 
-/* Take messages, without the lock. Return how many bytes they have. */
+/* Take messages, without the lock. Return their size in bytes. */
 static size_t take(struct publish_thread *thread, bool waits) {
     int64_t timeout = waits ? patience_of(thread) : 0;
     pthread_mutex_unlock(&thread->lock);
@@ -81,7 +81,7 @@ static void reach(struct publish_thread *thread, uint32_t generation) {
     atomic_store(&thread->generation, generation);
 }
 
-/* Serve what was taken. Return false if the thread was abandoned meanwhile. */
+/* Handle the taken messages. Return false if the thread was abandoned meanwhile. */
 static bool serve_all(struct publish_thread *thread, size_t size) {
     for (size_t at = 0; at < size;) {
         const struct message_record *record = (const struct message_record *)(thread->records + at);
@@ -98,7 +98,7 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
     return true;
 }
 
-/* Settle what is still kept. */
+/* Settle the timers. */
 static void end_timers(struct publish_thread *thread) {
     edition_begin(&thread->edition);
     timers_end(thread->stage.timers);
@@ -110,7 +110,7 @@ static void *run(void *of) {
     run_soon();
     pthread_mutex_lock(&thread->lock);
     for (;;) {
-        /* Read before the ring: what is there by now is served, and what comes later is of this generation at least. */
+        /* Read this before the ring: present messages are handled, and later ones have at least this generation. */
         uint32_t latest = atomic_load(&thread->latest);
         bool is_stopping = atomic_load(&thread->is_stopping);
         size_t size = take(thread, !is_stopping && latest <= atomic_load(&thread->generation));
@@ -126,9 +126,9 @@ static void *run(void *of) {
     return NULL;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
-/* Free a thread that does not run. */
+/* Free a thread that is not running. */
 static void publish_close(struct publish_thread *thread) {
     pthread_cond_destroy(&thread->changed);
     pthread_mutex_destroy(&thread->lock);
@@ -137,7 +137,7 @@ static void publish_close(struct publish_thread *thread) {
     free(thread);
 }
 
-/* All but the thread itself. NULL for lack of memory. */
+/* Prepare everything but the thread itself. Returns NULL if memory runs out. */
 static struct publish_thread *publish_prepare(struct ring *ring, counter *counters, struct ring *events,
                                               publish_function *publish, error_function *error, reset_function *reset,
                                               struct publish_change *first) {

@@ -6,7 +6,7 @@
 
 enum { HEADER = 4 };
 
-/* The message that is read, and the offset of what comes next. */
+/* The message being read, and the current offset. */
 struct reader {
     const uint8_t *message;
     size_t size, at;
@@ -15,12 +15,11 @@ struct reader {
 /* A sequence or array of messages or strings. */
 struct repetition {
     const struct read_operation *first; /* of an element */
-    uint32_t left;                      /* elements, this one included */
-    uint16_t list;                      /* slot that gets the beginning of each element, or NONE */
+    uint32_t left;                      /* elements, including this one */
+    uint16_t list;                      /* slot for the beginnings of the elements, or NONE */
 };
 
-/* Step over `count` scalars of `size` bytes; `start` gets the place of the first one. Return false if the message ends
- * before. */
+/* Skip `count` scalars of `size` bytes; `start` is set to the first one. Return false if the message ends before. */
 static bool skip_scalars(struct reader *reader, uint32_t count, unsigned size, const uint8_t **start) {
     if (count) reader->at += (HEADER - reader->at) & (size - 1); /* sizes are powers of two */
     if (reader->at > reader->size || count > (reader->size - reader->at) / size) return false;
@@ -50,8 +49,8 @@ static bool read_array(struct reader *reader, uint32_t count, unsigned size, str
     return true;
 }
 
-/* Some writers leave out the NUL of an empty string, so that its length is 0. Other text without its NUL is read as text
- * that is not UTF-8: so only a program that uses it refuses the message. */
+/* Some writers omit the NUL of an empty string, so that its length is 0. Other text without a NUL is read as text that is not
+ * UTF-8, so that only a routine that uses it refuses the message. */
 static bool read_text(struct reader *reader, struct value *text) {
     static const uint8_t NO_UTF8[] = {0xFF};
     uint32_t size;

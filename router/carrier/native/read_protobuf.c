@@ -5,7 +5,7 @@
 #include "lists.h"
 #include "wire.h"
 
-/* Find a field. Most messages have theirs in order: `guess` is where the next one is then. */
+/* Find a field. Most messages have their fields in order, so `guess` is the index after the last one found. */
 static const struct wanted_field *find(const struct section *section, uint32_t number, uint32_t *guess) {
     if (*guess < section->count && section->fields[*guess].number == number) return &section->fields[(*guess)++];
     uint32_t low = 0, high = section->count;
@@ -35,7 +35,7 @@ static uint32_t wire_type_of(enum field_type type) {
 
 static int64_t of_zigzag(uint64_t bits) { return (int64_t)(bits >> 1 ^ (bits & 1 ? UINT64_MAX : 0)); }
 
-/* What protobuf makes of the bits of a scalar. */
+/* The value of a scalar's bits, as in protobuf. */
 static struct value scalar(enum field_type type, uint64_t bits) {
     switch (type) {
     case TYPE_BOOL: return (struct value){.integer = bits != 0};
@@ -66,7 +66,7 @@ static bool read_scalar(struct bytes *from, enum field_type type, struct value *
     return true;
 }
 
-/* Whether a field can hold a value: of a closed enum, only its own numbers. */
+/* Whether a field can hold a value; a closed enum holds only its own numbers. */
 static bool is_known(const struct machine *machine, const struct wanted_field *field, const struct value *value) {
     if (field->type != TYPE_CLOSED_ENUM) return true;
     const struct closed_enum *closed = &machine->layout->closed[field->closed];
@@ -83,7 +83,7 @@ static bool read_element(struct machine *machine, const struct wanted_field *fie
     return !is_known(machine, field, &element) || list_add(machine, &machine->slots[field->slot], element);
 }
 
-/* Read a value of a repeated field, or several that are packed. */
+/* Read a value of a repeated field, or several packed ones. */
 static bool read_elements(struct machine *machine, const struct wanted_field *field, uint32_t wire_type,
                           struct bytes *from) {
     struct bytes many;
@@ -101,7 +101,7 @@ static bool has_type(const struct wanted_field *field, uint32_t wire_type) {
     return wire_type == declared || (wire_type == LEN && field->is_repeated);
 }
 
-/* A member of a oneof clears the others. */
+/* Clear the other members of a field's oneof. */
 static void choose(struct machine *machine, const struct wanted_field *field) {
     struct value *slots = machine->slots;
     if (slots[field->choice].integer == field->number) return;
@@ -109,13 +109,13 @@ static void choose(struct machine *machine, const struct wanted_field *field) {
     slots[field->choice].integer = field->number;
 }
 
-/* Note that a field is there. */
+/* Record that a field is present. */
 static inline void mark(struct machine *machine, const struct wanted_field *field) {
     if (field->choice != NONE) choose(machine, field);
     if (field->presence != NONE) machine->slots[field->presence].integer = 1;
 }
 
-/* A number that a closed enum does not have is an unknown field: it neither clears nor marks anything. */
+/* Read a singular field. A number that a closed enum lacks is an unknown field: it neither clears nor marks anything. */
 static bool read_single(struct machine *machine, const struct wanted_field *field, struct bytes *from) {
     struct value value;
     if (!read_scalar(from, field->type, &value)) return false;

@@ -9,15 +9,15 @@
 struct rehearsal {
     struct routing routing;
     struct ros_routing ros;
-    struct stage publishing, timing; /* of what topics get, and of what is due */
+    struct stage publishing, timing; /* for messages to topics, and for timers */
     struct timers *timers, *holding; /* of destinations, and of topics */
     struct ring *events;
     const struct ros_topic *topics;
-    int64_t now, ahead;   /* boot clock; how far the wall clock is ahead of it */
+    int64_t now, ahead;   /* boot clock; the lead of the wall clock */
     int64_t noted_at;     /* the time that the records have reached */
     uint8_t *records;
     size_t size, capacity;
-    bool is_incomplete;   /* there was no memory for a record */
+    bool is_incomplete;   /* memory for a record has run out */
     _Alignas(8) uint8_t taken[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
 };
 
@@ -39,8 +39,8 @@ static void append_record(struct rehearsal *rehearsal, const void *record, size_
     rehearsal->size += size;
 }
 
-/* Write down a record, after the events that were reported before: at the time of the record before them, which says what
- * was counted. */
+/* Append a record, after the events that were reported before it. These have the time of the preceding record, which says
+ * what was counted. */
 static void note(struct rehearsal *rehearsal, const void *record, size_t size) {
     for (size_t taken; (taken = ring_take(rehearsal->events, rehearsal->taken, sizeof rehearsal->taken, 0));)
         append_record(rehearsal, rehearsal->taken, taken);
@@ -97,7 +97,7 @@ static bool open_stage(struct rehearsal *rehearsal, struct stage *stage, counter
     stage->send = send_nowhere;
     stage->brake = brake_nowhere;
     stage->publish = publish_nowhere;
-    /* All losses are reported: the window in which these are still left never ends. */
+    /* All losses are reported: the time window never ends. */
     stage->reporter.window_began = INT64_MAX;
     stage->reporter.left = UINT32_MAX;
     return is_open;
@@ -108,7 +108,7 @@ struct rehearsal *rehearsal_open(counter *counters, int64_t now) {
     if (!rehearsal) return NULL;
     rehearsal->now = rehearsal->noted_at = now;
     rehearsal->events = ring_open(1 << 16);
-    rehearsal->routing.published = ring_open(1 << 16); /* from which each message is taken at once */
+    rehearsal->routing.published = ring_open(1 << 16); /* each message is taken at once */
     rehearsal->timers = timers_open_on(&rehearsal->timing, false);
     rehearsal->holding = timers_open_on(&rehearsal->publishing, false);
     struct stage *stages[] = {&rehearsal->routing.stage, &rehearsal->ros.stage, &rehearsal->timing, &rehearsal->publishing};
@@ -138,7 +138,7 @@ struct timers *rehearsal_timers(struct rehearsal *rehearsal) { return rehearsal-
 
 /* ---- messages ---- */
 
-/* What the thread does that publishes. */
+/* The work of the publish thread. */
 static void publish_waiting(struct rehearsal *rehearsal) {
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
     for (size_t size; (size = ring_take(rehearsal->routing.published, records, sizeof records, 0));)
@@ -173,7 +173,7 @@ void rehearsal_message(struct rehearsal *rehearsal, uint32_t topic, const void *
     struct taken taken = {.data = data, .size = size, .published_at = sent_at, .now = rehearsal->now,
                           .received_at = rehearsal->now + rehearsal->ahead,
                           .publisher = find_publisher(&rehearsal->ros, gid, NO_NAME)};
-    taken.publisher->sent = taken.publisher->stamped = INT64_MIN; /* any of them may have sent it */
+    taken.publisher->sent = taken.publisher->stamped = INT64_MIN; /* any publisher may have sent it */
     route_ros_message(&rehearsal->ros, &rehearsal->topics[topic], &taken);
 }
 
@@ -200,7 +200,7 @@ void rehearsal_end(struct rehearsal *rehearsal) {
     timers_end(rehearsal->timers);
 }
 
-/* ---- what became of it ---- */
+/* ---- results ---- */
 
 const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size) {
     note(rehearsal, NULL, 0);
@@ -209,7 +209,7 @@ const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size) {
     return rehearsal->is_incomplete ? NULL : rehearsal->records;
 }
 
-/* ---- conditions by themselves ---- */
+/* ---- stand-alone conditions ---- */
 
 static int evaluate_on_payload(struct machine *machine, const struct layout *layout, const struct routine *condition,
                                const struct value *source, int64_t received_at, const void *payload, size_t size,

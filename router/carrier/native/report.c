@@ -18,7 +18,7 @@ bool may_report(struct reporter *reporter, int64_t now) {
 bool put_event(struct ring *events, const void *event, size_t size, const char *text) {
     struct {
         _Alignas(8) struct event_head head;
-        char rest[sizeof(struct lost_event) + LONGEST_TEXT + 1]; /* no other event that has a text is longer */
+        char rest[sizeof(struct lost_event) + LONGEST_TEXT + 1]; /* the longest event with a text */
     } record = {0};
     size_t length = strnlen(text, LONGEST_TEXT);
     memcpy(&record, event, size);

@@ -15,7 +15,7 @@ struct ring *ring_open(size_t capacity) {
     if (!ring) return NULL;
     ring->capacity = capacity;
     ring->words = malloc(capacity);
-    if (ring->words) memset((void *)ring->words, 0, capacity); /* now, or the writer would wait for each new page */
+    if (ring->words) memset((void *)ring->words, 0, capacity); /* now, so that page faults do not delay the writer */
     ring->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     if (!ring->words || ring->wake < 0) {
         ring_close(ring);
@@ -34,8 +34,8 @@ static _Atomic uint64_t *word_at(struct ring *ring, uint64_t position) {
     return &ring->words[(position & (ring->capacity - 1)) / WORD];
 }
 
-/* The words are atomic because the reader may copy a record while the writer, having dropped it, writes the next one
- * there. What it copied is void then. */
+/* The words are atomic because the reader may copy a record while the writer has dropped it and writes the next one there.
+ * The copy is then discarded. */
 static void copy_out(struct ring *ring, uint64_t position, void *to, size_t size) {
     uint64_t *words = to;
     for (size_t done = 0; done < size; done += WORD)
@@ -47,10 +47,10 @@ static uint32_t size_at(struct ring *ring, uint64_t position) {
     return head.size;
 }
 
-/* Wake the reader, if it sleeps or is going to, once for all that is written until then. The full fences here and in
- * `ring_take` stand between what either side stores and what it loads then: either the reader sees the record or the
- * request, or the writer sees that it waits. Sequentially consistent stores and loads would do on a processor, but
- * qemu-user for aarch64 reorders them. */
+/* Wake the reader if it sleeps or is about to, once for all records written until then. The full fences here and in
+ * `ring_take` separate each side's stores from its later loads: either the reader sees the record or the request, or the
+ * writer sees that it waits. Sequentially consistent stores and loads would suffice on a processor, but qemu-user for
+ * aarch64 reorders them. */
 static void wake_reader(struct ring *ring) {
     atomic_thread_fence(memory_order_seq_cst);
     if (atomic_load_explicit(&ring->is_watched, memory_order_relaxed)) eventfd_write(ring->wake, 1);
@@ -63,7 +63,7 @@ bool ring_put(struct ring *ring, const void *record, uint32_t size) {
     uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
     if (written - taken + size > ring->capacity) return false;
     const uint64_t *words = record;
-    /* A reader that sees one of these words also sees that the record that was there is gone. */
+    /* A reader that sees one of these words also sees that the earlier record was dropped. */
     atomic_thread_fence(memory_order_release);
     for (uint32_t done = 0; done < size; done += WORD)
         atomic_store_explicit(word_at(ring, written + done), *words++, memory_order_relaxed);
@@ -80,13 +80,13 @@ bool ring_drop(struct ring *ring, void *record, size_t limit) {
     return atomic_compare_exchange_strong(&ring->taken, &taken, taken + size);
 }
 
-/* The size of the record at `taken`. If it was overwritten meanwhile, this may be any size that a record can have, or 0. */
+/* The size of the record at `taken`. If it was overwritten meanwhile, this may be any possible size, or 0. */
 static uint32_t record_at(struct ring *ring, uint64_t taken) {
     uint32_t size = size_at(ring, taken);
     return size >= WORD && size % WORD == 0 && size <= ring->capacity ? size : 0;
 }
 
-/* Whether nothing was dropped since `taken` was read: then all that was read of the record since is its own. */
+/* Whether nothing was dropped since `taken` was read: then everything read of the record since is valid. */
 static bool is_oldest(struct ring *ring, uint64_t taken) {
     atomic_thread_fence(memory_order_acquire);
     return atomic_load_explicit(&ring->taken, memory_order_relaxed) == taken;

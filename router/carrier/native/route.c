@@ -38,7 +38,7 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
 }
 
 static bool is_wanted(const struct targets *to) {
-    if (to->collect) return true; /* a frame is counted also while nobody subscribes */
+    if (to->collect) return true; /* frames are counted even without subscribers */
     for (uint32_t index = 0; index < to->count; index++)
         if (__atomic_load_n(to->targets[index].topic->wanted, __ATOMIC_RELAXED)) return true;
     return false;
@@ -54,7 +54,7 @@ static void drop_oldest(struct routing *routing, int64_t now) {
     }
 }
 
-/* Have the publish thread deliver to topics, if anybody subscribes to one of them. */
+/* Have the publish thread deliver to topics, if one of them has subscribers. */
 static void hand_over(struct routing *routing, const struct targets *to, const struct received *received) {
     if (!is_wanted(to)) {
         for (uint32_t index = 0; index < to->count; index++)
@@ -82,7 +82,7 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
 
 /* ---- routing ---- */
 
-/* Return the endpoint that has sent, or NULL for a stranger. One with a port is preferred to one without. */
+/* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. */
 static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
     uint32_t low = 0, high = listener->peer_count;
     while (low < high) {
@@ -105,7 +105,7 @@ static const struct payload_case *find_case(const struct program *program, uint3
     return &program->cases[low]; /* envelope_read returns no other number */
 }
 
-/* Return ROUTED, or the reason why no route takes the datagram. */
+/* Return ROUTED, or the reason for rejecting the datagram. */
 static int route(struct routing *routing, const struct payload_case *found, struct received *received) {
     const struct program *program = routing->program;
     const struct listener *listener = received->listener;
@@ -125,7 +125,7 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     return ROUTED;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
 int route_datagram(struct routing *routing, struct received *received) {
     const struct listener *listener = received->listener;

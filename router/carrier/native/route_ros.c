@@ -5,7 +5,7 @@
 #include "evaluate.h"
 #include "lists.h"
 
-enum { MOST_ELEMENTS = 1 << 16 /* that `for_each` sends of one message: the lock is held meanwhile */ };
+enum { MOST_ELEMENTS = 1 << 16 /* of one message for `for_each`, as the lock is held meanwhile */ };
 
 /* ---- the age of a message ---- */
 
@@ -15,8 +15,8 @@ static struct born earlier_of(struct born one, struct born other) {
     return one;
 }
 
-/* When a message was sent by the sender's clock, or arrived if that is earlier: then the sender's clock is ahead. Its
- * arrival is not known to be in order, so of that the youngest reading counts. */
+/* The time of sending by the sender's clock, or of arrival if that is earlier because the sender's clock is ahead. Messages
+ * may arrive out of order, so the youngest reading of the arrival counts. */
 static struct born sent(struct ros_routing *routing, const struct taken *taken) {
     int64_t stamp = taken->published_at ? taken->published_at : taken->arrived_at;
     if (!stamp) stamp = taken->received_at;
@@ -28,7 +28,7 @@ static struct born sent(struct ros_routing *routing, const struct taken *taken) 
     return earlier_of(sent, (struct born){arrived, arrived});
 }
 
-/* If the message was stamped before it was sent, it was born then. */
+/* If the stamp of a message is before its sending, its age counts from the stamp. */
 static void date_by_stamp(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken,
                           struct message *message) {
     if (route->seconds == NONE) return;
@@ -44,7 +44,7 @@ static void date_by_stamp(struct ros_routing *routing, const struct ros_route *r
 
 /* ---- messages ---- */
 
-/* Take an element off a list, and deliver it. The cells that this takes are freed afterwards. */
+/* Remove an element from a list, and deliver it. Its cells are freed afterwards. */
 static void serve_element(struct ros_routing *routing, const struct ros_route *route, struct message message,
                           struct value *list, int64_t index) {
     struct machine *machine = &routing->stage.machine;
@@ -58,8 +58,8 @@ static void serve_element(struct ros_routing *routing, const struct ros_route *r
     machine->cell_count = cell_count;
 }
 
-/* Deliver each element of the list of `for_each`. Return how many there were. A list that is refused or too long counts as
- * one message. */
+/* Deliver each element of the list of `for_each`. Return their number. A list that is refused or too long counts as one
+ * message. */
 static int64_t serve_each(struct ros_routing *routing, const struct ros_route *route, struct message *message) {
     struct machine *machine = &routing->stage.machine;
     struct value list;
@@ -80,7 +80,7 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
     return count;
 }
 
-/* ---- for others ---- */
+/* ---- public ---- */
 
 struct ros_publisher *find_publisher(struct ros_routing *routing, const uint8_t *gid, uint32_t topic) {
     uint32_t hash = 2166136261 ^ topic; /* FNV-1a */

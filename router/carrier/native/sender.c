@@ -9,9 +9,9 @@
 #include <string.h>
 #include <sys/socket.h>
 
-enum { MOST_ERRORS = 32 }; /* that are read at once */
+enum { MOST_ERRORS = 32 }; /* read at once */
 
-static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held for some steps only */
+static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held only briefly */
 static struct sender *first;
 
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port) {
@@ -45,19 +45,19 @@ void sender_close(struct sender *sender) {
 
 /* ---- errors of earlier datagrams ---- */
 
-/* Whether the receiver has refused a datagram. Routers report passing troubles too, and this computer reports that nobody
- * answers ARP: those say nothing about the next datagram. */
+/* Whether the receiver has refused a datagram. Routers also report temporary problems, and this computer reports that ARP is
+ * not answered: these say nothing about the next datagram. */
 static bool is_refusal(const struct sock_extended_err *error) {
     if (error->ee_origin != SO_EE_ORIGIN_ICMP || error->ee_type != ICMP_DEST_UNREACH) return false;
     return error->ee_code != ICMP_NET_UNREACH && error->ee_code != ICMP_HOST_UNREACH;
 }
 
-/* Read one error that a socket has. Return whether there was one. `refused` becomes its errno, or 0 if it is no refusal;
- * `address` that of the datagram, if the socket is an IPv4 one. */
+/* Read an error of a socket. Return whether there was one. `refused` is set to its errno, or 0 if it is not a refusal;
+ * `address` is set to that of the datagram, for an IPv4 socket. */
 static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
     union { struct cmsghdr aligned; char bytes[256]; } control;
     union { struct sockaddr_in v4; struct sockaddr_storage any; } name;
-    char byte; /* of the datagram: without room for any, qemu-user reads nothing and says that it did */
+    char byte; /* of the datagram: without a buffer, qemu-user reads nothing but reports success */
     struct iovec into = {&byte, sizeof byte};
     struct msghdr message = {.msg_name = &name, .msg_namelen = sizeof name, .msg_iov = &into, .msg_iovlen = 1,
                              .msg_control = &control, .msg_controllen = sizeof control};
@@ -74,18 +74,18 @@ static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
     return true;
 }
 
-/* Errors share the memory of the receive buffer: what a flood has left there would keep datagrams out. */
+/* Discard errors, which share the memory of the receive buffer: those of a flood would keep datagrams out. */
 static void discard_errors(int fd) {
     for (int wanted = 0; wanted <= 1; wanted++) setsockopt(fd, IPPROTO_IP, IP_RECVERR, &wanted, sizeof wanted);
 }
 
-/* Return false if the sender has an error already: it keeps one at a time. */
+/* Record an error. Return false if the sender already has one: it keeps one at a time. */
 static bool note(struct sender *sender, int refused) {
     int none = 0;
     return atomic_compare_exchange_strong(&sender->refused, &none, refused);
 }
 
-/* Of several senders to one address, the error goes to the first that has none yet. */
+/* Record an error for the first sender to the address that has none yet. */
 static void note_by_address(const struct sockaddr_in *address, int refused) {
     pthread_mutex_lock(&list_lock);
     for (struct sender *each = first; each; each = each->next)
@@ -104,7 +104,7 @@ bool sender_note_errors(int listener) {
     return read;
 }
 
-/* As `sender_note_errors`, for the errors that have reached the sender's own socket. */
+/* As `sender_note_errors`, for errors of the sender's own socket. */
 static bool note_own_errors(struct sender *sender) {
     struct sockaddr_in address;
     int fd = atomic_load(&sender->fd), refused, read = 0;
@@ -128,7 +128,7 @@ static int send_once(struct sender *sender, const void *data, size_t size) {
     return sendto(fd, data, size, MSG_DONTWAIT, to, sizeof sender->address) < 0 ? errno : 0;
 }
 
-/* Send from the port that the socket is bound to, and from whichever address the kernel chooses. Return 0 or an errno. */
+/* Send from the port of the socket, and from an address that the kernel chooses. Return 0 or an errno. */
 static int send_from_any_address(struct sender *sender, const void *data, size_t size) {
     union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct in_pktinfo))]; } control;
     memset(&control, 0, sizeof control); /* no address, no interface */
@@ -140,8 +140,8 @@ static int send_from_any_address(struct sender *sender, const void *data, size_t
     return sendmsg(atomic_load(&sender->fd), &message, MSG_DONTWAIT) < 0 ? errno : 0;
 }
 
-/* Try again after an error, if it is of an earlier datagram, or if this computer may have lost the address that the socket
- * is bound to: a brake has to leave from another one. Return 0 or an errno. */
+/* Retry after an error if it is about an earlier datagram, or if this computer may have lost the socket's address: a brake
+ * must then be sent from another one. Return 0 or an errno. */
 static int send_again(struct sender *sender, const void *data, size_t size, int error) {
     if (note_own_errors(sender)) error = send_once(sender, data, size);
     bool may_lack_address = (error == EINVAL || error == ENETUNREACH) && atomic_load(&sender->listener) >= 0;
@@ -160,7 +160,7 @@ int sender_send(struct sender *sender, const void *data, size_t size) {
 
 static void ask_for_room(int fd, int bytes) { setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes); }
 
-/* Send though the socket keeps as much as it may. What it keeps still counts: commands are refused as before. Return 0 or an
+/* Send although the socket's send buffer is full. Its contents still count, so commands are refused as before. Return 0 or an
  * errno. */
 static int send_beyond_room(struct sender *sender, const void *data, size_t size) {
     int fd = atomic_load(&sender->fd), room;
@@ -168,7 +168,7 @@ static int send_beyond_room(struct sender *sender, const void *data, size_t size
     if (getsockopt(fd, SOL_SOCKET, SO_SNDBUF, &room, &length)) return errno;
     ask_for_room(fd, INT_MAX / 2); /* the kernel grants net.core.wmem_max */
     int error = send_once(sender, data, size);
-    ask_for_room(fd, room / 2); /* the kernel doubles what is asked for, and returns the doubled value */
+    ask_for_room(fd, room / 2); /* the kernel doubles the requested size, and returns the doubled value */
     return error;
 }
 
@@ -179,7 +179,7 @@ static void note_errors_of(struct sender *sender) {
 }
 
 int sender_send_checked(struct sender *sender, const void *data, size_t size) {
-    note_errors_of(sender); /* of earlier datagrams: they are not taken for this one's */
+    note_errors_of(sender); /* of earlier datagrams, so that they do not count for this one */
     int error = sender_send(sender, data, size);
     if (error == EAGAIN) error = send_beyond_room(sender, data, size);
     if (error) return error;

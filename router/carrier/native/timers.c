@@ -6,9 +6,9 @@
 
 #include "deliver.h"
 
-/* With priority inheritance a thread that holds the lock runs with the priority of those that wait for it, and passes the
- * lock to the first of them: a thread that sends without a pause cannot keep brakes waiting by taking it again and again. It
- * costs nothing while nobody waits. Return 0 or an errno. */
+/* Open a lock with priority inheritance: its holder runs with the priority of the waiting threads, and unlocking passes the
+ * lock to the first of them, so a thread that sends continuously cannot delay brakes by taking it again and again. It costs
+ * nothing if no thread waits. Return 0 or an errno. */
 static int open_lock(pthread_mutex_t *lock) {
     pthread_mutexattr_t attributes;
     int error = pthread_mutexattr_init(&attributes);
@@ -66,7 +66,7 @@ void timers_close(struct timers *timers) {
 
 /* ---- with the lock held ---- */
 
-/* Have the thread of the group wake up then. A timerfd that has expired is no longer readable afterwards. */
+/* Wake the thread of the group at that time. An expired timerfd is no longer readable afterwards. */
 static void wake_at(struct timers *timers, int64_t due) {
     atomic_store_explicit(&timers->wakes_at, due, memory_order_relaxed);
     if (timers->timer < 0) return;
@@ -104,10 +104,10 @@ void timers_remove(struct timers *timers, struct timer *timer) {
     *(timer->next ? &timer->next->previous : &timers->last) = timer->previous;
 }
 
-/* End all deadmen, or all others, the oldest first: a pacer before the deferrals that pass messages to it. */
+/* End all deadmen, or all other timers, the oldest first: a pacer before the deferrals that pass messages to it. */
 static void end_all(struct timers *timers, bool are_deadmen, int64_t now) {
     for (struct timer *each = timers->last, *next; each && !timers->is_abandoned; each = next) {
-        next = each->previous; /* `end` may take it off the list */
+        next = each->previous; /* `end` may remove it from the list */
         if ((each->kind->adopt == NULL) == are_deadmen) each->kind->end(timers, each, now);
     }
 }

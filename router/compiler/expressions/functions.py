@@ -327,7 +327,7 @@ _DECLARED = (
              "The sum of a list, added in order; 0 for an empty list.", (("sum([1, 2, 3])", 6), ("sum([1, 0.5])", 1.5)),
              of_list=_sum_of_list),
     Function("round", (_number(),), _rounded(round), round_half_even,
-             "The nearest integer; of two, the even one. NaN, infinities and results beyond 64 bits drop the message.",
+             "The nearest integer; halves round to even. NaN, infinities and results beyond 64 bits drop the message.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
     Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The integer part: rounds towards zero.",
              (("trunc(-2.7)", -2),)),

@@ -89,9 +89,9 @@ def _unreadable(member: Field) -> tuple[str, str] | None:
     """Return the kind of a field that expressions cannot read, and a hint; None for all others."""
     declared = member.type.element if isinstance(member.type, List) else member.type
     if isinstance(declared, MessageType) and declared.is_map_entry:
-        return "map", "destinations receive it unchanged; for a topic, declare a list of messages with key and value"
+        return "map", "destinations get the map unchanged; for a topic, declare a list of messages with key and value"
     if member.is_group:
-        return "group", "destinations receive it unchanged; for a topic, declare it as a message"
+        return "group", "destinations get the group unchanged; for a topic, declare a message instead"
     if isinstance(declared, String) and declared.wide:
         return "wstring", "declare it as a string"
     return None

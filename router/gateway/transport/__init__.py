@@ -1,1 +1,1 @@
-"""The ways to a gateway's clients: UDP, TCP, websocket and Zenoh."""
+"""The transports of gateways: UDP, TCP, websocket and Zenoh."""

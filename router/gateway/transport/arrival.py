@@ -1,7 +1,7 @@
 """Arrival times of messages on streams.
 
-The kernel does not timestamp streams. Messages that are read after a pause (a busy computer, a stopped process) would
-look new, so they count as arrived when the event loop last ran before the pause.
+The kernel does not timestamp streams. After a pause (a busy computer, a stopped process) old messages would look new,
+so they count as arrived when the event loop last ran before the pause.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from router.clock import boottime_ns, wall_ns
 TICK_SECONDS = 0.02
 
 AWAY_NS = 50_000_000
-"""A gap between two ticks from which on the loop counts as having been away."""
+"""A gap between two ticks that counts as a pause of the loop."""
 
 CATCH_UP_NS = 100_000_000
-"""Messages that are read so long after a gap may have been waiting in it."""
+"""How long after a pause a message may be one that arrived in it."""
 
 
 class LoopClock:
-    """Detects, while started, when the event loop was away. `clock_ns` is the boot clock."""
+    """Detects pauses of the event loop while started. `clock_ns` is the boot clock."""
 
     def __init__(self, clock_ns: Callable[[], int] = boottime_ns) -> None:
         self._clock_ns = clock_ns
@@ -44,7 +44,7 @@ class LoopClock:
         return wall_ns() - self.delay()
 
     def delay(self) -> int:
-        """Return for how long (ns) a message that is read now may have been waiting."""
+        """Return how long (ns) a message that is read now may have been waiting."""
         if self._ticking is None:
             return 0
         now = self._clock_ns()

@@ -10,20 +10,20 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 HIGH_WATER = 256 * 1024
-"""Bytes waiting for a client from which on nothing more is written to it."""
+"""Bytes waiting for a client at which nothing more is written to it."""
 
 LOW_WATER = 64 * 1024
-"""Bytes below which a client that had to wait is reported as drained."""
+"""Bytes waiting for a client below which it is reported as drained."""
 
 PER_TURN = 32
-"""Messages of one client, or topics, that are handled before other work of the loop has its turn."""
+"""Messages of one client, or topics, that are handled before the loop continues with other work."""
 
 
 class Frame(NamedTuple):
-    """One packet or document to send. `data` is what clients see, without the framing of the transport.
+    """One packet or document to send. `data` does not include the framing of the transport.
 
-    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers the messages that
-    publishers keep beside the newest one of the topic.
+    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers kept messages of a
+    topic backwards from the newest one, which has 0.
     """
 
     data: bytes
@@ -40,7 +40,7 @@ class Client(Protocol):
     def label(self) -> str: ...
 
     def write(self, frames: Sequence[Frame]) -> None:
-        """Accept all frames, whatever their size, without waiting."""
+        """Accept all frames, of any size, without blocking."""
 
     def backlog(self) -> int:
         """Return the number of bytes written that the kernel (or Zenoh) has not taken yet."""
@@ -57,7 +57,7 @@ class Events(Protocol):
     def left(self, client: Client) -> None: ...
 
     def drained(self, client: Client) -> None:
-        """The client took what was waiting for it, down to less than LOW_WATER. May be repeated."""
+        """The client's backlog fell below LOW_WATER. May be repeated."""
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
         """A client sent one packet or document. `arrived_ns` is wall-clock time."""
@@ -72,20 +72,20 @@ class Events(Protocol):
         """Another gateway owns, or claims, the same place in the network."""
 
     def connected(self, number: int) -> None:
-        """So many other routers and peers of the network are connected now."""
+        """The number of connected routers and peers of the network has changed."""
 
     async def snapshot(self) -> Sequence[Frame]:
-        """Return all schemas, latest values, and what publishers keep for late joiners. A schema is before its data."""
+        """Return all schemas, latest values and messages kept for late joiners. A schema precedes its data."""
 
 
 def report_fault(where: str, error: Exception) -> None:
-    """Report an exception that nobody else sees: a fault of the router itself."""
+    """Report an otherwise unhandled exception: a fault of the router itself."""
     what = {"message": f"a fault in the router itself {where}", "exception": error}
     asyncio.get_running_loop().call_exception_handler(what)
 
 
 class Transport(Protocol):
-    """A way to clients."""
+    """Connects a gateway to its clients."""
 
     async def open(self) -> None:
         """Open the sockets. A local address that this machine does not have yet is retried in the background.
@@ -97,4 +97,4 @@ class Transport(Protocol):
         """Close the sockets; all clients have left when this returns."""
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
-        """Write the same frames to several clients of this transport; their wire form is made once."""
+        """Write the same frames to several clients of this transport, encoding them once."""

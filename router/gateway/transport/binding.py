@@ -1,4 +1,4 @@
-"""Opening sockets at a local address: now, or as soon as this machine has that address."""
+"""Opens sockets at a local address, now or as soon as this machine has that address."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from router.net.kernel import why_not_bound
 from router.table.addresses import Address
 
 RETRY_SECONDS = 1.0
-"""Between two attempts at an address that this machine does not have."""
+"""The interval of attempts to open an address that this machine does not have."""
 
 MOST_UNACCEPTED = 1024
-"""Connections that the kernel keeps until they are accepted: as many clients may come at once."""
+"""The listen backlog: this many clients can connect at once."""
 
 RECEIVE_BUFFER = 64 * 1024
-"""Bytes of the receive buffer of a client: clients send little, and there may be a thousand."""
+"""Bytes of a client's receive buffer: clients send little, and there may be a thousand."""
 
 
 class Binding:
@@ -34,7 +34,7 @@ class Binding:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Raises StartError for all errors but that no network interface has the address yet."""
+        """Raises StartError, except if no network interface has the address yet: then retries in the background."""
         try:
             await self._attempt()
         except OSError as error:
@@ -59,7 +59,7 @@ class Binding:
                 if error.errno not in (None, errno.EADDRNOTAVAIL, reported):
                     reported = error.errno
                     logger.error("cannot bind to the address; retrying", why=str(self._refusal(error)))
-            except Exception as error:  # noqa: BLE001 - a fault of the router is reported, and no reason to give up
+            except Exception as error:  # noqa: BLE001 - a fault of the router is reported; retry
                 report_fault(f"kept {self._address} from being opened", error)
             else:
                 logger.info("the address exists now; listening", address=str(self._address))
@@ -74,7 +74,7 @@ def listen_at(address: Address) -> socket.socket:
     """Return a non-blocking TCP socket that listens at `address`. Raises OSError."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        # A restarted router need not wait for old connections to end; a port that another listens at stays refused.
+        # Lets a restarted router bind while old connections end; a port with another listener is still refused.
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         opened.setblocking(False)

@@ -1,4 +1,4 @@
-"""What the TCP and websocket transports share: a listener with limits, and clients with a buffer each."""
+"""The base of the TCP and websocket transports: a listener with limits, and clients with a buffer each."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ PIECE = 64 * 1024
 """Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""
 
 UNSENT = 128 * 1024
-"""Bytes that the kernel keeps unsent for a client; what waits beyond that can still be superseded by newer values."""
+"""Bytes that the kernel keeps unsent for a client. Values that wait here can still be replaced by newer ones."""
 
 STALLED_SECONDS = 60.0
-"""The kernel closes the connection of a client that acknowledges or takes nothing for so long."""
+"""The kernel closes the connection of a client that acknowledges or reads nothing for this long."""
 
 MESSAGE_SECONDS = 10.0
-"""Time a client has for one message, from its first byte to its last, and for the websocket handshake."""
+"""Timeout for one message of a client, from its first byte to its last, and for the websocket handshake."""
 
 WATCH_SECONDS = 1.0
 """Between two checks of that deadline."""
 
 ACCEPTED_PER_TURN = 16
-"""Connections that are accepted before other work of the loop has its turn."""
+"""Connections that are accepted before the loop continues with other work."""
 
 Piece = Union[bytes, memoryview]
 
 
 class Limits(NamedTuple):
-    """Clients in all, clients from one host, and bytes of one message from a client."""
+    """The most clients in total, clients from one host, and bytes of one message from a client."""
 
     clients: int
     clients_per_host: int
     message: int
 
     def exceeded_by(self, host: str, hosts: Sequence[str]) -> str:
-        """Return the key of the limit that a connection of `host` beside those of `hosts` would exceed, or ""."""
+        """Return the key of the limit that a further connection from `host` would exceed, or ""."""
         if len(hosts) >= self.clients:
             return "max_clients"
         return "max_clients_per_host" if hosts.count(host) >= self.clients_per_host else ""
@@ -72,7 +72,7 @@ class StreamClient:
         drain: Callable[[], Awaitable[None]],
         is_open: Callable[[], bool] = lambda: True,
     ) -> None:
-        peer = connection.get_extra_info("peername") or ("a client that has gone", 0)
+        peer = connection.get_extra_info("peername") or ("a client that has left", 0)
         self.host: str = peer[0]
         self.label = f"{self.host}:{peer[1]}"
         self.unfinished_since: float | None = None
@@ -154,7 +154,7 @@ class StreamTransport(ABC):
         self._watch()
 
     async def close(self) -> None:
-        self.is_closing = True  # connections that are being accepted are refused
+        self.is_closing = True  # connections that are being accepted are rejected
         await self._binding.close()
         if self._watching is not None:
             self._watching.cancel()
@@ -188,7 +188,7 @@ class StreamTransport(ABC):
         self.address = Address(*listening.getsockname())
 
     def enter(self, client: StreamClient) -> str:
-        """Add a client and return "", or return (and log) why it is refused."""
+        """Add a client and return "", or return (and log) why it is rejected."""
         if self.is_closing:
             return "the gateway is shutting down"
         if key := self.limits.exceeded_by(client.host, [each.host for each in self._clients]):
@@ -200,7 +200,7 @@ class StreamTransport(ABC):
         return ""
 
     def leave(self, client: StreamClient) -> None:
-        """Remove a client; nothing happens for one that was refused."""
+        """Remove a client, unless it was rejected."""
         if client in self._clients:
             self._clients.remove(client)
             self.events.left(client)
@@ -211,7 +211,7 @@ class StreamTransport(ABC):
         client.close()
 
     def timed_out(self, client: StreamClient) -> None:
-        """Log that the kernel closed the connection of a client that took, or acknowledged, nothing."""
+        """Log that the kernel closed the connection of a client that read or acknowledged nothing."""
         what = "client disconnected: it does not read, or its computer does not answer"
         self.close_client(client, what, seconds=STALLED_SECONDS)
 
@@ -231,7 +231,7 @@ def _configure(connection: asyncio.Transport) -> None:
     opened: socket.socket = connection.get_extra_info("socket")
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
-    # Detect a computer that disappeared, whether something is being sent to it or not, and a client that takes nothing.
+    # Detect a computer that disappeared, even while nothing is sent to it, and a client that reads nothing.
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10)

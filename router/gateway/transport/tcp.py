@@ -21,9 +21,9 @@ class TooLongError(ValueError):
 
 
 class TcpTransport(StreamTransport):
-    """`prefixed`: each packet is preceded by its length, u32 little-endian; otherwise a packet is a line.
+    """TCP. `prefixed`: each packet is preceded by its length, u32 little-endian; otherwise each is a line.
 
-    A client that sends a longer message than the limit is closed.
+    A client whose message exceeds the limit is disconnected.
     """
 
     def __init__(self, address: Address, events: Events, limits: Limits, *, prefixed: bool) -> None:
@@ -60,14 +60,14 @@ class TcpTransport(StreamTransport):
         try:
             if not self.enter(client):
                 await self._read(client, reader)
-        except TooLongError as error:  # where the next message begins is unknown
+        except TooLongError as error:  # the beginning of the next message is unknown
             self.events.refused("too_large")
             self.close_client(client, "client disconnected", why=str(error))
         except TimeoutError:
             self.timed_out(client)
         except (asyncio.IncompleteReadError, OSError):
             pass  # the client left
-        except Exception as error:  # noqa: BLE001 - a fault of the router, reported; it ends this client alone
+        except Exception as error:  # noqa: BLE001 - a fault of the router, reported; it ends only this client
             report_fault("ended a TCP connection", error)
         finally:
             client.close()
@@ -81,7 +81,7 @@ class TcpTransport(StreamTransport):
                 client.unfinished_since = monotonic()
                 data = await read_rest(reader, first)
                 client.unfinished_since = None
-                if not client.can_write():  # it was closed, and what came before that is discarded
+                if not client.can_write():  # it was closed: discard what it sent before
                     return
                 self.events.received(client, data, self.clock.stamp())
             await asyncio.sleep(0)

@@ -1,6 +1,6 @@
 """A gateway's UDP socket: sends to one client, and receives from that client's host.
 
-It is not connected, so that a client may send from any port; ICMP errors do not reach such a socket.
+The socket is not connected, so that a client can send from any port; it therefore gets no ICMP errors.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ RECEIVE_BUFFER = 1 << 20
 BURST = 64
 BURST_BYTES = 128 * 1024
 PAUSE_SECONDS = 0.001
-"""Datagrams and bytes sent at once, and the pause before more: a receiver with a default buffer keeps up with that."""
+"""Datagrams and bytes sent at once, and the pause after them: a receiver with a default buffer keeps up."""
 
 
 class UdpTransport:
-    """Has one client, from the start. Without `local`, it sends from any port and receives nothing."""
+    """UDP. Has one client, from the start. Without `local`, it sends from any port and receives nothing."""
 
     def __init__(self, remote: Address, local: Address | None, events: Events) -> None:
         self.address: Address | None = None
@@ -56,7 +56,7 @@ class UdpTransport:
         self._socket = None
 
     def kernel_drops(self) -> int:
-        """Return how many datagrams, from any sender, the kernel dropped before they were received. Thread-safe."""
+        """Return how many datagrams, from any sender, the kernel has dropped. Thread-safe."""
         opened = self._socket
         return self._drops_at_close if opened is None else drops(opened)
 
@@ -138,7 +138,7 @@ class UdpClient:
         self._events.left(self)
 
     def _send_burst(self) -> None:
-        """Send what may be sent now, and the rest later. Of several errors in a burst, the last one is reported."""
+        """Send as much as a burst allows now, and the rest later. Of several errors in a burst, report the last."""
         has_waited, self._resume = self._resume is not None, None
         now = self._loop.time()
         if now >= self._burst_ends:

@@ -41,16 +41,16 @@ CLOSING_SECONDS = 1.0
 """Time for the closing handshake."""
 
 READ_AT_ONCE = 16 * 1024
-"""Bytes of a client that are read, and parsed by the library, in one turn of the loop."""
+"""Bytes of a client that the library reads and parses in one turn of the loop."""
 
 STRANGERS, STRANGERS_PER_HOST = 64, 8
-"""Connections beyond the limits that may be open without a websocket: they fetch the page, or shake hands."""
+"""Connections allowed beyond the limits, to fetch the page or for handshakes: in total, and per host."""
 
 
 class WebsocketTransport(StreamTransport):
-    """`text`: the frames of one `write` are one text message, joined by newlines; otherwise each is a binary message.
+    """Websocket. `text`: the frames of one `write` are joined to one text message; otherwise each is a binary message.
 
-    A client that sends a longer message than the limit is closed. `page` is HTML.
+    A client whose message exceeds the limit is disconnected. `page` is HTML.
     """
 
     def __init__(self, address: Address, events: Events, limits: Limits, *, text: bool, page: bytes) -> None:
@@ -73,7 +73,7 @@ class WebsocketTransport(StreamTransport):
             self._serve_client,
             sock=listening,
             backlog=ACCEPTED_PER_TURN,
-            create_connection=partial(Connection, owner=self),  # type: ignore[arg-type]  # a factory does as well
+            create_connection=partial(Connection, owner=self),  # type: ignore[arg-type]  # a factory is accepted
             process_request=self._page.answer,
             compression=None,
             server_header=None,
@@ -126,7 +126,7 @@ class WebsocketTransport(StreamTransport):
             self.leave(client)
 
     async def _read(self, connection: Connection) -> None:
-        """Raises ConnectionClosed in the end."""
+        """Receive messages until ConnectionClosed is raised."""
         client = connection.client
         while True:
             for _ in range(PER_TURN):
@@ -138,7 +138,7 @@ class WebsocketTransport(StreamTransport):
 
 
 class Connection(ServerConnection):
-    """The library's connection, which is also counted before the handshake and notes unfinished messages."""
+    """The library's connection, which is also counted before the handshake, and tracks unfinished messages."""
 
     client: StreamClient
 
@@ -162,12 +162,12 @@ class Connection(ServerConnection):
             self.client.unfinished_since = None
         elif self.client.unfinished_since is None:
             self.client.unfinished_since = monotonic()
-        if self.transport.get_write_buffer_size() > HIGH_WATER:  # pings without end, whose answers are not read
+        if self.transport.get_write_buffer_size() > HIGH_WATER:  # an endless series of pings whose answers are not read
             self.client.close()
 
 
 class Page:
-    """HTTP answers of the websocket port: one page, which loads nothing from elsewhere."""
+    """HTTP responses of the websocket port: one page, which loads nothing from other hosts."""
 
     _HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
 
@@ -176,7 +176,7 @@ class Page:
         self._policy = page_policy(html)
 
     def answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a request; None goes on to a websocket."""
+        """Return the response to a request; None continues with the websocket handshake."""
         if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
             if _is_from_elsewhere(request.headers):
                 return connection.respond(
@@ -190,7 +190,7 @@ class Page:
 
     def _headers(self, request: Headers) -> Headers:
         host = self._HOST.fullmatch("".join(request.get_all("Host")))
-        # Older browsers do not take websockets of the same host for 'self'.
+        # In older browsers 'self' does not include websockets of the same host.
         sockets = f" ws://{host.group()} wss://{host.group()}" if host else ""
         return Headers(
             {
@@ -205,13 +205,13 @@ class Page:
 
 
 _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
-"""Addresses, and names that cannot be registered on the internet."""
+"""IP addresses, and names that nobody can register on the internet."""
 
 
 def _is_from_elsewhere(headers: Headers) -> bool:
-    """Return whether a page of another host asks: any page that is open in a browser could publish.
+    """Return whether a page of another host connects: otherwise any page that is open in a browser could publish.
 
-    A name that anybody can register may have been made to lead here after its page was loaded (DNS rebinding).
+    Names that anybody can register are not trusted (DNS rebinding).
     """
     hosts = [host.lower() for host in headers.get_all("Host")]
     origins = [origin.lower().partition("://")[2] for origin in headers.get_all("Origin")]
@@ -238,7 +238,7 @@ class _DebugLog(logging.Handler):
 
 
 _LOG = logging.getLogger("router.websocket")
-"""The library logs clients that break the rules of HTTP or leave in the middle, which seldom helps an operator."""
+"""The library logs clients that violate HTTP or disconnect early, which seldom helps an operator."""
 _LOG.setLevel(logging.WARNING)
 _LOG.propagate = False
 _LOG.addHandler(_DebugLog())

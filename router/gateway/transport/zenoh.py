@@ -1,6 +1,6 @@
-"""A gateway in a Zenoh network: puts frames under keys, receives what is put under KEY/inbound, answers late joiners.
+"""A gateway in a Zenoh network: puts frames under keys, receives samples under KEY/inbound, answers queries.
 
-Any call of Zenoh may block, and its callbacks come from its own threads: all calls are made in threads beside the loop.
+Any call of Zenoh may block, and its callbacks run in its own threads, so no call is made in the loop's thread.
 """
 
 from __future__ import annotations
@@ -36,38 +36,38 @@ from router.table.model import ZenohSettings
 from router.threads import DaemonThread
 
 CLOSING_SECONDS = 2.0
-"""How long a session has to end."""
+"""Timeout for closing a session."""
 
 PAUSE_SECONDS = 0.2
-"""Between two changes of the key's owner at least, also when others come and go more often."""
+"""The minimum time between two changes of the key's owner, even if others come and go more often."""
 
 LOOK_AGAIN_SECONDS = 2.0
-"""Between two looks for the owner while waiting for the key, in case its going was not received."""
+"""The interval of checks for the owner while waiting for the key, in case a message was lost."""
 
 CONNECTIONS_SECONDS = 1.0
-"""Between two looks at who is connected."""
+"""The interval of checks of connections."""
 
 MOST_OTHERS = 100
-"""Other owners of its key that a gateway remembers."""
+"""The most other owners of its key that a gateway remembers."""
 
 MOST_RECEIVED = 1000
 MOST_RECEIVED_BYTES = 64 << 20
-"""Samples, and their bytes, that wait to be handed on; others are refused."""
+"""The most samples, and bytes, in the queue to the loop; others are rejected."""
 
 MOST_QUERIES = 100
-"""Queries that wait for answers, each of which may be large."""
+"""The most pending queries; each answer may be large."""
 
 LARGE = 64 * 1024
-"""Bytes from which on a put can take long."""
+"""Bytes from which a put can take long."""
 
 Declared = Union[zenoh.LivelinessToken, "zenoh.Subscriber[None]", "zenoh.Queryable[None]"]
 
 
 class ZenohTransport:
-    """Its one client is the network, from when the session is open and the key is free.
+    """Zenoh. The one client is the network, as soon as the session is open and the key is free.
 
-    `most` bounds in bytes what is received as one. Where the table names locators, only those are connected; without
-    any, others are found by multicast.
+    `most` limits the bytes of a received sample. If the table names locators, only they are used; otherwise others are
+    found by multicast.
     """
 
     def __init__(self, settings: ZenohSettings, events: Events, most: int) -> None:
@@ -129,7 +129,7 @@ class ZenohTransport:
                 self._tasks.append(self._loop.create_task(task(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
-        """Runs in the session's thread. Raises ZError. Returns None when the transport was closed meanwhile."""
+        """Runs in the session's thread. Raises ZError. Returns None if the transport was closed meanwhile."""
         session = zenoh.open(config)
         if self._is_closed:
             session.close()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it
@@ -147,7 +147,7 @@ class ZenohTransport:
                 logger.info("connected to Zenoh", key=self._key)
 
     async def _mind_connections(self, session: zenoh.Session) -> None:
-        """Report at each change to how many routers and peers the session is connected. Zenoh connects by itself."""
+        """Report each change of the number of connected routers and peers. Zenoh reconnects automatically."""
         reported, was_lost = None, False
         while True:
             connected = await self._loop.run_in_executor(self._session_thread, connections, session)
@@ -176,7 +176,7 @@ class ZenohTransport:
         self._met |= others
 
     async def _mind_key(self, session: zenoh.Session) -> None:
-        """Look for owners, then settle who owns the key at each change; look again while waiting for it."""
+        """Find the owners, and decide at each change who owns the key; look again while waiting for it."""
         look: Callable[[zenoh.Session], set[Owner] | None] = self._watch
         while True:
             try:
@@ -195,7 +195,7 @@ class ZenohTransport:
                 await asyncio.wait_for(self._others_changed.wait(), None if self._client else LOOK_AGAIN_SECONDS)
 
     def _watch(self, session: zenoh.Session) -> set[Owner] | None:
-        """Look for owners and subscribe to changes. Runs in the session's thread. Raises ZError."""
+        """Find the owners and subscribe to changes. Runs in the session's thread. Raises ZError."""
         own = str(session.zid())
 
         def on_sample(sample: zenoh.Sample) -> None:
@@ -204,13 +204,13 @@ class ZenohTransport:
                 is_there = sample.kind == zenoh.SampleKind.PUT
                 self._loop.call_soon_threadsafe(self._on_token, owner, is_there)
 
-        # First, since Zenoh answers from what a subscriber has received as soon as there is one.
+        # Before subscribing: once there is a subscriber, Zenoh answers from the tokens that it has received.
         others = owners(session, self._key)
         session.liveliness().declare_subscriber(all_tokens(self._key), on_sample, history=True)
         return others
 
     async def _settle(self, session: zenoh.Session) -> None:
-        """Take the key when it is free, give it up to an earlier owner, report other owners. Raises ZError."""
+        """Take the key if it is free, give it up to an earlier owner, report other owners. Raises ZError."""
         first = min(self._others, default=None)
         if self._owner is None and first is None:
             first = await self._take(session)
@@ -231,7 +231,7 @@ class ZenohTransport:
         self._met.clear()
 
     async def _take(self, session: zenoh.Session) -> Owner | None:
-        """Take the key, and serve unless another gateway took it in the same moment and was first.
+        """Take the key, and serve unless another gateway took it at the same time and was first.
 
         Returns the first of the other owners. Raises ZError.
         """
@@ -251,7 +251,7 @@ class ZenohTransport:
         return min(self._others, default=None)
 
     def _declare(self, session: zenoh.Session, owner: Owner) -> set[Owner]:
-        """Return who else owns the key. Runs in the session's thread. Raises ZError."""
+        """Declare this owner, and return the others. Runs in the session's thread. Raises ZError."""
         self._declared = [
             session.liveliness().declare_token(owner.token(self._key)),
             session.declare_subscriber(f"{self._key}/inbound/**", self._inbox.on_sample),
@@ -260,7 +260,7 @@ class ZenohTransport:
         return owners(session, self._key) or set()
 
     async def _give_up(self) -> None:
-        """Stop serving. What waits is discarded: it may be old when the key is free."""
+        """Stop serving, and discard waiting data: it may be old when the key is free."""
         self._owner = None
         self._stop_serving()
         await self._loop.run_in_executor(self._session_thread, self._release)
@@ -280,7 +280,7 @@ class ZenohTransport:
     # -- queries -------------------------------------------------------------------------------------------------
 
     async def _answer_queries(self, queries: Queries) -> None:
-        """Answer queries from now on, all that wait from one snapshot."""
+        """Answer queries from now on, all pending ones from one snapshot."""
         while True:
             await queries.came.wait()
             queries.came.clear()
@@ -288,7 +288,7 @@ class ZenohTransport:
                 waiting = queries.take()
                 frames = await self._events.snapshot()
                 error = await self._loop.run_in_executor(self._answering, _reply, waiting, self._key, frames)
-            except Exception as fault:  # noqa: BLE001 reported; the next query matters as much
+            except Exception as fault:  # noqa: BLE001 reported; the next query is still answered
                 report_fault("left a query unanswered", fault)
             else:
                 if error is not None:
@@ -296,7 +296,7 @@ class ZenohTransport:
 
 
 class Inbox:
-    """Samples on their way from Zenoh's threads to the loop. `most` bounds one sample, in bytes."""
+    """The queue of samples from Zenoh's threads to the loop. `most` limits the bytes of one sample."""
 
     def __init__(self, events: Events, most: int) -> None:
         self._client: Client | None = None
@@ -304,13 +304,13 @@ class Inbox:
         self._most = most
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[tuple[bytes, int]] = deque()
-        # Each counter is written by one thread alone.
+        # Only one thread writes each counter.
         self._received_bytes = self._handed_bytes = 0
         self._lost = self._reported_lost = 0
         self._clock = LoopClock()
 
     def start(self, client: Client) -> None:
-        """Hand on samples as coming from `client`."""
+        """Start to deliver samples, as sent by `client`."""
         self._client = client
         self._clock.start()
         self._hand_on()
@@ -321,7 +321,7 @@ class Inbox:
 
     def on_sample(self, sample: zenoh.Sample) -> None:
         """Runs in Zenoh's thread."""
-        if sample.kind != zenoh.SampleKind.PUT:  # never `is`: each is made anew
+        if sample.kind != zenoh.SampleKind.PUT:  # not `is`: each is a new object
             return
         size = len(sample.payload)
         waiting_bytes = self._received_bytes - self._handed_bytes
@@ -352,7 +352,7 @@ class Inbox:
 
 
 class Queries:
-    """Queries that wait for an answer. `came` is set when there is one after there was none."""
+    """Pending queries. `came` is set when the first one is added."""
 
     def __init__(self) -> None:
         self.came = asyncio.Event()
@@ -370,12 +370,12 @@ class Queries:
             self._loop.call_soon_threadsafe(self.came.set)
 
     def take(self) -> list[zenoh.Query]:
-        """Remove and return all that wait."""
+        """Remove and return all pending queries."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
 class ZenohClient:
-    """The whole network. Its backlog is of small frames; of large ones the newest of each key waits apart."""
+    """The whole network as a client. Its backlog has small frames; the newest large one of each key waits apart."""
 
     def __init__(self, key: str, putter: Putter, events: Events) -> None:
         self.label = f"zenoh {key}"
@@ -404,7 +404,7 @@ class ZenohClient:
             self._events.left(self)
 
     def _put(self) -> None:
-        """Put all waiting frames at once; frames that are written meanwhile go with the next call."""
+        """Put all waiting frames at once; frames that are written meanwhile are put by the next call."""
         frames, self._waiting = self._waiting, []
         size = sum(len(frame.data) for frame in frames)
         self._is_putting = True
@@ -427,8 +427,8 @@ class ZenohClient:
 class Putter:
     """Puts frames under KEY/data/TOPIC and KEY/schema/TYPE, in threads: a put may wait for a slow network.
 
-    Large values go in a thread of their own, with less priority and of each key only the newest, so that small ones
-    need not wait. A key that once had a large value is a large one from then on.
+    Large values have a thread of their own with less priority, only the newest of each key, so that small ones
+    need not wait. A key that once had a large value counts as large from then on.
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -443,11 +443,11 @@ class Putter:
         self._lock = threading.Lock()
 
     def put(self, frames: Sequence[Frame]) -> Future[list[Exception]]:
-        """Complete when Zenoh has the small frames and the large ones are queued. Gives an error per lost frame."""
+        """Put small frames and queue large ones. The result is an error for each lost frame."""
         return self._small.submit(self._put_all, frames)
 
     def close(self) -> None:
-        """Discard what waits; a put that is under way ends when Zenoh lets it."""
+        """Discard waiting frames; a put in progress is not interrupted."""
         for executor in (self._small, self._large):
             executor.shutdown()
 
@@ -469,7 +469,7 @@ class Putter:
         return errors + failed
 
     def _queue_large(self, key: str, data: bytes) -> None:
-        """Raises TransportError for the value that this one replaces."""
+        """Queue a value. Raises TransportError if it replaces another one."""
         with self._lock:
             is_newer = key in self._large_waiting
             self._large_waiting[key] = data
@@ -504,7 +504,7 @@ def key_of(root: str, frame: Frame) -> str:
 
 
 def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -> zenoh.ZError | None:
-    """Answer queries; runs in a thread. Returns the last error: mostly, the asker has gone."""
+    """Answer queries; runs in a thread. Returns the last error: usually the querier has left."""
     failure = None
     for query in queries:
         with query:

@@ -1,4 +1,4 @@
-"""A gateway's Zenoh session: its configuration, what its errors mean, and who owns a key.
+"""A gateway's Zenoh session: its configuration, its errors, and the owners of a key.
 
 Each gateway that serves a key keeps a liveliness token at KEY/owner/SINCE/SESSION/HOST/PID.
 """
@@ -21,22 +21,22 @@ from router.net.kernel import port_taken
 from router.table.model import ZenohSettings
 
 LARGE_MESSAGE_US = 2_000_000
-"""How long Zenoh may wait for room for the fragments of one large message before it drops it: 7 MB take 0.6 s at
-100 Mbit/s. By default it gives up after 50 ms."""
+"""How long Zenoh waits for room for the fragments of a large message before dropping it (default: 50 ms). 7 MB take
+0.6 s at 100 Mbit/s."""
 
 LOOK_SECONDS = 1.5
-"""How long tokens are asked for. All that are reachable answer at once, unless one of them stands still. Less than a
-session has to end: closing waits for it."""
+"""Timeout of a query for tokens. All reachable sessions answer at once, unless one is suspended. Shorter than the
+timeout for closing a session, which waits for the query."""
 
 _TEMPORARY = "Unable to connect|timeout|os error (?:19|99|100|101|110|113)\\b"
-"""Errors that pass when others, or a network interface, are there."""
+"""Errors that end when others, or a network interface, appear."""
 
 _LONGEST = 64
-"""Characters of a host's name that are shown."""
+"""The most characters of a host name that are shown."""
 
 
 def session_config(settings: ZenohSettings) -> zenoh.Config:
-    """Return what `config` of the table says, and what the gateway sets itself. Raises StartError."""
+    """Return the table's `config` with the gateway's own settings. Raises StartError."""
     try:
         zenoh.KeyExpr(settings.key.value)
     except zenoh.ZError as error:
@@ -64,12 +64,12 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
 
 
 def connections(session: zenoh.Session) -> int:
-    """Return to how many routers and peers a session is connected. Clients do not count."""
+    """Return the number of routers and peers that a session is connected to. Clients do not count."""
     return len(session.info.routers_zid()) + len(session.info.peers_zid())
 
 
 def permanent(settings: ZenohSettings, error: str) -> str:
-    """Return what to do about an error that does not pass by itself, "" for others."""
+    """Return a message for an error that retrying does not solve, "" for others."""
     if "not supported" in error:
         return f"Zenoh cannot use one of these: {', '.join((*settings.connect, *settings.listen))}: {short(error)}"
     if "os error 98" not in error:
@@ -83,7 +83,7 @@ def permanent(settings: ZenohSettings, error: str) -> str:
 
 
 def short(error: object) -> str:
-    """Return the error's text without locations in Zenoh's source."""
+    """Return the text of an error without locations in Zenoh's source."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error))
 
 
@@ -94,7 +94,7 @@ def _refused(settings: ZenohSettings, error: object) -> str:
 
 
 class Owner(NamedTuple):
-    """A gateway that owns a key. The lesser of two came first: `since_ns` is wall-clock time, `session` a Zenoh id."""
+    """A gateway that owns a key. The lesser of two was first: `since_ns` is wall-clock time, `session` a Zenoh id."""
 
     since_ns: int
     session: str
@@ -130,9 +130,9 @@ def owner_of(token: object) -> Owner | None:
 
 
 def owners(session: zenoh.Session, key: str) -> set[Owner] | None:
-    """Return the owners of a key other than `session`. None when not all who were asked have answered.
+    """Return the owners of a key other than `session`; None if an answer is missing.
 
-    Takes LOOK_SECONDS at most. Raises ZError.
+    Takes at most LOOK_SECONDS. Raises ZError.
     """
     found = set()
     for reply in session.liveliness().get(all_tokens(key), timeout=LOOK_SECONDS):
