@@ -40,7 +40,7 @@ class Thread(threading.Thread):
     def start(self) -> None:
         """Start the thread. Raises RuntimeError or MemoryError; then the target is not called.
 
-        Python's own `start` waits for ever if the thread dies, for lack of memory, before it signals that it runs.
+        Python's own `start` waits forever if a lack of memory ends the thread before it signals that it runs.
         """
         try:
             super().start()
@@ -134,7 +134,7 @@ class _Call(NamedTuple):
 
 
 class DaemonThread(Executor):
-    """An executor with one daemon thread, for calls that may block for ever.
+    """An executor with one daemon thread, for calls that may block forever.
 
     The interpreter waits at exit for all threads of a ThreadPoolExecutor, but not for this one. The thread starts with
     the first call.

@@ -48,7 +48,7 @@ class Carrier(NativeThread):
         self._running = change, used
 
     def change(self, change: c.Change, *used: object) -> None:
-        """Execute another program from the next datagram on. Listeners that it does not have are drained before."""
+        """Execute another program from the next datagram on. Listeners that it does not have are drained first."""
         self._library.carrier_change(self._address, ctypes.byref(change))
         self._running = change, used
 
