@@ -28,7 +28,7 @@ def is_installed(path: Path) -> bool:
 
 
 def page_policy(page: bytes) -> str:
-    """The Content-Security-Policy of a page whose scripts and styles are all in it; it may connect to nothing yet."""
+    """The Content-Security-Policy of a page with inline scripts and styles only. Callers add permitted connections."""
     import base64
     import re
     from hashlib import sha256  # here, as `table` has imported it without OpenSSL

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 def _compile_and_route(
     args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
 ) -> None:
-    """Compile the table and run it. `ending` closes the head start until `route` does."""
+    """Compile the table and run it. `ending` closes the head start if `route` is not reached."""
     from router.app.keeping import Keeper
     from router.carrier.library import library
     from router.compiler.check import uncollected

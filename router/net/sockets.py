@@ -163,7 +163,7 @@ class ListeningSocket:
         An inherited socket is not changed, for the next process: its receiver must stop without an end.
 
         A socket that is connected to itself accepts nothing from others, so a flood cannot keep the receiver busy
-        for ever; shutting it down wakes a waiting receiver.
+        forever; shutting it down wakes a waiting receiver.
         """
         if self.is_inherited:
             return

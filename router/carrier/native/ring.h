@@ -34,7 +34,7 @@ bool ring_put(struct ring *ring, const void *record, uint32_t size);
 bool ring_drop(struct ring *ring, void *record, size_t limit);
 
 /* For the reader. Copy as many whole records as fit and return their size in bytes. If there are none, wait for up to
- * `timeout` ns (-1: for ever), and return 0 after that, after `ring_wake`, or spuriously. A record longer than `limit` is
+ * `timeout` ns (-1: forever), and return 0 after that, after `ring_wake`, or spuriously. A record longer than `limit` is
  * never taken: the buffer must be as long as the longest record. */
 size_t ring_take(struct ring *ring, void *records, size_t limit, int64_t timeout);
 void ring_wake(struct ring *ring);

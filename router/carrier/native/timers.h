@@ -26,10 +26,10 @@ struct timers;
 struct timer_kind {
     /* Act: the timer is due at `now` (boot clock, ns). */
     void (*serve)(struct timers *timers, struct timer *timer, int64_t now);
-    /* At the start and after a reload: deliver what the timer holds to this target of the program, and serve the timer from
+    /* At the start and after a reload: deliver the held messages to this target of the program, and serve the timer from
      * then on. NULL for a deadman. */
     void (*adopt)(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target);
-    /* Settle what the timer holds, and never be due again. Later messages are not held. */
+    /* Settle the messages that the timer holds; it is never due again, and holds no later messages. */
     void (*end)(struct timers *timers, struct timer *timer, int64_t now);
 };
 
