@@ -1,6 +1,6 @@
-"""Finds the router's own files: inside the package in a wheel, at the root in a checkout.
+"""Where the files that belong to the router lie: within the package in a wheel, at the root in a checkout.
 
-Does not interpret them. `routes/`, `protos/` and `schemas/` are such files.
+Knows no file's meaning. `routes/`, `protos/` and `schemas/` are such files.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ _PLACES = (_PACKAGE / "_assets", _PACKAGE.parent)
 
 
 def asset(relative: str) -> Path:
-    """The absolute path of a file or folder of the router, for example `schemas/route-table.schema.json`.
+    """The absolute path of a file or folder of ours, such as `schemas/route-table.schema.json`.
 
-    Raises FileNotFoundError if the installation lacks it.
+    Raises FileNotFoundError when the installation lacks it.
     """
     for place in _PLACES:
         if (path := place / relative).exists():
@@ -23,12 +23,12 @@ def asset(relative: str) -> Path:
 
 
 def is_installed(path: Path) -> bool:
-    """Whether `path` is in the installed package, where an upgrade overwrites changes."""
+    """Whether `path` is within the installed package: the next version overwrites what is changed there."""
     return path.resolve().is_relative_to(_PACKAGE.resolve())
 
 
 def page_policy(page: bytes) -> str:
-    """The Content-Security-Policy of a page with only inline scripts and styles, which may not connect anywhere yet."""
+    """The Content-Security-Policy of a page with inline scripts and styles only. Callers add permitted connections."""
     import base64
     import re
     from hashlib import sha256  # here, as `table` has imported it without OpenSSL

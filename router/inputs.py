@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
 _ASSETS = "_assets"
 _SCHEMAS = [os.path.join(place, "schemas") for place in (os.path.join(_PACKAGE, _ASSETS), os.path.dirname(_PACKAGE))]
-"""In an installation or a checkout. The schemas of tables are read once, like the code."""
+"""The schema folders of an installation and of a checkout. They are read once, like the code."""
 _ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
 _CODE = (".py", ".so", ".json", ".html", ".xml")
 _OF_ROS = ("AMENT_", "RMW_", "ROS_")

@@ -40,7 +40,7 @@ class Thread(threading.Thread):
     def start(self) -> None:
         """Start the thread. Raises RuntimeError or MemoryError; then the target is not called.
 
-        Python's own `start` waits forever if the thread dies, for lack of memory, before it signals that it runs.
+        Python's own `start` waits forever if a lack of memory ends the thread before it signals that it runs.
         """
         try:
             super().start()

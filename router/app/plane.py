@@ -257,7 +257,7 @@ class Plane:
         until = monotonic() + _PATIENCE_S
         late = [name for name, wait_for in waits.items() if not wait_for(generation, max(until - monotonic(), _TURN_S))]
         if late:
-            logger.error("thread did not leave the old program in time; what it uses stays open", threads=late)
+            logger.error("thread did not leave the old program in time; its sockets and topics stay open", threads=late)
             return False
         if not self._has_turned() or not all(thread.has_passed for thread in self._from_ros):
             return False

@@ -254,7 +254,7 @@ class Services:
     def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
         """Open the services; `opening` closes them. Raises StartError.
 
-        `diagnostics`: the node's name and a function that publishes CDR bytes; None if the table asks for none.
+        `diagnostics`: the node's name and a function that publishes CDR bytes; None without diagnostics.
         """
         running, table = self._running, self._running.program.table
         if table.record is not None:

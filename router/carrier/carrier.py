@@ -48,12 +48,12 @@ class Carrier(NativeThread):
         self._running = change, used
 
     def change(self, change: c.Change, *used: object) -> None:
-        """Execute another program from the next datagram on. Listeners that it does not have are drained before."""
+        """Execute another program from the next datagram on. Listeners that it does not have are drained first."""
         self._library.carrier_change(self._address, ctypes.byref(change))
         self._running = change, used
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
-        """Mirror received datagrams to `ring` from now on. `lost` is the counter of those that found it full.
+        """Mirror received datagrams to `ring` from now on. `lost` counts those dropped because it is full.
 
         Does nothing after `close`.
         """

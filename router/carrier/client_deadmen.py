@@ -28,7 +28,7 @@ class ClientDeadman(NativeDeadman):
     """
 
     def feed(self, now: int) -> None:
-        """Feed the deadman when a client's message was published; `now` is a time before that."""
+        """Feed the deadman after a client's message is published; `now` is a time before the publish call."""
         self._library.deadman_feed(self._deadmen, self.address, now)
 
     def await_subscribers(self, now: int) -> None:

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 def _compile_and_route(
     args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
 ) -> None:
-    """Compile the table and run it. `ending` closes the head start until `route` does."""
+    """Compile the table and run it. `ending` closes the head start if `route` is not reached."""
     from router.app.keeping import Keeper
     from router.carrier.library import library
     from router.compiler.check import uncollected
@@ -108,7 +108,7 @@ def _begun(begun: Beginning | None) -> HeadStart | None:
 
     head_start = begun.take() if begun is not None else None
     if head_start is not None:
-        logger.info("forwarding by the kept program while the table is compiled", listening=[*head_start.listening])
+        logger.info("forwarding with the kept program while the table is compiled", listening=[*head_start.listening])
     elif begun is not None and begun.why:
         log = logger.info if begun.why.endswith(CHANGED) else logger.warning
         log("the kept program is not used: the table is compiled first", why=begun.why)

@@ -117,13 +117,13 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
 
 
 def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]:
-    """The conflicts in `found` that `names` refer to. Raises UsageError for a name of none, or of several."""
+    """The conflicts in `found` that `names` refer to. Raises UsageError for a name that fits none or several."""
     accepted = [each for name in names for each in _meant(name, found)]
     return [each for each in found if each in accepted]
 
 
 def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
-    """The conflict of that name, or all of a message. Package and enclosing messages may be left out.
+    """Return the conflict of that name, or all conflicts of a message. `name` may omit package and enclosing messages.
 
     A field may also have its name in the lock.
     """

@@ -187,7 +187,7 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
 
 
 def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
-    """Yield findings for deadmen of gateways that publish on a topic of others, or feed the deadman of a route."""
+    """Yield a finding if a gateway's deadman publishes where others also publish, or feeds the deadman of a route."""
     if use.deadman is None:
         return
     for other in others:

@@ -51,7 +51,7 @@ class ClientQueue:
         self.sent += len(frames)
 
     def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[str, Frame], frames: int, now: int) -> int:
-        """Queue the newest of so many `frames`. Return how many frames were replaced by newer ones."""
+        """Queue `schemas` and `values`, the newest of `frames` frames. Return how many were replaced by newer ones."""
         if self._behind_since is None:
             self._behind_since = now
         before = self.waiting

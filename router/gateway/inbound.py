@@ -17,7 +17,7 @@ from router.gateway.packets import PacketError, TooLargeError, decompress
 from router.log import FloodLog, logger
 
 CLOCK_TOLERANCE_NS = 20_000_000
-"""How far a client's clock may be ahead before it counts: more than two computers with NTP differ."""
+"""How far a client's clock may be ahead without being reported; clocks synchronized by NTP differ less."""
 
 
 class RefusedError(Exception):

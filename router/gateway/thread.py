@@ -55,7 +55,7 @@ PAGE = Path(__file__).with_name("page.html")
 
 @dataclass(frozen=True, slots=True)
 class GatewayChange:
-    """`services` of the next program by gateway; `opened` ones are new, and it does not use those in `left`."""
+    """`services` of the next program by gateway; `opened` ones are new, `left` ones are no longer used."""
 
     services: dict[str, GatewayService]
     opened: list[GatewayService]

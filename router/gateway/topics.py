@@ -155,7 +155,7 @@ class Topics:
             self._tasks.run(self._introduce(served))
         if selection.others:
             logger.warning(
-                "the topic has several types; serving the type of most publishers",
+                "the topic has several types; serving the one that most publishers use",
                 gateway=self._name,
                 topic=topic,
                 type=selection.type_name,

@@ -168,7 +168,7 @@ class HeadStart:
 
 
 _WANTED, _UNWANTED = (ctypes.c_uint8 * 1)(1), (ctypes.c_uint8 * 1)(0)
-"""Topics that serve late joiners receive their messages later; the others have no known subscriber yet."""
+"""Topics that serve late joiners get their messages later; other topics have no known subscriber yet."""
 
 
 class _Image:

@@ -64,7 +64,7 @@ _LOSSES = (
     Kind.RECORDING_INCOMPLETE,
 )
 _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
-"""Reasons that the table asks for, and the one that UNHANDLED_CASE reports."""
+"""Reasons of intended losses, and the one that UNHANDLED_CASE reports."""
 
 _NAMED = 3
 """The most routes that a text names."""

@@ -48,7 +48,7 @@ from router.table.addresses import Address
 from router.threads import REST_S, Thread, join_or_leave
 
 MAX_PER_HOST = 16
-"""Connections. The router's own computer counts as one host, with all its addresses."""
+"""Maximum connections. The router's own computer, with all its addresses, counts as one host."""
 MAX_FROM_OTHERS = 48
 """Connections of all other computers together, so that they cannot exclude the router's own computer."""
 MAX_TAPS = 6

@@ -210,7 +210,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, read: Mapping[str, Any]) -> Problem:
-        """Return the problem with this `json()`. Raises KeyError if it is none."""
+        """Return the problem with this `json()`. Raises KeyError if it is not that of a problem."""
         kind = {kind.alert: kind for kind in Kind}[read["kind"]]
         labels = {label: str(read["labels"][label]) for label in {*kind.labels, *read["labels"]}}
         return cls(kind, labels, read["more"], read["remedy"], tuple(read["routes"]))

@@ -1,4 +1,4 @@
-"""Logs losses and deadmen, and remembers senders whose messages no route accepts from them."""
+"""Logs losses and deadmen, and remembers senders whose messages no route accepts."""
 
 from __future__ import annotations
 

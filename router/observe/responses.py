@@ -37,7 +37,7 @@ SAVE_SECONDS = 10.0
 SAVE = "/record/save"
 
 GZIP_FROM = 1000
-"""The least bytes of a response that is compressed."""
+"""Minimum bytes of a compressed response."""
 
 OPEN_METRICS = "application/openmetrics-text"
 

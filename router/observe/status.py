@@ -93,7 +93,7 @@ class Status:
 
     def map(self) -> Json:
         """Return everything that is fixed while a table runs. `keeps`: seconds that can be saved, or None. `intended`:
-        reasons of losses that the table asks for."""
+        reasons of intended losses."""
         table = self._running.program.table
         kept = table.record.last if self._can_save and table.record is not None else None
         return {

@@ -25,13 +25,13 @@ from router.table.model import RecordSettings
 from router.threads import Thread, WakeEvent
 
 PERIOD = 500_000_000
-"""ns from chunk to chunk. A kill loses this much and the mirror's PERIOD; more only if the disk is slow."""
+"""ns from chunk to chunk. A kill loses this much plus the mirror's PERIOD, or more if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
 """The most bytes of chunks in the queue to the disk."""
 
 STOP_SECONDS = 2.5
-"""How long shutting down waits for the disk. A service manager kills after 10 s, and there is more to close."""
+"""How long shutting down waits for the disk. A service manager kills the router after 10 s, and more must be closed."""
 
 _PATIENCE = 30.0
 """Timeout of `save`, s."""
@@ -137,7 +137,7 @@ class Recorder:
         self._wake()
         self._thread.join(STOP_SECONDS)
         if self._thread.is_alive():
-            event = "the disk is too slow to finish the recordings; they are readable as far as they were written"
+            event = "the disk is too slow to finish the recordings; the parts already written are readable"
             logger.error(event, directory=str(self._directory.path))
         else:
             self._wake_up.close()

@@ -297,7 +297,7 @@ class ContinuousWriter:
         try:
             file.close()
         except OSError as error:
-            event = "the recording has no index because it could not be finished; it is readable without"
+            event = "the recording could not be finished and has no index; it is readable without one"
             logger.error(event, file=str(file.path), problem=error.strerror)
 
     def _file_for(self, chunk: Chunk, now: int) -> RecordingFile:

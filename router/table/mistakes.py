@@ -410,7 +410,7 @@ _REST = re.compile(r"\s+#\s*(?:[-+*/%<>]\s*\w[\w.]*|\d+(?:\.\d*)?(?:e-?\d+)?)\s*
 
 
 def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagnostic]:
-    """Yield a warning for each expression before a comment that is only a number, or an operator and a word."""
+    """Yield a warning for each comment that may belong to its expression: only a number, or an operator and a word."""
     lines = {source.file: source.lines for source in sources}
     for node in _expressions(root.get("routes"), is_expression=False):
         span = node.span

@@ -155,7 +155,7 @@ FRAME_TIMEOUT = 1_000_000_000
 """Nanoseconds from the first part of a frame until an incomplete frame is discarded."""
 
 MOST_FRAMES, MOST_PARTS = 64, 8192
-"""Most frames that are assembled at a time, and most parts of a frame."""
+"""Maximum frames that are assembled at once, and maximum parts of a frame."""
 
 
 def is_part(kind: MessageType) -> bool:

@@ -393,7 +393,7 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
 
 
 def _publishers(types: Iterable[str]) -> str:
-    """Types with their number of publishers, the one that gateways choose first."""
+    """Types with their number of publishers, first the type that gateways choose."""
     return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
 
 

@@ -112,12 +112,12 @@ def down(url: str, error: TransportError) -> Problem:
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = (), only: str | None = None
 ) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
-    """Yield what a running router receives from now on: of these payload cases, from these endpoints; none means all.
+    """Yield the datagrams that a running router receives, with these payload cases, from these endpoints (empty: all).
     `only` is one of DECISIONS.
 
-    It arrives in batches, each second an empty one while nothing is received. Datagrams of no known payload case are
-    always included. Raises UsageError if the router rejects the request, TransportError if none answers, and later
-    when the router stops.
+    They arrive in batches; while nothing is received, an empty batch arrives each second. Datagrams without a known
+    payload case are always included. Raises UsageError if the router rejects the request, TransportError if none
+    answers, or later if the router stops.
     """
     asked = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(asked + ([("only", only)] if only else []))

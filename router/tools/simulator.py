@@ -102,13 +102,13 @@ DRAIN = 256
 """Datagrams read from one socket before the next one is served."""
 
 PATIENCE = 0.2
-"""Most seconds until `stop` and missing commands are noticed."""
+"""Longest delay in seconds before `stop` or missing commands are noticed."""
 
 LATE = 1.0
 """Seconds behind schedule after which messages are skipped rather than sent in a burst."""
 
 MOST_CHANGES = 100
-"""The newest changes of boards that are kept."""
+"""How many of the newest changes of boards are kept."""
 
 
 @dataclass(slots=True)

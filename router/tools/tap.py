@@ -101,7 +101,7 @@ def _enums(message: MessageType) -> Iterator[Enum]:
 
 
 PATIENCE = 0.2
-"""Most seconds until Ctrl-C and the end of --for are noticed while no message arrives."""
+"""Longest delay in seconds before Ctrl-C or the end of --for is noticed while no message arrives."""
 
 
 @dataclass(frozen=True, slots=True)

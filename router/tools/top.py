@@ -33,8 +33,8 @@ class Order(enum.Enum):
 @dataclass(frozen=True, slots=True)
 class TargetRow:
     """A destination or topic of a route, or the clients of a gateway: delivered messages in total and per second,
-    dropped and withheld ones. `lost` are those that were dropped although the table does not ask for it;
-    `is_losing`: that is a problem now.
+    dropped and withheld ones. `lost` are dropped messages without the intended losses; `is_losing`: losses are a
+    problem now.
     """
 
     name: str
@@ -178,7 +178,7 @@ def _weight(row: RouteRow, order: Order) -> float:
 
 
 def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
-    """Without what the table asks for, such as `max_rate`."""
+    """Return the unintended losses; those by `max_rate`, for example, are intended."""
     return {reason: count for reason, count in reasons.items() if reason not in INTENDED_REASONS}
 
 

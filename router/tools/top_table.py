@@ -139,7 +139,7 @@ def _drops(row: RouteRow) -> Text:
 
 
 def reasons_text(dropped: Mapping[str, int]) -> str:
-    """`12 stale, 3 queue_full`, the largest first, and those that the table asks for last."""
+    """`12 stale, 3 queue_full`, the largest first, and intended losses last."""
     by_count = sorted(dropped.items(), key=lambda item: (item[0] in INTENDED_REASONS, -item[1], item[0]))
     return ", ".join(f"{count} {reason}" for reason, count in by_count)
 

@@ -194,7 +194,7 @@ def cannot_send(to: Address, error: OSError) -> TransportError:
 
 
 def send_once(sender: socket.socket, data: bytes) -> int:
-    """Send on a connected socket. Return 1 if an earlier datagram was refused, which the first attempt reports."""
+    """Send on a connected socket. If that reports that an earlier datagram was refused, send again and return 1."""
     try:
         sender.send(data)
     except ConnectionRefusedError:

@@ -83,7 +83,7 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
         assert router.reload().ok
         await_subscriber(router, subscriber)
         goes_on.set()
-    assert [line["threads"] for line in logs if "what it uses stays open" in line["event"]] == [["publish"]]
+    assert [line["threads"] for line in logs if "its sockets and topics stay open" in line["event"]] == [["publish"]]
 
 
 def test_a_reload_opens_again_what_a_stuck_thread_kept_open(

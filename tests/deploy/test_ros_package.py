@@ -174,10 +174,10 @@ def test_it_forwards_by_what_it_compiled_before(
     first = start(installed, *arguments)
     wait_until(lambda: any(tmp_path.glob("cache/rover-router/*.program")), "the kept program")
     first.terminate()
-    assert "forwarding by the kept program" not in output(first)
+    assert "forwarding with the kept program" not in output(first)
     second = start(installed, *arguments)
     assert second.stderr
-    assert "forwarding by the kept program" in second.stderr.readline()
+    assert "forwarding with the kept program" in second.stderr.readline()
     second.terminate()
     output(second)
     assert second.returncode == 0

@@ -35,11 +35,11 @@ int carrier_start(struct carrier *carrier, const struct change *first);
 /* Feed the watchdog of a service manager every `interval` ns through a socket that is connected to it. */
 void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval);
 
-/* Adopt another program between two datagrams, and wait for that. Listeners that it does not have are drained before.
+/* Adopt another program between two datagrams, and wait for that. Listeners that it does not have are drained first.
  * The receive thread must be running. */
 void carrier_change(struct carrier *carrier, const struct change *change);
 
-/* Copy received datagrams to `mirror` from now on; NULL stops that. `lost` is the counter of those that found it full. */
+/* Copy received datagrams to `mirror` from now on; NULL stops that. `lost` counts those dropped because it is full. */
 void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost);
 
 /* Signal that Python is alive. Call it every few seconds, or the watchdog is not fed. */

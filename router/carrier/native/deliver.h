@@ -162,7 +162,7 @@ bool deliver_now(struct stage *stage, const struct targets *to, const struct tar
 /* Deliver a message to one of the targets. Return false if the thread was abandoned. */
 bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);
 
-/* Deliver it to all of them, likewise. */
+/* Deliver a message to all targets. Return false if the thread was abandoned. */
 bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message);
 
 #endif

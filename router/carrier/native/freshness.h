@@ -49,7 +49,7 @@ struct born {
  * also without stamps, to bound the time at which the clock was set. For one thread. */
 void freshness_look(struct freshness *freshness, int64_t received_at, int64_t now);
 
-/* State that no later message was stamped before the last look: the queue was empty since. */
+/* Record that all later messages are stamped after the last look, because the queue has been empty since. */
 static inline void freshness_forget_past(struct freshness *freshness) { freshness->count = 0; }
 
 /* Look, and return the possible times of an event with the wall-clock stamp `stamp`, never after `now`. The event did not

@@ -29,12 +29,12 @@ struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct 
 int from_ros_watch(struct from_ros *thread, int eventfd);
 void from_ros_unwatch(struct from_ros *thread, int eventfd);
 
-/* Serve this set from the next message on, including messages that have already arrived, after those on subscriptions that
- * are left. Returns when the earlier set is no longer used. Returns false with nothing changed after 1 s: the thread is
- * stuck in the middleware. */
+/* Serve this set from the next message on, including messages that have already arrived. Messages on subscriptions that only
+ * the earlier set has are handled first. Returns when the earlier set is no longer used. Returns false
+ * with nothing changed after 1 s: the thread is stuck in the middleware. */
 bool from_ros_serve(struct from_ros *thread, const struct ros_set *set);
 
-/* Take over the positions of another thread in its subscriptions, so that no message is handled twice. */
+/* Copy the positions of another thread in its subscriptions, so that no message is handled twice. */
 void from_ros_follow(struct from_ros *thread, struct from_ros *other);
 
 /* Handle what has arrived, and end the thread. Returns false after 1 s if the thread is stuck in the middleware. It then

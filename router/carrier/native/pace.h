@@ -23,7 +23,7 @@ enum { LEAST_ROOM = 1 << 16, MOST_ROOM = 1 << 24, BYTES_PER_WAITING = 16 };
 
 enum { LONGEST_SENT = 65507 }; /* by UDP over IPv4 */
 
-/* A target of a route. While its messages wait, a reload may replace it with that of the next program. */
+/* A target of a route. While its messages wait, a reload may replace it with the target of the next program. */
 struct route_target {
     const struct targets *to;
     const struct target *target;

@@ -1,4 +1,4 @@
-/* Scheduling of threads. Most compute little, and should preempt a thread that computes when they wake up. */
+/* Scheduling of threads. Most compute little, and should preempt a computing thread as soon as they wake up. */
 #ifndef PRIORITY_H
 #define PRIORITY_H
 
@@ -18,8 +18,8 @@ bool run_first(void);
 /* Request only the shortest slices: for a thread that may block or compute, but should not wait long for others. */
 void run_soon(void);
 
-/* Set the default policy, even if Python passes on another one: for a thread that is woken by a thread that holds a lock
- * which it needs. If it preempted that thread, it would wait for the lock: two more switches per message. */
+/* Set the default policy, even if the thread inherits another one from Python. For a thread whose lock is held by the thread
+ * that wakes it: if it preempted that thread, it would wait for the lock, which costs two more switches per message. */
 void run_in_turn(void);
 
 /* After a turn of 100 ms of which the calling thread used three quarters, remove its priority for one turn: in a flood, it

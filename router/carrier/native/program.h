@@ -63,7 +63,7 @@ struct program {
     const struct route *routes;
 };
 
-/* The changes that come with a program, made between two datagrams. Timers that end send what they hold. */
+/* The changes that come with a program, made between two datagrams. Ending timers send the messages that they hold. */
 struct change {
     const struct program *program;
     struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */

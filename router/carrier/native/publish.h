@@ -31,7 +31,7 @@ struct publish_change {
 /* Make a change when the thread reaches the generation. Call it before the first message of that generation. */
 void publish_change(struct publish_thread *thread, struct publish_change *change);
 
-/* Go on to a generation once all messages in the ring are handled. No more of an earlier one may be added. */
+/* Go on to a generation once all messages in the ring are handled. Add no more messages of earlier generations. */
 void publish_advance(struct publish_thread *thread, uint32_t generation);
 
 /* Whether the thread no longer uses anything of earlier generations. */

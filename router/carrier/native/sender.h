@@ -21,7 +21,7 @@ struct sender {
 };
 
 /* Open a sender to `address` (host byte order) and `port`. Returns NULL if memory runs out. The caller closes the sockets
- * after `sender_end`, from which on sending fails with EBADF. */
+ * after `sender_end`, after which sending fails with EBADF. */
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
 void sender_close(struct sender *sender); /* when nothing uses it */
@@ -35,7 +35,7 @@ void sender_move(struct sender *sender, int fd, int listener);
  * (ECONNREFUSED), or a firewall rejects it. Then this datagram was sent, so the counters balance. */
 int sender_send(struct sender *sender, const void *data, size_t size);
 
-/* The two steps of `sender_send`: send the datagram and return its own errno, then return that of an earlier one. */
+/* The two steps of `sender_send`: send the datagram and return its own errno; return the errno of an earlier one. */
 int sender_send_only(struct sender *sender, const void *data, size_t size);
 int sender_take_refused(struct sender *sender);
 

@@ -1,4 +1,4 @@
-/* Starts threads, and stops threads that may be stuck in the middleware. */
+/* Starts threads. Publishes from threads that may be stuck in the middleware, and ends such threads. */
 #ifndef THREADS_H
 #define THREADS_H
 
@@ -20,7 +20,8 @@ void condition_open(pthread_cond_t *condition);
 struct timespec patience(void);
 
 /* Wait for a thread to end: with `lock` held, it sets `has_ended` and signals `changed`. If that takes more than a second,
- * the thread is stuck: `is_abandoned` is set, after which it uses nothing of others. Return whether it has ended. */
+ * the thread is stuck: `is_abandoned` is set, after which it uses nothing that belongs to others. Return whether it
+ * has ended. */
 bool thread_end(pthread_t thread, pthread_mutex_t *lock, pthread_cond_t *changed, const bool *has_ended, bool *is_abandoned);
 
 /* The state of a thread that publishes: */

@@ -26,10 +26,10 @@ struct timers;
 struct timer_kind {
     /* Act: the timer is due at `now` (boot clock, ns). */
     void (*serve)(struct timers *timers, struct timer *timer, int64_t now);
-    /* At the start and after a reload: deliver what the timer holds to this target of the program, and serve the timer from
+    /* At the start and after a reload: deliver the held messages to this target of the program, and serve the timer from
      * then on. NULL for a deadman. */
     void (*adopt)(struct timers *timers, struct timer *timer, const struct targets *to, const struct target *target);
-    /* Settle what the timer holds, and never be due again. Later messages are not held. */
+    /* Settle the messages that the timer holds; it is never due again, and holds no later messages. */
     void (*end)(struct timers *timers, struct timer *timer, int64_t now);
 };
 
@@ -68,14 +68,14 @@ void timers_serve(struct timers *timers, int64_t now);
 
 /* ---- with the lock held ---- */
 
-/* Serve a timer from now on, or no longer. May be called again. */
+/* Start and stop serving a timer. Both may be called repeatedly. */
 void timers_add(struct timers *timers, struct timer *timer);
 void timers_remove(struct timers *timers, struct timer *timer);
 
 /* Set the time at which a timer is due; NEVER if it is not. */
 void timer_set_due(struct timers *timers, struct timer *timer, int64_t due);
 
-/* Determine when the next timer is due, after those that are due were served. */
+/* Determine when the next timer is due. Call it after serving the timers that are due. */
 void timers_await_next(struct timers *timers);
 
 /* ---- without it ---- */

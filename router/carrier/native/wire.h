@@ -1,9 +1,9 @@
-/* The wire format of protobuf: a message is a sequence of fields. A field starts with a tag, `number << 3 | wire type`,
- * then comes its value:
+/* The wire format of protobuf: a message is a sequence of fields. A field is a tag, `number << 3 | wire type`, followed
+ * by its value:
  *
  *     0  VARINT     7 bits per byte, the lowest first; the high bit says that another byte follows
  *     1  I64        8 bytes
- *     2  LEN        a varint with the size, then so many bytes: a string, bytes, a message, or packed scalars
+ *     2  LEN        a varint with the size, then that many bytes: a string, bytes, a message, or packed scalars
  *     3  GROUP      fields, up to
  *     4  GROUP_END  with the same number
  *     5  I32        4 bytes */

@@ -17,7 +17,7 @@ AWAY_NS = 50_000_000
 """A gap between two ticks that counts as a pause of the loop."""
 
 CATCH_UP_NS = 100_000_000
-"""How long after a pause a message may be one that arrived in it."""
+"""How long after a pause the messages read may have arrived during it."""
 
 
 class LoopClock:

@@ -39,7 +39,7 @@ Piece = Union[bytes, memoryview]
 
 
 class Limits(NamedTuple):
-    """The most clients in total, clients from one host, and bytes of one message from a client."""
+    """Maximum clients in total, clients from one host, and bytes of one message from a client."""
 
     clients: int
     clients_per_host: int

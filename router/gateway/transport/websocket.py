@@ -121,7 +121,7 @@ class WebsocketTransport(StreamTransport):
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.events.refused("too_large")
         except Exception as error:  # noqa: BLE001 - a fault of the router, which the library would only log
-            report_fault("ended a websocket", error)
+            report_fault("ended a WebSocket connection", error)
         finally:
             self.leave(client)
 
