@@ -440,7 +440,7 @@ def test_neither_clients_nor_a_reload_wait_for_the_deadman_of_a_gateway_that_is_
         wait_until(lambda: router.total("deadman_active") == 1)
         site.write(PH + operator(port, "1h"))
         assert router.reload().ok
-        assert [entry["threads"] for entry in logged if "stays open" in entry["event"]] == [["client deadmen"]]
+        assert [entry["threads"] for entry in logged if "stay open" in entry["event"]] == [["client deadmen"]]
         with socket.create_connection(("127.0.0.1", port)) as another:
             another.sendall(TRUE)
             wait_until(lambda: router.total("messages_published") == 2)
