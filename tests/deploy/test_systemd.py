@@ -234,7 +234,7 @@ listen:
     assert all('"systemd"' in line and f"pid={running.show('MainPID')}" in line for line in holders)
     running.shell(SEND)
     running.wait_for(f"{METRICS} | grep -q '^router_datagrams_received_total{{listener=\"rover\"}} 1'")
-    assert "was handed over" not in running.journal().rpartition("router started")[2]
+    assert "uses this inherited socket" not in running.journal().rpartition("router started")[2]
     running.shell(f"sed -i '/radio:/d' /opt/two.yaml; {ROOT}/deploy/install-service.sh")
     assert running.run("systemctl", "cat", "rover-router.socket", check=False).returncode != 0
     assert running.state() == running.state("rover-router-lo.socket") == "active"
