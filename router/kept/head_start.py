@@ -61,7 +61,6 @@ class HeadStart:
             self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=GENERATION)
             self._change = c.Change(program=self._image.at(c.Program, parts["program"]))
             self._change.timers = self._timers(parts, of_topics=False)
-            undo.callback(self.forwarding.carrier.close)
             undo.callback(self.forwarding.deadmen.end)
             self._start_deadmen(parts)
             self._fill_listeners(parts)

@@ -21,6 +21,7 @@ from router.app import router as whole
 from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.carrier import events
+from router.carrier.carrier import Carrier
 from router.carrier.image import image_of
 from router.carrier.library import library
 from router.cli import run
@@ -104,6 +105,16 @@ def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkey
     monkeypatch.setattr(whole, "Plane", fail)
     with pytest.raises(MemoryError):
         run.route(program, [], os.environ, begun)
+    assert site.basestation.recv(1000) == BRAKE
+
+
+def test_a_head_start_whose_threads_cannot_start_is_undone(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("no threads")
+
+    monkeypatch.setattr(Carrier, "start", fail)
+    with pytest.raises(OSError, match="no threads"):
+        head_start(site.program(DRIVING.replace("20ms", "1h")))
     assert site.basestation.recv(1000) == BRAKE
 
 
