@@ -21,7 +21,7 @@ from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
 from router.carrier.deadmen import NativeDeadman, replaced
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import EventReader, EventThread
-from router.carrier.forwarding import Forwarding, counts_and_events
+from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
 from router.carrier.outlets import Outlets, Publication
@@ -35,7 +35,7 @@ from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import StartError
-from router.kept.head_start import GENERATION, HeadStart
+from router.kept.head_start import HeadStart
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
@@ -99,7 +99,7 @@ class Plane:
         self._head_start = head_start
         self._forwarding, self._names = forwarding, forwarding.names
         self._deadmen, self._carrier = forwarding.deadmen, forwarding.carrier
-        self._generations = count(GENERATION + 1)
+        self._generations = count(KEPT_GENERATION + 1)
         self._is_running, self.has_stopped = head_start is not None, False
         size = counts.counters.size
         self._client_deadmen = ClientDeadmen(library, *counts_and_events(library, size), self._names)

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 MOST_COUNTERS = 1 << 18
 """Counters of each native thread: a fixed number, because their addresses must not change."""
 
+KEPT_GENERATION = 1
+"""The generation of a kept program; compiled programs have higher ones."""
+
 _PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
 """Bytes of the queues: messages for topics, received datagrams for observers, and events of a thread."""
 

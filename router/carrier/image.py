@@ -16,6 +16,7 @@ from typing import Any, TypeVar, cast
 from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import DeadmanGroup
 from router.carrier.deferrals import Adoption
+from router.carrier.forwarding import KEPT_GENERATION
 from router.carrier.names import Names
 from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, native_program
@@ -55,7 +56,7 @@ def image_of(library: ctypes.CDLL, program: Program) -> tuple[Parts, bytes]:
         bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
         boards=NativeBoards(program.boards),
     )
-    native = native_program(program, 1, outlets)
+    native = native_program(program, KEPT_GENERATION, outlets)
     adopted = [*outlets.pacers(), *native.states.adopted]
     memory = _Memory(native, symbols)
     image, relocations, imports = memory.image()

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 
 from router import declared as c
 from router.carrier.deferrals import Adoption, timer_change
-from router.carrier.forwarding import Forwarding
+from router.carrier.forwarding import KEPT_GENERATION, Forwarding
 from router.carrier.library import library
 from router.carrier.sender import NativeSender
 from router.carrier.state import opened
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from router.inputs import Plain
 
 _WORD = 8
-GENERATION = 1
-"""The generation of the kept program; compiled programs have higher ones."""
 
 
 class HeadStart:
@@ -58,7 +56,7 @@ class HeadStart:
             self._open_sockets(parts)
             self._open_what_is_kept(parts)
             self._image = _Image(kept.image, parts, self._symbols(parts))
-            self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=GENERATION)
+            self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=KEPT_GENERATION)
             self._change = c.Change(program=self._image.at(c.Program, parts["program"]))
             self._change.timers = self._timers(parts, of_topics=False)
             undo.callback(self.forwarding.deadmen.end)
