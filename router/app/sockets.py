@@ -13,7 +13,7 @@ from router.compiler.network import LOOPBACK, WILDCARD, sent_from
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.sockets import ListeningSocket
+from router.net.sockets import ListeningSocket, placed
 from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
 from router.table import model
 from router.table.addresses import Address, BadAddressError
@@ -69,14 +69,6 @@ def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
         route=usual,
         remedy="use `send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
     )
-
-
-def _source(name: str | None, listeners: Mapping[str, Listener]) -> Listener | None:
-    """The listener of that name; while it is waiting, another one with the same address and port."""
-    named = listeners.get(name) if name is not None else None
-    if named is None or not named.is_waiting:
-        return named
-    return next((each for each in listeners.values() if each.address == named.address and not each.is_waiting), named)
 
 
 _Destination = tuple[Address, model.EndpointKind]
@@ -152,7 +144,8 @@ class Sockets:
             moves = []
             every = [each.opened for each in (*self._bound.values(), *listeners.values())]
             for to in program.senders:
-                source = _source(sent_from(program.table, to), listeners)
+                name = sent_from(program.table, to)
+                source = placed(listeners.get(name) if name is not None else None, listeners.values())
                 beside = source.opened if source is not None else None
                 destination, sender = self._senders.get(to.name, (None, None))
                 is_new = sender is None or destination != _destination(to)

@@ -19,7 +19,7 @@ from router.carrier.sender import NativeSender
 from router.carrier.state import opened
 from router.clock import boottime_ns
 from router.kept import store
-from router.net.sockets import ListeningSocket, open_sending
+from router.net.sockets import ListeningSocket, open_sending, placed
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class HeadStart:
             self.listening[name] = ListeningSocket(address, interface, receive_buffer)
         every = [*self.listening.values()]
         for name, address, is_board, source_name in parts["senders"]:
-            source = _placed(self.listening.get(source_name), every)
+            source = placed(self.listening.get(source_name), every)
             try:
                 to_send = open_sending(source, every, is_board=is_board)
             except OSError:  # as in `net.udp`, which logs it when it adopts the sender
@@ -196,13 +196,6 @@ class _Image:
         """Give a symbol another address."""
         for word in self._places.get(symbol, ()):
             self._words[word] = address
-
-
-def _placed(source: ListeningSocket | None, every: list[ListeningSocket]) -> ListeningSocket | None:
-    """The listener to send from; while it is waiting, another one with the same address and port."""
-    if source is None or not source.is_waiting:
-        return source
-    return next((each for each in every if each.address == source.address and not each.is_waiting), source)
 
 
 class Beginning:

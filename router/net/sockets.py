@@ -22,6 +22,21 @@ from router.net.kernel import (
     send_arrivals,
 )
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Protocol, TypeVar
+
+    class Bound(Protocol):
+        """A ListeningSocket, or a listener that has one."""
+
+        @property
+        def address(self) -> tuple[str, int]: ...
+
+        @property
+        def is_waiting(self) -> bool: ...
+
+    Source = TypeVar("Source", bound=Bound)
+
 BOARD_ROOM = 8192
 """Requested send buffer of a board, in bytes: the kernel queues commands until it knows the hardware address.
 It grants twice as much, which holds about 20 small datagrams, so that a burst of 16 is queued without loss."""
@@ -175,6 +190,13 @@ class ListeningSocket:
                 self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RD)
+
+
+def placed(source: Source | None, every: Iterable[Source]) -> Source | None:
+    """The listener to send from; while it is waiting, another one with the same address and port."""
+    if source is None or not source.is_waiting:
+        return source
+    return next((each for each in every if each.address == source.address and not each.is_waiting), source)
 
 
 def open_sending(
