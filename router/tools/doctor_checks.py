@@ -150,7 +150,8 @@ def _clock_status() -> int | None:
 
 def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[CheckResult]:
     """Warn if several users run nodes: Fast DDS's shared memory silently loses messages between them."""
-    owners = {each.stat().st_uid for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")}
+    segments = [each for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")]
+    owners = {owner for owner in map(_owner, segments) if owner is not None}
     if len(owners) > 1 or (owners - {os.geteuid()} and variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4"):
         yield warning(
             "ROS",
@@ -159,6 +160,14 @@ def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[
             "run all nodes as one user, or with FASTDDS_BUILTIN_TRANSPORTS=UDPv4 in their environment, as the service "
             "of the router does; `fastdds shm clean` removes the files of nodes that have exited",
         )
+
+
+def _owner(segment: Path) -> int | None:
+    """Return the user ID of a file's owner; None if the node that had the file has just exited."""
+    try:
+        return segment.stat().st_uid
+    except FileNotFoundError:
+        return None
 
 
 def _user(number: int) -> str:

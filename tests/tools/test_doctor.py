@@ -331,6 +331,11 @@ def test_nodes_of_two_users_that_share_memory_are_a_warning(tmp_path: Path) -> N
     assert (found.grade, "user 12345" in found.text) == (Grade.WARNING, True)
 
 
+def test_a_node_that_exits_while_the_doctor_looks_is_not_a_crash(tmp_path: Path) -> None:
+    (tmp_path / "fastrtps_port7000").symlink_to("gone")  # listed, but `stat` does not find it
+    assert list(shared_memory({}, tmp_path)) == []
+
+
 def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_warning(
     table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
