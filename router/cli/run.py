@@ -9,7 +9,6 @@ import argparse
 import signal
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from router.app import Router
     from router.app.keeping import Keeper
     from router.compiler.program import Program
-    from router.kept.head_start import Beginning, HeadStart
+    from router.kept.head_start import Beginning
     from router.table.model import Gateway
 
 _DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
@@ -59,28 +58,17 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from router.app.keeping import Keeper
+    from router.carrier.library import library
+    from router.compiler.check import uncollected
     from router.kept.head_start import BEGUN
+    from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     begun = BEGUN[0] if BEGUN else None
-    with ExitStack() as ending:
-        head_start = _begun(begun)
-        if head_start is not None:
-            ending.callback(head_start.close)
-        _compile_and_route(args, begun, head_start, ending)
-    return OK
-
-
-def _compile_and_route(
-    args: argparse.Namespace, begun: Beginning | None, head_start: HeadStart | None, ending: ExitStack
-) -> None:
-    """Compile the table and run it. `ending` closes the head start if `route` is not reached."""
-    from router.app.keeping import Keeper
-    from router.carrier.library import library
-    from router.compiler.check import uncollected
-    from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
-
+    if begun is not None:
+        _log(begun)
     with uncollected():  # until the router has started
         with inputs.noted() as asked:
             parameters = ros_parameters(args.ros_args)
@@ -89,38 +77,41 @@ def _compile_and_route(
         with inputs.recording(asked) as read:
             program = good_table(table, environ)[1]  # only the program, so that a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.asked))
-        start = "kept" if head_start is not None else "refused" if begun is not None and begun.why else "compiled"
-        if head_start is not None and not _is_of(head_start, program, read):
-            logger.warning("an input has changed since the start: the compiled program replaces the kept one")
-            ending.close()
-            head_start, start = None, "replaced"
-        if signal.sigpending() & _ENDING:  # held back since the head start began, which `ending` closes
-            return
-        kept = head_start.inputs if head_start is not None else None
-        keeper = Keeper(library(), asked, read, kept) if begun is not None else None
-        ending.pop_all()
-        route(program, args.ros_args, environ, head_start, keeper, start)
+        start = "compiled"
+        keeper = None
+        if begun is not None:
+            start = _checked(begun, program, read)
+            kept = begun.head_start.inputs if begun.head_start is not None else None
+            keeper = Keeper(library(), asked, read, kept)
+        if not signal.sigpending() & _ENDING:  # held back since the head start began
+            route(program, args.ros_args, environ, begun, keeper, start)
+    return OK
 
 
-def _begun(begun: Beginning | None) -> HeadStart | None:
-    """Return the head start, if there is one, and log it. Log why a kept program is not used."""
+def _log(begun: Beginning) -> None:
+    """Log the head start, or why a kept program is not used."""
     from router.kept.store import CHANGED
 
-    head_start = begun.take() if begun is not None else None
-    if head_start is not None:
-        logger.info("forwarding with the kept program while the table is compiled", listening=[*head_start.listening])
-    elif begun is not None and begun.why:
+    if begun.head_start is not None:
+        listening = [*begun.head_start.listening]
+        logger.info("forwarding with the kept program while the table is compiled", listening=listening)
+    elif begun.why:
         log = logger.info if begun.why.endswith(CHANGED) else logger.warning
         log("the kept program is not used: the table is compiled first", why=begun.why)
-    return head_start
 
 
-def _is_of(head_start: HeadStart, program: Program, read: inputs.Inputs) -> bool:
-    """Whether a head start runs the program that was just compiled."""
+def _checked(begun: Beginning, program: Program, read: inputs.Inputs) -> str:
+    """End a head start of another program than the compiled one. Return how the router starts, as in STARTS."""
     from router.carrier.image import image_of
     from router.carrier.library import library
 
-    return head_start.inputs == read.plain() and head_start.is_of(*image_of(library(), program))
+    if begun.head_start is None:
+        return "refused" if begun.why else "compiled"
+    if begun.head_start.inputs == read.plain() and begun.head_start.is_of(*image_of(library(), program)):
+        return "kept"
+    logger.warning("an input has changed since the start: the compiled program replaces the kept one")
+    begun.close()
+    return "replaced"
 
 
 def _table(args: argparse.Namespace, name: str, parameter: str | None) -> Path:
@@ -140,23 +131,19 @@ def route(
     program: Program,
     ros_args: Sequence[str],
     environ: Mapping[str, str],
-    head_start: HeadStart | None = None,
+    begun: Beginning | None = None,
     keeper: Keeper | None = None,
     start: str = "compiled",
 ) -> None:
-    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError.
-
-    The head start is closed in any case.
-    """
+    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError."""
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_ENDING, signal.SIGHUP, signal.SIGUSR1})
-    with ExitStack() as unowned:
-        if head_start is not None:
-            unowned.callback(head_start.close)
-        router = Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start)
-        unowned.pop_all()  # the router closes it
+    head_start = begun.head_start if begun is not None else None
+    router = Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start)
+    if begun is not None:
+        begun.pass_on()
     with router:
         tune_interpreter()
         _show_places(router)

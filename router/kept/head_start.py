@@ -205,15 +205,15 @@ class Beginning:
         self.head_start = head_start
         self.why = why
 
-    def take(self) -> HeadStart | None:
-        """Return the head start; the caller must close it."""
-        taken, self.head_start = self.head_start, None
-        return taken
+    def pass_on(self) -> None:
+        """Leave it to the router to close the head start."""
+        self.head_start = None
 
     def close(self) -> None:
-        """Close the head start unless it was taken."""
-        if (left := self.take()) is not None:
-            left.close()
+        """Close the head start unless it was passed on."""
+        if self.head_start is not None:
+            self.head_start.close()
+            self.head_start = None
 
 
 BEGUN: list[Beginning] = []

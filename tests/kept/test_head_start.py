@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Iterator
+from contextlib import closing
 from mmap import mmap
 from pathlib import Path
 
@@ -103,8 +104,8 @@ def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkey
         raise MemoryError
 
     monkeypatch.setattr(whole, "Plane", fail)
-    with pytest.raises(MemoryError):
-        run.route(program, [], os.environ, begun)
+    with pytest.raises(MemoryError), closing(Beginning(begun)) as beginning:
+        run.route(program, [], os.environ, beginning)
     assert site.basestation.recv(1000) == BRAKE
 
 
