@@ -90,6 +90,7 @@ class Plane:
         counts: ThreadCounts,
         reporter: Reporter,
         changed: Callable[[str, bool], None],
+        first: Program,
         head_start: HeadStart | None = None,
     ) -> None:
         self.now: Built | None = None
@@ -100,6 +101,8 @@ class Plane:
         self._forwarding, self._names = forwarding, forwarding.names
         self._deadmen, self._carrier = forwarding.deadmen, forwarding.carrier
         self._generations = count(KEPT_GENERATION + 1)
+        self._explaining = {KEPT_GENERATION: first} if head_start is not None else {}
+        """Programs that explain events, by generation; the newest one is last."""
         self._is_running, self.has_stopped = head_start is not None, False
         size = counts.counters.size
         self._client_deadmen = ClientDeadmen(library, *counts_and_events(library, size), self._names)
@@ -247,6 +250,7 @@ class Plane:
             thread.follow(other)
             thread.adopt(built.from_ros)
         self.now = built
+        self._explaining = {**(self._explaining if earlier is None else {}), generation: built.program}
 
     def has_passed(self) -> bool:
         """Wait until nothing of an earlier program is in use. Return False if that takes longer than a second."""
@@ -335,13 +339,13 @@ class Plane:
     # for events
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
-        return why_rejected(self.now.program, listener, data, length) if self.now else ""
+        newest = next(reversed(self._explaining.values()), None)
+        return why_rejected(newest, listener, data, length) if newest is not None else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """The place in the table; "" if an earlier program refused the message."""
-        if self.now is None or self.now.native.generation != generation:
-            return ""
-        return where_refused(self.now.program.lowered, route, topic, target, place)
+        program = self._explaining.get(generation)
+        return where_refused(program.lowered, route, topic, target, place) if program is not None else ""
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:

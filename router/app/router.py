@@ -72,7 +72,7 @@ class Router:
         self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
         forwarding = head_start.forwarding if head_start else Forwarding(load(), program.counters.size)
-        plane = Plane(forwarding, self._counts, self._reporter, self._deadman_changed, head_start)
+        plane = Plane(forwarding, self._counts, self._reporter, self._deadman_changed, program, head_start)
         self.mirror = Mirror(plane, self._reporter.failed)
         self._runtime = Runtime(plane, self._reporter, ros_args)
         if head_start is not None:

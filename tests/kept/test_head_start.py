@@ -33,6 +33,7 @@ from router.kept.store import Kept
 from router.net.sockets import ListeningSocket, open_sending
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, site
+from tests.app.test_runtime import NAN_PH, PH
 
 __all__ = ["site"]
 
@@ -91,6 +92,21 @@ def test_what_was_told_before_the_router_was_made_is_read_at_once(site: Site, mo
     with capture_logs() as logged, Router(program, head_start=begun) as router:
         wait_until(lambda: TRIPPED in [entry["event"] for entry in logged], "the report")
         assert router.total("deadman_trips") == 1
+
+
+def test_what_was_lost_before_the_router_was_made_is_explained(site: Site) -> None:
+    condition = "{endpoint: basestation, when: 1 / temperature > 0}"
+    program = site.program(f"  ph_info: {{source: sensor_board, destinations: [{condition}]}}\n")
+    begun = head_start(program)
+    site.send(b"\xff", NAN_PH, PH)
+    assert site.basestation.recv(1000) == PH
+    with capture_logs() as logged, Router(program, head_start=begun):
+        wait_until(
+            lambda: {"datagram rejected", "message dropped"} <= {entry["event"] for entry in logged}, "the report"
+        )
+    details = {entry["event"]: str(entry["detail"]) for entry in logged if "detail" in entry}
+    assert details["datagram rejected"].endswith("does not parse as PBEnvelope")
+    assert details["message dropped"].endswith("when: division by zero")
 
 
 def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
