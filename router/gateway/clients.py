@@ -8,6 +8,7 @@ from typing import Any
 
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Encoding
+from router.gateway.kept import MOST_KEPT_BYTES
 from router.gateway.transport.base import HIGH_WATER, Client, Frame, Transport
 from router.log import FloodLog, logger
 
@@ -31,11 +32,28 @@ class ClientQueue:
         self._behind_since: int | None = None
         self._schemas: dict[Hashable, Frame] = {}
         self._values: dict[str, Frame] = {}
+        self._held: dict[str, list[Frame]] = {}
+        self._held_bytes = 0
+        self._held_incomplete: set[str] = set()
 
     @property
     def waiting(self) -> int:
         """Frames in the queue."""
         return len(self._schemas) + len(self._values)
+
+    @property
+    def held(self) -> int:
+        """Frames that wait for the kept messages of their topic."""
+        return sum(map(len, self._held.values()))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the kept messages of any topic are on their way."""
+        return bool(self._held)
+
+    def lack(self, topic: str) -> None:
+        """Record that the client missed a message of the topic, unless its kept messages, on their way, include it."""
+        (self._held_incomplete if topic in self._held else self.lacking).add(topic)
 
     @property
     def keeps_up(self) -> bool:
@@ -49,6 +67,40 @@ class ClientQueue:
     def write(self, frames: Sequence[Frame]) -> None:
         self.client.write(self._on_wire(frames))
         self.sent += len(frames)
+
+    def hold(self, topic: str) -> bool:
+        """Hold values of the topic until `release`, because its kept messages come first.
+
+        Return False if they are held already.
+        """
+        if topic in self._held:
+            return False
+        self._held[topic] = []
+        return True
+
+    def release(self, topic: str, *, is_complete: bool = False) -> list[Frame]:
+        """Return the held values of the topic, in order. `is_complete`: the kept messages include all others so far."""
+        if topic in self._held_incomplete:
+            self._held_incomplete.discard(topic)
+            if not is_complete:
+                self.lacking.add(topic)
+        frames = self._held.pop(topic, [])
+        self._held_bytes -= sum(len(frame.data) for frame in frames)
+        return frames
+
+    def unheld(self, frames: Sequence[Frame]) -> list[Frame]:
+        """Return the frames that can be sent now, and hold the others. If they are too large together, release all."""
+        passed: list[Frame] = []
+        for frame in frames:
+            if frame.is_schema or frame.topic not in self._held:
+                passed.append(frame)
+                continue
+            self._held[frame.topic].append(frame)
+            self._held_bytes += len(frame.data)
+        if self._held_bytes > MOST_KEPT_BYTES:
+            for topic in list(self._held):
+                passed += self.release(topic)
+        return passed
 
     def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[str, Frame], frames: int, now: int) -> int:
         """Queue `schemas` and `values`, the newest of `frames` frames. Return how many were replaced by newer ones."""
@@ -119,7 +171,10 @@ class Clients:
         ready: list[ClientQueue] = []
         behind: list[ClientQueue] = []
         for each in self.queues.values():
-            (ready if each.keeps_up else behind).append(each)
+            if each.holds:
+                self.send_to(each, each.unheld(frames))
+            else:
+                (ready if each.keeps_up else behind).append(each)
         if behind:
             self._queue(behind, frames)
         if len(ready) > 1:
@@ -132,7 +187,7 @@ class Clients:
     def lack(self, topic: str) -> None:
         """Record that all clients missed a message of the topic."""
         for queue in self.queues.values():
-            queue.lacking.add(topic)
+            queue.lack(topic)
 
     def send_to(self, queue: ClientQueue, frames: Sequence[Frame]) -> None:
         """Send frames to one client."""
@@ -153,7 +208,7 @@ class Clients:
 
     def left(self, client: Client) -> None:
         if (queue := self.queues.pop(client, None)) is not None:
-            self._counters.left(queue.waiting)
+            self._counters.left(queue.waiting + queue.held)
             self._counters.clients(len(self.queues))
             self._log_change("client left", queue)
 

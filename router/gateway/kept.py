@@ -60,6 +60,11 @@ class KeptMessages:
         self._found_at: tuple[int, frozenset[bytes]] | None = None  # `arrived`, publishers
         self._forgetting: asyncio.TimerHandle | None = None
 
+    @property
+    def is_current(self) -> bool:
+        """Whether no message has arrived since the last `get`, at most FRESH_S ago."""
+        return self._found_at is not None and self._found_at[0] == self._arrived()
+
     async def get(self) -> Sequence[Sample]:
         """Return the messages in the order of publication. Concurrent calls share one subscription.
 

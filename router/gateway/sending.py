@@ -31,9 +31,8 @@ class ServedTopic:
 
     `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` if every message
     is sent), `reported` the part in the rates for clients. `sample` is the latest one taken, `readable` the latest that
-    could be converted. `is_busy` while a large one is being converted; `unconverted` ones wait. `awaits_kept` until
-    clients have the messages that publishers keep, which a new subscription also gets. Kept messages sent until
-    `refused_ns` have been counted if they cannot be sent.
+    could be converted. `is_busy` while a large one is being converted; `unconverted` ones wait. Kept messages sent
+    until `refused_ns` have been counted if they cannot be sent.
     """
 
     subscription: TopicSubscription
@@ -46,7 +45,6 @@ class ServedTopic:
     readable: Sample | None = None
     is_busy: bool = False
     has_ended: bool = False
-    awaits_kept: bool = False
     refused_ns: int = 0
     seen: int = -1
     looks: int = 0
@@ -112,7 +110,7 @@ class TopicSender:
             return
         new = served.uncounted()
         self._counters.received(new)
-        if not self._clients or served.awaits_kept:  # the middleware keeps the newest message for later
+        if not self._clients:  # the middleware keeps the newest message for later
             self._counters.filtered(new)
             return
         sample = served.subscription.latest() if new or served.sample is None else served.sample
@@ -231,7 +229,7 @@ class TopicSender:
     def _frame(self, sample: Sample) -> Frame:
         """Raises UnreadableError."""
         data = self._encoding.data(sample, self._context.wall_s())
-        return Frame(data, sample.topic, sample.type_name, is_schema=False)
+        return Frame(data, sample.topic, sample.type_name, is_schema=False, sent_ns=sample.sent_ns)
 
     # -- answers to one client -----------------------------------------------------------------------------------
 

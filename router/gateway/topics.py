@@ -151,8 +151,7 @@ class Topics:
         served = ServedTopic.begin(subscription, selection, period, next(self._numbers))
         self._served[topic] = served
         if self._clients and selection.keepers and not (callback and is_new and selection.keeps):
-            served.awaits_kept = selection.keeps
-            self._tasks.run(self._introduce(served))
+            self._introduce(served)
         if selection.others:
             logger.warning(
                 "the topic has several types; serving the one that most publishers use",
@@ -208,35 +207,53 @@ class Topics:
         self._clients.send([self._sender.schema(served) for served in is_known])
         if self._is_udp:  # a new client goes unnoticed
             for queue in self._clients.queues.values():
-                self._show_kept(queue, is_known)
+                self._show_kept(queue, is_known, is_repetition=True)
 
     # -- messages kept for late joiners ------------------------------------------------------------------------
 
-    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic]) -> None:
-        """Send a client the kept messages of these topics, a little later."""
+    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, is_repetition: bool = False) -> None:
+        """Send a client the kept messages of these topics, a little later.
+
+        Newer messages follow them, except in a repetition and on topics that some publishers do not keep messages of.
+        """
         for served in topics:
-            if served.selection.keepers:
-                self._tasks.run(self._show(queue, served))
+            topic = served.subscription.topic
+            holds = served.selection.keeps and not is_repetition
+            if served.selection.keepers and (not holds or queue.hold(topic)):
+                self._tasks.run(self._show(queue, topic, holds=holds))
 
-    async def _show(self, queue: ClientQueue, served: ServedTopic) -> None:
-        queue.lacking.discard(served.subscription.topic)
-        frames = await self._sender.kept(served)
-        if served.has_ended or queue.client not in self._clients.queues:
+    async def _show(self, queue: ClientQueue, topic: str, *, holds: bool) -> None:
+        queue.lacking.discard(topic)
+        frames, is_complete = await self._kept(topic)
+        held = queue.release(topic, is_complete=is_complete) if holds else []
+        if queue.client not in self._clients.queues:
             return
-        if queue.keeps_up:
-            self._clients.send_to(queue, frames)
-        else:
-            queue.lacking.add(served.subscription.topic)
+        if frames and not queue.keeps_up:
+            queue.lacking.add(topic)
+            frames = []
+        known = {frame.sent_ns for frame in frames}
+        missing = [frame for frame in held if frame.sent_ns not in known]
+        self._clients.send_to(queue, sorted([*frames, *missing], key=lambda frame: frame.sent_ns))
 
-    async def _introduce(self, served: ServedTopic) -> None:
+    async def _kept(self, topic: str) -> tuple[list[Frame], bool]:
+        """Return the kept messages of a topic if it is still served, and whether no message has arrived since."""
+        while (served := self._served.get(topic)) is not None and served.selection.keepers:
+            try:
+                frames = await self._sender.kept(served)
+            except Exception as error:  # noqa: BLE001 reported; other messages are still sent
+                self._failed(error)
+                break
+            if not served.has_ended:
+                return frames, served.subscription.kept.is_current
+        return [], False
+
+    def _introduce(self, served: ServedTopic) -> None:
         """Begin to serve a topic while there are clients."""
         schema = self._sender.schema(served)
         self._clients.send([schema])
         self._sender.introduced([schema])
-        try:
-            await asyncio.gather(*(self._show(queue, served) for queue in self._clients.queues.values()))
-        finally:
-            served.awaits_kept = False
+        for queue in self._clients.queues.values():
+            self._show_kept(queue, [served])
 
     async def _mend(self) -> None:
         """Send clients the messages that they lack of a topic, once it is quiet and they keep up."""

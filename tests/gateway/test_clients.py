@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.clients import ClientQueue
+from router.gateway.kept import MOST_KEPT_BYTES
 from router.gateway.transport.base import HIGH_WATER, Frame
 
 MS = 1_000_000
@@ -111,6 +112,39 @@ def test_a_frame_that_is_larger_than_the_buffer_is_written_alone() -> None:
     client.takes, client.level = 1, 0
     one.drained()
     assert [frame.topic for frame in client.got] == ["/a"]
+
+
+def test_values_wait_for_the_kept_messages_of_their_topic() -> None:
+    one = new_queue(Client())
+    assert one.hold("/map")
+    assert not one.hold("/map")
+    frames = [schema("T"), data("/map", b"1"), data("/imu", b"2"), data("/map", b"3")]
+    assert one.unheld(frames) == [frames[0], frames[2]]
+    one.lack("/map")
+    one.lack("/imu")
+    assert (one.held, one.lacking) == (2, {"/imu"})
+    assert one.release("/map") == [frames[1], frames[3]]
+    assert (one.held, one.holds, one.lacking) == (0, False, {"/imu", "/map"})
+
+
+def test_a_client_that_has_all_kept_messages_lacks_none() -> None:
+    one = new_queue(Client())
+    one.hold("/map")
+    one.lack("/map")
+    assert one.release("/map", is_complete=True) == []
+    assert one.lacking == set()
+
+
+def test_values_that_wait_are_bounded() -> None:
+    one = new_queue(Client())
+    one.hold("/map")
+    one.hold("/imu")
+    large = data("/map", bytes(MOST_KEPT_BYTES // 2))
+    small = data("/imu", b"1")
+    assert one.unheld([large, small]) == []
+    assert one.unheld([large]) == [large, large, small]
+    assert not one.holds
+    assert one.unheld([small]) == [small]
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 3)), max_size=40))

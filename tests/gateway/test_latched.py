@@ -150,6 +150,30 @@ async def test_a_late_client_gets_what_each_publisher_keeps_once_and_oldest_firs
             await until(lambda: last.texts == ["0 4", "2 4"])
 
 
+@pytest.mark.parametrize("period", ["20ms", "each"])
+@asynchronous
+async def test_a_late_client_of_a_topic_that_is_never_quiet_gets_each_message_once_and_in_order(
+    tmp_path: Path, period: str
+) -> None:
+    numbers = [f"{number:03}" for number in range(200)]
+    with publishers(5) as [peer]:
+        peer.publish([cdr(numbers[0])])
+        async with gateway(tmp_path, period) as (_, played):
+            await until(lambda: texts(played) == numbers[:1])
+            await asyncio.sleep(0.5)  # the first client has all that is kept
+            for number in numbers[1:20]:
+                peer.publish([cdr(number)])
+                await asyncio.sleep(0.005)
+            late = LateClient(played)
+            for number in numbers[20:]:
+                peer.publish([cdr(number)])
+                await asyncio.sleep(0.005)
+            await until(lambda: late.texts[-1:] == numbers[-1:])
+            assert late.texts == sorted({*late.texts})
+            if period == "each":
+                assert late.texts == numbers[-len(late.texts) :]
+
+
 @pytest.mark.parametrize("period", ["500ms", "each"])
 @asynchronous
 async def test_a_client_that_is_there_gets_what_gave_way_within_a_period(tmp_path: Path, period: str) -> None:

@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     """One packet or document to send. `data` does not include the framing of the transport.
 
     A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers kept messages of a
-    topic backwards from the newest one, which has 0.
+    topic backwards from the newest one, which has 0. `sent_ns` is the source timestamp of a message (wall clock).
     """
 
     data: bytes
@@ -31,6 +31,7 @@ class Frame(NamedTuple):
     type_name: str
     is_schema: bool
     older: int = 0
+    sent_ns: int = 0
 
 
 class Client(Protocol):
