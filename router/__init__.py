@@ -16,7 +16,7 @@ NO_CACHE = "--no-cache"
 
 _KEYBOARD_INTERRUPT = 130
 _UNTIL_COLLECTED = 200_000
-"""New objects until garbage collection. With the default of 700, it would take a fifth of the time of `validate`."""
+"""Threshold of garbage collection, in objects. With the default of 700, it takes a fifth of the time of `validate`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,31 +26,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_what_is_closed()
     with ExitStack() as ending:
         try:
-            if _verb(arguments) != "run":  # which sets up its own process
+            if _verb(arguments) != "run":  # `run` sets up its process itself
                 gc.set_threshold(_UNTIL_COLLECTED)
             elif argv is None and NO_CACHE not in arguments:
                 from router.kept.head_start import begin
 
-                ending.callback(begin().close)  # where the verb fails before it has taken the head start
-            from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
+                ending.callback(begin().close)  # if the verb fails before it takes over the head start
+            from router.cli import main as run_verb  # once signals are blocked, as this takes up to 1 s
         except KeyboardInterrupt:
             return _KEYBOARD_INTERRUPT
         code = run_verb(arguments)
     if argv is None and _verb(arguments) == "run":
         _exit(code)
-    gc.freeze()  # all that is left goes with the process, which would search it for cycles several times
+    gc.freeze()  # otherwise Python would search all remaining objects for cycles several times before it exits
     return code
 
 
 def _open_what_is_closed() -> None:
-    """A standard stream that our caller has closed leads nowhere; its number would be the next socket's otherwise."""
+    """Open /dev/null for each standard stream that the caller has closed, or the next socket would get its number."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: PTH123, SIM115 - for as long as we run
 
 
 def _exit(code: int) -> None:
-    """End the process without the exit handlers of libraries, once all is closed: that of Fast DDS sleeps for 0.1 s."""
+    """End the process without running exit handlers of libraries: that of Fast DDS sleeps for 0.1 s. Call it last."""
     with suppress(OSError):
         sys.stderr.flush()
     os._exit(code)
@@ -59,7 +59,7 @@ def _exit(code: int) -> None:
 def hold_signals(arguments: Sequence[str]) -> None:
     """Block SIGHUP and SIGUSR1 for `router run`, which handles them with sigwait once it routes.
 
-    Blocked in all threads, they run no handler and interrupt no system call. Other verbs are ended by them, as usual.
+    Blocked in all threads, they run no handler and interrupt no system call. They end other verbs, as usual.
     """
     if _verb(arguments) == "run":
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})

@@ -1,6 +1,6 @@
-"""Where the files that belong to the router lie: within the package in a wheel, at the root in a checkout.
+"""Finds the files shipped with the router: within the package in a wheel, at the root in a checkout.
 
-Knows no file's meaning. `routes/`, `protos/` and `schemas/` are such files.
+They are in `routes/`, `protos/` and `schemas/`, for example.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ _PLACES = (_PACKAGE / "_assets", _PACKAGE.parent)
 
 
 def asset(relative: str) -> Path:
-    """The absolute path of a file or folder of ours, such as `schemas/route-table.schema.json`.
+    """Return the absolute path of a shipped file or folder, such as `schemas/route-table.schema.json`.
 
-    Raises FileNotFoundError when the installation lacks it.
+    Raises FileNotFoundError if the installation lacks it.
     """
     for place in _PLACES:
         if (path := place / relative).exists():
@@ -23,15 +23,15 @@ def asset(relative: str) -> Path:
 
 
 def is_installed(path: Path) -> bool:
-    """Whether `path` is within the installed package: the next version overwrites what is changed there."""
+    """Return whether `path` is within the installed package: the next version overwrites what is changed there."""
     return path.resolve().is_relative_to(_PACKAGE.resolve())
 
 
 def page_policy(page: bytes) -> str:
-    """The Content-Security-Policy of a page with inline scripts and styles only. Callers add permitted connections."""
+    """Return the Content-Security-Policy of a page with inline scripts and styles only. Callers add connect-src."""
     import base64
     import re
-    from hashlib import sha256  # here, as `table` has imported it without OpenSSL
+    from hashlib import sha256  # not at the top: `table` is the first to import it, without OpenSSL
 
     sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
     for kind, text in re.findall(rb"<(script|style)[^>]*>(.*?)</\1>", page, re.DOTALL):

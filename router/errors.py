@@ -237,11 +237,11 @@ class NonFiniteError(MappingError):
 
 
 class TransportError(OperatorError):
-    """A network failure: a datagram or a ROS message could not be handed over."""
+    """A network failure, for example a datagram that cannot be sent, or a router that does not answer."""
 
 
 def shown_path(path: Path) -> str:
-    """Return a path as findings show it: relative to the working directory if it is inside that."""
+    """Return a path as findings show it: relative to the working directory if it is inside it."""
     absolute = path.absolute()
     try:
         return str(absolute.relative_to(Path.cwd()))
@@ -270,10 +270,10 @@ def did_you_mean_file(written: str, path: Path) -> str:
 
 
 def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
-    """Return the known name that `name` most likely stands for, or None. With a `closeness` of 1 they must be equal.
+    """Return the known name that `name` most likely stands for, or None.
 
-    Names with the same words in another order are similar. A prefix that all known names share does not count:
-    `MODE_X` is not similar to `MODE_A`.
+    With a `closeness` of 1, they may differ only in case and in a prefix that all known names share. Otherwise, names
+    with the same words in another order are similar. Such a prefix does not count: `MODE_X` is not similar to `MODE_A`.
     """
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
     words = sorted(name.lower().split("_"))
@@ -293,9 +293,9 @@ def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | No
 
 
 _HALF = 0.5
-"""Similarity required of names without a shared prefix: in `MODE_OM`, one of two letters is right."""
+"""Similarity to exceed once a shared prefix is removed: in `MODE_OM` for `MODE_ON`, one of two letters is right."""
 _SHORTEST = 3
-"""Length from which the beginning of a name can stand for all of it."""
+"""Minimum length at which the beginning of a name can stand for the whole name."""
 
 
 def _likeness(known: str, wanted: str) -> float:

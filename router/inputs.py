@@ -47,7 +47,7 @@ class Inputs:
             self._folder = ""
 
     def plain(self) -> Plain:
-        """All inputs as plain values for `marshal`. Equal for compiles that have read the same."""
+        """Return all inputs as plain values for `marshal`. Compiles that read the same inputs get equal values."""
         return tuple((kind, name, value) for (kind, name), value in sorted(self._values.items(), key=_key))
 
     def note(self, kind: str, name: str, value: object) -> None:
@@ -64,7 +64,7 @@ class Inputs:
             self.note(kind, name, value)
 
     def read_again(self) -> bool:
-        """Read everything again. If all is the same, note it in the open recording and return true."""
+        """Read all inputs again. Return whether no value has changed; if so, note them in the open recording."""
         if any(_PROBES[kind](name) != value for (kind, name), value in self._values.items()):
             return False
         if (outer := _open.get()) is not None:
@@ -104,7 +104,7 @@ def recording(before: Inputs | None = None) -> Iterator[Inputs]:
 
 
 def changed(plain: Plain) -> str:
-    """The first input whose value has changed, in words; "" if none has."""
+    """Return the first input whose value has changed, in words; "" if none has."""
     for kind, name, value in plain:
         if _PROBES[kind](name) != value:
             return _WORDS[kind].format(name)
@@ -112,7 +112,7 @@ def changed(plain: Plain) -> str:
 
 
 def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
-    """The content of a file, or its first bytes. Raises OSError, or ValueError for an impossible path."""
+    """Return the content of a file, or its first `most` bytes. Raises OSError, or ValueError for an impossible path."""
     name = os.fspath(path)
     try:
         with open(name, "rb") as stream:
@@ -125,22 +125,22 @@ def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file with line ends as in Python. Raises OSError, or UnicodeDecodeError if it is not UTF-8."""
+    """Read a UTF-8 file with universal newlines. Raises OSError or UnicodeDecodeError."""
     return read_bytes(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether the path is a regular file. Raises OSError if it cannot be examined."""
+    """Return whether the path is a regular file. Raises OSError if it cannot be examined."""
     return _noted_kind(path) == "file"
 
 
 def is_dir(path: str | os.PathLike[str]) -> bool:
-    """Whether the path is a folder. Raises OSError if it cannot be examined."""
+    """Return whether the path is a folder. Raises OSError if it cannot be examined."""
     return _noted_kind(path) == "folder"
 
 
 def exists(path: str | os.PathLike[str]) -> bool:
-    """Whether the path exists. Raises OSError if it cannot be examined."""
+    """Return whether the path exists. Raises OSError if it cannot be examined."""
     return _noted_kind(path) != ""
 
 
@@ -154,7 +154,7 @@ def _noted_kind(path: str | os.PathLike[str]) -> str:
 
 
 def listing(path: str | os.PathLike[str]) -> Listing:
-    """The folders and the other files in a folder, without hidden ones. Empty if it cannot be read."""
+    """Return the folders and the other files in a folder, without hidden ones. Empty if it cannot be read."""
     name = os.fspath(path)
     found = _listing(name)
     _note("folder", name, found)
@@ -162,7 +162,7 @@ def listing(path: str | os.PathLike[str]) -> Listing:
 
 
 def real_path(path: str | os.PathLike[str]) -> str:
-    """The absolute path without links; it need not exist."""
+    """Return the absolute path without links; it need not exist."""
     name = os.fspath(path)
     real = os.path.realpath(name)
     _note("link", name, real)
@@ -170,7 +170,7 @@ def real_path(path: str | os.PathLike[str]) -> str:
 
 
 class _Environment(Mapping[str, str]):
-    """The variables of the process; notes which of them are read."""
+    """The environment variables of the process. Notes each one that is read."""
 
     def __getitem__(self, name: str) -> str:
         value = os.environ.get(name)
@@ -198,7 +198,7 @@ def _note(kind: str, name: str, value: object) -> None:
 
 
 def _content(path: str) -> bytes | int | None:
-    """The content or errno; None unless it is a regular file, as others can be read only once or block."""
+    """Return the content of a file, or errno; None unless it is a regular file, as reading others may block."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         try:
@@ -234,7 +234,10 @@ def _listing(path: str) -> Listing | int:
 
 @cache
 def _process() -> Mapping[str, object]:
-    """The code that this process runs, as of its start: it imports each module once."""
+    """Return what identifies the code of this process: Python, router and packages, and the variables of ROS.
+
+    Computed once, because the process imports each module only once.
+    """
     from router.declared import CHECKSUM
 
     packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -248,7 +251,7 @@ def _process() -> Mapping[str, object]:
 
 
 def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """The code files below a folder, each with properties that change when it is written."""
+    """Yield each code file below a folder with its times (ns) and size, which change when it is written."""
     try:
         entries = [*os.scandir(folder)]
     except OSError:

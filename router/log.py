@@ -35,7 +35,7 @@ NO_THREAD = "can't start new thread"
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether memory, threads or descriptors have run out: not a bug of the router, and perhaps temporary."""
+    """Return whether memory, threads or descriptors have run out: not a bug of the router, and perhaps temporary."""
     if isinstance(error, OSError):
         return error.errno in {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error) == NO_THREAD)
@@ -46,7 +46,7 @@ ADDRESS_SPACE = 1 << 30
 
 
 def address_space() -> int | None:
-    """Bytes that this process may map (`ulimit -v`), or None."""
+    """Return how many bytes this process may map (`ulimit -v`), or None if there is no limit."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     return None if limit == resource.RLIM_INFINITY else limit
 
@@ -140,8 +140,8 @@ def _configure(structlog: Any, level: str, *, coloured: bool) -> None:
 class _NonBlockingStream:
     """A stream that drops lines if its reader is gone or slow, or its disk is full; it never blocks or raises.
 
-    What dropped lines report is also counted. `flush` writes whole lines, past the stream's own buffer: that would keep
-    a line that cannot be written, and make Python exit with code 120.
+    The events of dropped lines are also counted. `flush` writes whole lines and bypasses the stream's buffer, which
+    would keep a line that cannot be written, and make Python exit with code 120.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -187,7 +187,7 @@ class _Flood:
 
 
 class FloodLog:
-    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and the number.
+    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their number.
 
     Thread-safe. Call `flush()` regularly, or the last events of a flood are not logged. Kinds beyond `MOST_KEYS` share
     a summary.

@@ -21,7 +21,7 @@ T = TypeVar("T")
 _LONGEST_WAIT_MS = 3_600_000
 
 START_S = 2.0
-"""Timeout in seconds for a started thread to run."""
+"""Timeout in seconds for a started thread to begin to run."""
 
 REST_S = 0.1
 """Seconds before a thread retries after a shortage."""
@@ -88,7 +88,10 @@ class WakeEvent:
         self._poll.register(self._event, select.POLLIN)
 
     def wait(self, nanoseconds: int) -> None:
-        """Wait until the event is set, or was since the last wait, but at most `nanoseconds` or an hour."""
+        """Wait until the event is set, at most `nanoseconds` or an hour.
+
+        Returns at once if the event was set since the last wait.
+        """
         if self._poll.poll(min(max(0, nanoseconds) / 1e6, _LONGEST_WAIT_MS)):
             self._event.read(8)
 
@@ -96,13 +99,13 @@ class WakeEvent:
         self._event.write((1).to_bytes(8, sys.byteorder))
 
     def close(self) -> None:
-        """Idempotent. Neither `wait` nor `set` may be called afterwards."""
+        """Close the event. Idempotent. Neither `wait` nor `set` may be called afterwards."""
         self._event.close()
 
 
 @contextmanager
 def background_threads() -> Iterator[None]:
-    """Keep threads that any library starts inside from preempting other threads when they wake up.
+    """Keep threads that libraries start in this context from preempting other threads when they wake up.
 
     They inherit Linux's batch scheduling: the same share of the processor without wake-up preemption. Fast DDS wakes
     one of its threads several times per reliable message; on a processor shared with the receive thread, that caused
@@ -148,7 +151,10 @@ class DaemonThread(Executor):
         self._lock = threading.Lock()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Raises RuntimeError after `shutdown`, or if the thread cannot be started; the next call tries again."""
+        """Queue a call.
+
+        Raises RuntimeError after `shutdown`, or if the thread cannot be started; the next call tries again.
+        """
         done: Future[T] = Future()
         with self._lock:
             if self._is_shut_down:
@@ -176,7 +182,7 @@ class DaemonThread(Executor):
 
 
 LEAVING_S = 1.0
-"""Timeout in seconds of a reload or a stop for a thread that may be stuck in the middleware."""
+"""How long, in seconds, a reload or a stop waits for a thread that may be stuck in the middleware."""
 
 
 def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
@@ -190,8 +196,8 @@ def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
 class StopStack(ExitStack):
     """An ExitStack whose callbacks have timeouts: after one, a line is logged and the next callback is called.
 
-    Each callback has its own thread; if no thread can be started, it is called without one, and without a timeout.
-    `outer` is a stack with which this one shares its time.
+    Each callback runs in its own thread; if none can be started, it runs in this one, without a timeout. `outer` is a
+    stack with which this one shares the timeout of all steps.
     """
 
     def __init__(self, outer: StopStack | None = None) -> None:
@@ -205,7 +211,7 @@ class StopStack(ExitStack):
 
 
 STEP_S, STEPS_S, LEAST_S = 3.0, 6.0, 0.2
-"""Timeouts in seconds of a step, of all steps, and of each step after that; systemd kills the router after 10 s."""
+"""Timeouts in seconds: of a step, of all steps, of a step once those are over; systemd kills the router after 10 s."""
 
 
 class _Steps:

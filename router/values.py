@@ -99,7 +99,7 @@ def _assign_element(values: Any, kind: List, index: int | None, path: str, text:
 
 
 LARGEST_LIST = 65_507
-"""Elements: no list is longer than the bytes of the largest datagram."""
+"""Maximum number of elements: no list has more than the largest datagram has bytes."""
 
 ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Enum: 0, Float: 0.0, String: "", Bytes: b""}
 """The value of a scalar that is not set."""
@@ -219,19 +219,19 @@ def one_line(listed: Iterable[str], empty: str = "(all default)") -> str:
 
 
 def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
-    """Print a protobuf message as one line, without fields that have their default."""
+    """Format a protobuf message as one line, without fields that have their default."""
     return one_line(words(protobuf_tree(message, kind, digits)))
 
 
 def scalar_text(value: Any, kind: Type, digits: int | None = None) -> str:
-    """Print a scalar of this type: an enum by name, bytes as hex. `digits` as in float_text."""
+    """Format a scalar of this type: an enum by name, bytes as hex. `digits` as in float_text."""
     if isinstance(kind, Enum):
         return next((name for name, number in kind.values if number == value), str(value))
     return plain_text(value, kind.bits if isinstance(kind, Float) else 64, digits)
 
 
 def plain_text(value: object, bits: int = 64, digits: int | None = None) -> str:
-    """Print a scalar by its Python type. `bits` is the width of a float, `digits` as in float_text."""
+    """Format a scalar by its Python type. `bits` is the width of a float, `digits` as in float_text."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -248,7 +248,7 @@ def plain_text(value: object, bits: int = 64, digits: int | None = None) -> str:
 def float_text(value: float, bits: int, digits: int | None = None) -> str:
     """Return the shortest decimal that parses as the same float of this width.
 
-    With `digits`, round to that many, and to twice as many for 64 bits: a degree of latitude has 111 km.
+    With `digits`, round to that many digits, and to twice as many for 64 bits: a degree of latitude is 111 km.
     """
     if digits is not None:
         return f"{value:.{digits * bits // 32}g}"
@@ -261,7 +261,7 @@ def float_text(value: float, bits: int, digits: int | None = None) -> str:
 
 
 def age_text(seconds: float | None) -> str:
-    """Print an age: `0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
+    """Format an age: `0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
     if seconds is None:
         return "never"
     if seconds < 10:
@@ -272,7 +272,7 @@ def age_text(seconds: float | None) -> str:
 
 
 def rate_text(rate: float) -> str:
-    """Print a rate per second, in at most four characters up to 9999."""
+    """Format a rate per second, in at most four characters up to 9999."""
     return f"{rate:.1f}" if 0 < rate < 9.95 else f"{rate:.0f}"
 
 
@@ -285,7 +285,7 @@ def shortened(name: str, letters: int) -> str:
 
 
 def protobuf_tree(message: Any, kind: MessageType, digits: int | None = None) -> Mapping[str, Tree]:
-    """Return the fields of a protobuf message without defaults. Each element of a list is a member: `x[0]`."""
+    """Return the fields of a protobuf message that are set. Each element of a list is a member: `x[0]`."""
     tree: dict[str, Tree] = {}
     for field in kind.fields:
         value = getattr(message, field.name)
@@ -310,7 +310,7 @@ def _is_negative_zero(value: Any) -> bool:
 
 
 SHOWN_ELEMENTS = 8
-"""Elements shown of a list in a ROS message; an image has a million."""
+"""Maximum number of elements shown of a list in a ROS message; an image has a million."""
 
 
 def ros_tree(message: Any) -> Mapping[str, Tree]:

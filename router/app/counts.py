@@ -39,7 +39,7 @@ class ThreadCounts:
         return [copy(size) for copy in self._copies]
 
     def total(self, metric: str) -> int:
-        """The sum of a counter over all its labels."""
+        """Return the sum of a counter over all its labels."""
         indexes = [index for series, index in self.counters.series() if series.metric == metric]
         return sum(counts[index] for counts in self.lists for index in indexes)
 
@@ -59,5 +59,5 @@ class ThreadCounts:
         self.adopt(counters)
 
     def adopt(self, counters: Counters) -> None:
-        """As `replace`, while a thread may still use the earlier counters, whose indexes stay reserved."""
-        self.counters = counters  # from here on read by other threads, and no longer changed
+        """Adopt `counters` while a thread may still use the earlier ones, whose indexes stay reserved."""
+        self.counters = counters  # from now on, other threads read them, and nothing changes them

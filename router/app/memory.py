@@ -35,7 +35,7 @@ def drop_idle_code() -> None:
 
 
 def read_only(maps: str) -> Iterator[Mapping]:
-    """The mappings that cannot have been modified: code, and the part of a library before it.
+    """Yield the mappings that cannot have been modified: code, and the part of a library before it.
 
     `maps` is the text of /proc/PID/maps. Constants after the code are left out: they include pages that the loader
     has written and then protected.

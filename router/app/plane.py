@@ -41,7 +41,7 @@ from router.net.udp import Listener
 from router.observe.reports import Reporter
 
 _PATIENCE_S = 1.0
-"""How long a reload waits for a thread that may be stuck in the middleware."""
+"""How long, in seconds, a reload waits for a thread that may be stuck in the middleware."""
 
 _TURN_S = 0.002
 
@@ -73,7 +73,7 @@ class Built:
     client_deadmen: Mapping[str, ClientDeadman]
 
     def timers(self, earlier: Built | None, *, of_topics: bool) -> c.TimerChange:
-        """Changes to the timers of topics or of endpoints. Timers only in `earlier` deliver what they hold."""
+        """Return changes to the timers of topics or endpoints. Timers only in `earlier` deliver what they hold."""
         now, before = (
             [each for each in adopted if each.is_topic is of_topics]
             for adopted in (self.adopted, earlier.adopted if earlier else ())
@@ -125,7 +125,7 @@ class Plane:
         return self._carrier.turns
 
     def stalled(self) -> Iterator[tuple[str, float]]:
-        """The topics on which native threads are publishing now, each with the seconds since they began."""
+        """Return the topics on which native threads are publishing now, each with the seconds since the call began."""
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
     def tell(self) -> None:
@@ -137,10 +137,10 @@ class Plane:
         for thread in self._from_ros:
             thread.report_failures()
 
-    # a program
+    # building a program
 
     def first_state(self) -> State:
-        """The state of the first program, which includes what a head start has opened."""
+        """Return the state of the first program, which includes what a head start has opened."""
         return State(self.library, opened=self._head_start.opened if self._head_start else None)
 
     def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
@@ -214,7 +214,7 @@ class Plane:
                 what = "the deadman publishes its payload to a new subscriber after startup"
                 logger.info(what, route=plan.route, topic=topic)
 
-    # running it
+    # running a program
 
     def adopt(self, built: Built, left: Sequence[Listener] = ()) -> None:
         """Switch to a program; the first one starts the threads. Listeners in `left` are drained and closed to input.
@@ -291,7 +291,7 @@ class Plane:
         self._forwarding.mirror(self.counts.counters.index("mirror_dropped") if is_observed else None)
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
-        """The datagrams received since the last call, as `recording.mirror.Mirrored`. For one thread."""
+        """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. Not thread-safe."""
         return self._mirrored.take()
 
     @property
@@ -303,7 +303,7 @@ class Plane:
         """Feed a watchdog through the connected socket `notify` every `interval` ns; -1 ends that."""
         self._carrier.watchdog(notify, interval)
 
-    # the end
+    # stopping
 
     def stop(self, listeners: Sequence[Listener]) -> bool:
         """End all input, handle what is still queued, and end the threads; deadmen keep running.
@@ -336,14 +336,14 @@ class Plane:
             self._carrier.close()
         return has_ended
 
-    # for events
+    # explaining events
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
         newest = next(reversed(self._explaining.values()), None)
         return why_rejected(newest, listener, data, length) if newest is not None else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
-        """The place in the table; "" if an earlier program refused the message."""
+        """Return the place in the table; "" if an earlier program refused the message."""
         program = self._explaining.get(generation)
         return where_refused(program.lowered, route, topic, target, place) if program is not None else ""
 

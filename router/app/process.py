@@ -69,7 +69,7 @@ def notify(*lines: str) -> None:
 
 
 def _notify_socket() -> socket.socket | None:
-    """A socket that is connected to the service manager; None without one, or where it cannot be reached."""
+    """Return a socket that is connected to the service manager; None without one, or where it cannot be reached."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return None
@@ -85,7 +85,7 @@ def _notify_socket() -> socket.socket | None:
 
 
 def _watchdog_ns() -> int | None:
-    """The watchdog's timeout in ns, or None without a watchdog."""
+    """Return the watchdog's timeout in ns, or None without a watchdog."""
     microseconds = os.environ.get("WATCHDOG_USEC", "")
     is_ours = os.environ.get("WATCHDOG_PID") in (None, str(os.getpid()))
     return int(microseconds) * 1000 if is_ours and microseconds.isdecimal() and int(microseconds) else None
@@ -95,7 +95,7 @@ def tune_interpreter() -> None:
     """Set up the process for low latency. Call it once, from the main program, after start-up."""
     gc.freeze()  # objects made at start-up live as long as the process and need no scan
     may_open, may_request = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 are too few: each client of a gateway needs one
+    if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 descriptors are too few for gateway clients
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
-    sys.setswitchinterval(0.0005)  # the longest that gateways wait for a busy thread
+    sys.setswitchinterval(0.0005)  # the longest time that gateways wait for a busy thread
     gc.enable()  # it may have been paused until here

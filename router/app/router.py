@@ -95,7 +95,7 @@ class Router:
             with background_threads():
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)
-            if self._first.table.record is not None:  # kept for the recorder, which opens later
+            if self._first.table.record is not None:  # for the recorder, which opens later, but records from here on
                 self._runtime.plane.observe(is_observed=True)
             self._runtime.start(change)
             with background_threads():
@@ -147,11 +147,11 @@ class Router:
         return self._services.http_address
 
     def total(self, metric: str) -> int:
-        """The sum of a counter over all its labels, since the start."""
+        """Return the sum of a counter over all its labels, since the start."""
         return self._counts.total(metric)
 
     def totals(self) -> dict[str, int]:
-        """The main counters since the start, over all listeners, routes and targets."""
+        """Return the main counters since the start, over all listeners, routes and targets."""
         totals = {metric: self.total(metric) for metric in _TOTALS}
         return totals | {"kernel_drops": sum(dropped for _, dropped in self._runtime.drops.totals())}
 
@@ -212,7 +212,7 @@ class Router:
             self._interfaces.close()
 
     def _asked(self) -> dict[str, Asked]:
-        """Series without a counter, whose values are computed at each scrape."""
+        """Return the series without a counter, whose values are computed at each scrape."""
 
         def of_clients(value: Callable[[ClientQueue], float]) -> Asked:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
@@ -286,7 +286,7 @@ class Services:
             self.http_address = server.address
 
     def asked(self) -> Mapping[str, Asked]:
-        """Series of the services, and of the table."""
+        """Return the series of the services and of the table."""
 
         def recorded(metric: str) -> Asked:
             return lambda: self._recorder.samples()[metric] if self._recorder else ()
@@ -305,7 +305,7 @@ class Services:
             self._recorder.deadman_tripped(route)
 
     def save_recording(self, reason: str) -> None:
-        """Start to save, and return at once; the result is logged. For one thread.
+        """Start to save, and return at once; the result is logged. Not thread-safe.
 
         A request is ignored while an earlier one has not begun.
         """

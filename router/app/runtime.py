@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from router.ros.router_node import RouterNode
 
 _STALLED_S = 0.01
-"""Publish calls that have taken less are reported as 0."""
+"""Publish calls that have taken less, in seconds, are reported as 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Runtime:
         return self._ros.name if self._ros else ""
 
     def stalled(self) -> dict[str, float]:
-        """For how many seconds a publish call has been in the middleware, by topic; 0 if no call is running."""
+        """Return the seconds for which a publish call has been in the middleware, by topic; 0 if no call is running."""
         stalled = dict.fromkeys((plan.label for plan in self.program.publishers) if self.program else (), 0.0)
         for topic, seconds in (*(self._ros.stalled() if self._ros else ()), *self.plane.stalled()):
             if seconds >= _STALLED_S:
@@ -99,16 +99,16 @@ class Runtime:
         closing.callback(self._stop_gateways)
         closing.callback(self._stop_plane)
 
-    # a reload
+    # reloading
 
     def prepare(self, program: Program) -> Change:
-        """Open what `program` needs and is not open yet. Raises StartError with nothing changed.
+        """Open what `program` needs that is not open yet. Raises StartError with nothing changed.
 
         For the first program, deadmen send here, and gateways are opened later, by `start`, because they take longer to
         open than sockets and topics.
         """
         if self._unfinished and self.plane.has_passed():
-            self._close_unfinished()  # first, as it may be opened again
+            self._close_unfinished()  # first, as `program` may open the same again
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
@@ -172,7 +172,8 @@ class Runtime:
         """Close what no thread uses any more, of this reload and earlier ones."""
         self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
-            is_first = earlier is None and not change.sockets.moves  # a head start sends by what those leave
+            # The threads of a head start may still send through the sockets that moves replace.
+            is_first = earlier is None and not change.sockets.moves
             if is_first or self.plane.has_passed():
                 last_first.callback(self._counts.replace, change.program.counters)
                 last_first.callback(self._close_unfinished)
@@ -239,7 +240,7 @@ class Runtime:
         for name in _users_of_topics(program).get(topic, ()):
             self._counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
 
-    # the end
+    # stopping
 
     def _stop_gateways(self) -> None:
         if self.gateways is not None:
@@ -269,7 +270,7 @@ def _needs_ros(program: Program) -> bool:
 
 
 def _check_ros_arguments(program: Program, ros_args: Sequence[str]) -> None:
-    """Check the arguments. Raises StartError. Without arguments, ROS is not loaded, which would take a while."""
+    """Check the arguments. Loads ROS, which takes a while, only if there are any. Raises StartError."""
     if len(ros_args) > 1:
         try:
             from router.ros.node import check_arguments
@@ -297,7 +298,7 @@ def _missing_ros(program: Program, error: ImportError) -> StartError:
 
 
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
-    """The position in the table of each topic, by ROS name."""
+    """Return the position in the table of each topic, by ROS name."""
     table = program.table
     spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.all_topics}
     for gateway in table.gateways.values():
@@ -309,7 +310,7 @@ def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
 
 
 def _users_of_topics(program: Program) -> Mapping[str, Sequence[str]]:
-    """The routes and gateways that name each topic, by ROS name."""
+    """Return the routes and gateways that name each topic, by ROS name."""
     names: dict[str, list[str]] = {}
     for route in program.table.routes:
         for topic in route.all_topics:

@@ -24,7 +24,7 @@ class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
     `moves` are new sockets for senders that stay, each with the listener whose port it uses. `opened` closes the
-    sockets opened for the change; `left` closes, once it is applied, the sockets that it does not use.
+    sockets opened for the change. Once the change is applied, `left` closes the sockets that it does not use.
     """
 
     program: Program
@@ -75,7 +75,7 @@ _Destination = tuple[Address, model.EndpointKind]
 
 
 def _destination(endpoint: model.Endpoint) -> _Destination:
-    """The settings of an endpoint that its sender depends on."""
+    """Return the settings of an endpoint that its sender depends on."""
     return endpoint.address.value, endpoint.kind
 
 
@@ -87,7 +87,7 @@ class KernelDrops:
         self._before: dict[str, int] = {}
 
     def follow(self, name: str, dropped: Callable[[], int], *, since: int = 0) -> None:
-        """Count for `name` what `dropped` returns for its socket beyond `since`."""
+        """Count the drops of a socket for `name`: the result of `dropped`, minus `since`."""
         self.leave(name)
         self._now[name] = dropped, since
 
@@ -107,7 +107,7 @@ class KernelDrops:
 class Sockets:
     """Open listeners by name, and senders by endpoint; none before the first change is applied.
 
-    `library` is the carrier's, which sends.
+    `library` is that of the carrier, which sends.
     """
 
     def __init__(self, drops: KernelDrops, library: ctypes.CDLL) -> None:
@@ -163,12 +163,12 @@ class Sockets:
             return SocketChange(program, listeners, senders, moves, opening.pop_all())
 
     def _sending_ports(self) -> set[int]:
-        """The ports that a listener and a sender share."""
+        """Return the ports that a listener and a sender share."""
         senders = [sender for _, sender in self._senders.values()]
         return {sender.source.address[1] for sender in senders if sender.source is not None and sender.is_bound}
 
     def left(self, change: SocketChange) -> list[Listener]:
-        """The listeners that the change does not use."""
+        """Return the listeners that the change does not use."""
         return [each for each in self._bound.values() if each not in change.listeners.values()]
 
     def apply(self, change: SocketChange) -> None:

@@ -16,7 +16,7 @@ from router.threads import Thread
 from router.types.proto_files import walk
 
 PERIOD = 0.5
-"""Seconds between two checks. A reload waits until two checks in a row find the same: editors write in pieces."""
+"""Seconds between two checks. A reload waits until two checks in a row see the same files: editors write in pieces."""
 
 UNCHANGED_TIMEOUT = 5.0
 """Seconds for which a reload waits for files that are being written."""
@@ -53,7 +53,7 @@ class Watcher:
                 logger.info("files of the table have changed; reloading")
                 self._changed()
                 self._handled = now
-                after = self._snapshot() or now  # of other files, if the reloaded table names others
+                after = self._snapshot() or now  # possibly of other files than before the reload
                 if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
                     self._handled = after
                 before = after
@@ -61,7 +61,7 @@ class Watcher:
                 before = now
 
     def _snapshot(self) -> _Snapshot | None:
-        """The state of the files, or None on an error."""
+        """Return the state of the files, or None on an error."""
         try:
             return _snapshot(self._files())
         except OSError:
@@ -71,7 +71,7 @@ class Watcher:
 class InterfaceWatcher:
     """Checks once a second whether `listeners` have their addresses and network interfaces.
 
-    After a tunnel or an adapter was removed and is back, a socket stays bound to the old interface and receives
+    After a tunnel or an adapter was removed and has come back, a socket stays bound to the old interface and receives
     nothing; a waiting socket was never bound. `reopen` is called in the watcher's thread until both receive. A socket
     whose address is gone receives again when the address comes back. `close` does not wait.
     """
@@ -101,7 +101,7 @@ class InterfaceWatcher:
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """The table, the tables that it extends, Zenoh configurations, the lock file, and all files beside its protos."""
+    """Return the table, the tables it extends, Zenoh configurations, the lock file, and all files beside its protos."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
     protos: Iterable[Path] = ()
@@ -113,7 +113,7 @@ def watched_files(table: RouteTable) -> list[Path]:
 
 
 def wait_until_unchanged(files: Iterable[Path], until: int) -> bool:
-    """Wait until no file was written within the last PERIOD. Return whether one was when called.
+    """Wait until no file was written within the last PERIOD. Return whether there was such a file.
 
     `until` is in ns of the monotonic clock; raises StartError if files are still written then.
     """

@@ -24,7 +24,7 @@ class Arrays:
     _kept: list[object] = field(default_factory=list)
 
     def add(self, made: T) -> T:
-        """Own a structure or an array."""
+        """Take ownership of a structure or an array, and return it."""
         self.blocks.append(made)
         return made
 
@@ -41,7 +41,7 @@ class Arrays:
         self._kept += others
 
     def include(self, others: Arrays) -> None:
-        """Own everything that others own."""
+        """Share the ownership of everything that `others` owns."""
         self.blocks += others.blocks
         self.references += others.references
         self._kept += others._kept

@@ -29,13 +29,13 @@ class NativeBoards:
             self._boards[name] = self.arrays.add(board)
 
     def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
-        """The limits of an endpoint; None if it is not a board."""
+        """Return the limits of an endpoint; None if it is not a board."""
         board = self._boards.get(endpoint)
         return ctypes.pointer(board) if board is not None else None
 
 
 class _Tree:
-    """The flattened message tree of an envelope: each place has an index and a range of counters."""
+    """The flattened message tree of an envelope: each message in it has an index and a range of counters."""
 
     def __init__(self, envelope: BoardMessage, arrays: Arrays) -> None:
         self._messages: list[c.BoardMessage] = []

@@ -50,7 +50,7 @@ class BuildError(Exception):
 
 
 def sources() -> list[Path]:
-    """The files to compile."""
+    """Return the files to compile."""
     return sorted(NATIVE.glob("*.c"))
 
 
@@ -69,7 +69,7 @@ def _prefixes() -> list[str]:
 
 
 def checksum() -> str:
-    """The SHA-256 of everything that determines the library: processor, sources, headers, and the build scripts.
+    """Return the SHA-256 of everything that determines the library: processor, sources, headers, and the build scripts.
 
     `carrier_checksum` returns it, and `router.declared` contains it.
     """
@@ -81,13 +81,13 @@ def checksum() -> str:
 
 
 def is_current(library: Path = LIBRARY) -> bool:
-    """Whether the library was built from the present files. Does not load it."""
+    """Return whether the library was built from the present files. Does not load it."""
     current = checksum().encode()
     return all(made.exists() and current in made.read_bytes() for made in (library, declared_by(library)))
 
 
 def declared_by(library: Path) -> Path:
-    """The Python module that is generated together with a library."""
+    """Return the Python module that is generated together with a library."""
     return DECLARED if library == LIBRARY else library.with_name(DECLARED.name)
 
 
@@ -107,7 +107,7 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 
 
 def _declare(library: Path, folder: Path) -> Path:
-    """Generate the module of a library. Return a C file in `folder` that checks at compile time that it is right."""
+    """Generate the module of a library. Return a C file in `folder` that checks the module at compile time."""
     from router.carrier.headers import HeaderError, checks, declarations
 
     made = folder / DECLARED.name

@@ -71,7 +71,7 @@ class ClientDeadmen(NativeThread):
     def kept(
         self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
     ) -> ClientDeadman:
-        """The deadman of a topic, shared by programs that have it with the same publisher. Raises MemoryError."""
+        """Return the deadman of a topic. Programs with the same plan and publisher share it. Raises MemoryError."""
         topics = [topic for topic, _ in plan.datagrams]
         used = [publications[topic] for topic in topics]
         return state.open(
@@ -85,7 +85,7 @@ class ClientDeadmen(NativeThread):
         )
 
     def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
-        """Replace the deadmen of one program with those of the next, which has that generation. By name.
+        """Replace the deadmen of one program with those of the next, of that generation; both are by name.
 
         A deadman with changed settings inherits the state of the earlier one.
         """
@@ -104,7 +104,7 @@ class ClientDeadmen(NativeThread):
         return False
 
     def stalled(self) -> tuple[str, float] | None:
-        """The topic on which the thread is publishing now, and for how many seconds; None if there is none."""
+        """Return the topic on which the thread is publishing now, and for how many seconds; None if there is none."""
         topic = ctypes.c_uint32()
         since = self._library.client_deadmen_since(self._address, ctypes.byref(topic))
         return (self._names.name(topic.value), (monotonic_ns() - since) / 1e9) if since else None

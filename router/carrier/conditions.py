@@ -21,9 +21,9 @@ class NativeCondition:
         self._holds = library.condition_holds
 
     def holds(self, payload: bytes, source: str, received_at: int) -> bool | None:
-        """Whether it holds for a payload from `source`, received then (wall clock, ns); None if it has no value.
+        """Return whether the condition holds for a payload from `source`; None if it has no value.
 
-        Raises MemoryError.
+        `received_at` is wall-clock time in ns. Raises MemoryError.
         """
         named = Arrays()
         sender, holds = native_values([source.encode()], named), ctypes.c_bool()

@@ -63,7 +63,7 @@ class DeadmanGroup:
     def kept(
         self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
     ) -> NativeDeadman:
-        """The deadman of a route, shared by programs that have it with the same senders. Raises MemoryError."""
+        """Return the deadman of a route. Programs with the same plan and senders share it. Raises MemoryError."""
         endpoints = [endpoint for endpoint, _ in plan.datagrams]
         used = [senders[endpoint] for endpoint in endpoints]
         return state.open(
@@ -93,7 +93,7 @@ class Deadmen(NativeThread, DeadmanGroup):
 
 
 def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
-    """Pairs of a deadman that replaces one of an earlier program, and that one, matched by route."""
+    """Return pairs of a deadman and the one of an earlier program that it replaces, matched by route."""
     pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
     for each, earlier in pairs:
         each.succeeds(earlier)
@@ -101,7 +101,7 @@ def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[
 
 
 def settings(plan: DeadmanPlan, counters: Counters, names: Names) -> tuple[int, int, bool, int, int, int]:
-    """The arguments of `deadman_open` between the group and the destinations."""
+    """Return the arguments of `deadman_open` between the group and the destinations."""
     active, trips = counters.index("deadman_active", plan.route), counters.index("deadman_trips", plan.route)
     return plan.timeout, plan.repeat, plan.at_start, active, trips, names.number(plan.route)
 
@@ -109,7 +109,7 @@ def settings(plan: DeadmanPlan, counters: Counters, names: Names) -> tuple[int, 
 def destinations_of(
     plan: DeadmanPlan, counters: Counters, names: Names, outlets: Iterable[Addressed], kind: str = "sender"
 ) -> tuple[ctypes.Array[c.DeadmanDestination], int]:
-    """The payloads of a deadman for its outlets, senders or publishers (`kind`), as an argument of `deadman_open`."""
+    """Return the payloads of a deadman for its senders or publishers (`kind`), as arguments of `deadman_open`."""
     made = [
         c.DeadmanDestination(
             datagram=datagram,

@@ -23,9 +23,10 @@ class Adoption:
 def timer_change(
     now: Collection[Adoption], before: Iterable[Adoption] = (), ended: Iterable[int] = ()
 ) -> c.TimerChange:
-    """The changes of timers at a reload. Timers that only the earlier program had end first, then those in `ended`.
+    """Return the changes of timers at a reload.
 
-    A pacer ends before its deferrals, and deadmen end last.
+    Timers that only the earlier program had end first, then those in `ended`. A pacer ends before its deferrals, and
+    deadmen end last.
     """
     adopted = [
         c.Adoption(timer=_at(c.Timer, each.timer), to=_at(c.Targets, each.targets), target=_at(c.Target, each.target))

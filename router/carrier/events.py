@@ -30,7 +30,7 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A loss, and the counter of such losses."""
+    """A loss or a rejection, and the counter of its kind."""
 
     counter: int
     report: Report

@@ -40,12 +40,12 @@ class Forwarding:
         self.carrier = Carrier(library, self.deadmen.address, *counts_and_events(library, counters), self.published)
 
     def mirror(self, lost: int | None) -> None:
-        """Mirror received datagrams from now on; `lost` counts those that found the ring full. None: stop."""
+        """Mirror received datagrams from now on; `lost` counts those that the full ring drops. None: stop."""
         self.carrier.mirror(None if lost is None else self.mirrored, lost or 0)
 
 
 def counts_and_events(library: ctypes.CDLL, counters: int) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:
-    """Counters and an event ring for a native thread. Raises MemoryError.
+    """Return counters and an event ring for a native thread. Raises MemoryError.
 
     The counters never move, and use memory only where something is counted.
     """

@@ -200,7 +200,7 @@ def _served(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _S
 
 
 def forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
-    """Drop messages of new subscriptions that the replaced ones have also received, and serve."""
+    """Drop messages of new subscriptions that the replaced ones have also received and will serve."""
     replacing = [each for topic, each in later.items() if earlier.get(topic, each) is not each]
     for subscription in replacing:
         subscription.take_all()

@@ -73,7 +73,7 @@ class _Declared:
 
 
 def declarations(folder: Path, checksum: str) -> str:
-    """The text of the module. Raises HeaderError."""
+    """Return the text of the module. Raises HeaderError."""
     declared = _Declared(values=dict(_LIMITS))
     for statement in _statements(folder, declared):
         _declare(statement, declared)
@@ -81,7 +81,7 @@ def declarations(folder: Path, checksum: str) -> str:
 
 
 def checks(folder: Path, made: ModuleType) -> str:
-    """C that compiles only if the structures and enumerators of a module equal those of the headers."""
+    """Return C that compiles only if the structures and enumerators of a module match those of the headers."""
     lines = [f'#include "{path.name}"' for path in sorted(folder.glob("*.h"))]
     for tag, structure in made.STRUCTURES.items():
         lines.append(_asserted(f"sizeof(struct {tag})", ctypes.sizeof(structure)))
@@ -94,7 +94,7 @@ def checks(folder: Path, made: ModuleType) -> str:
 
 
 def _names(structure: type[ctypes.Structure | ctypes.Union]) -> Iterator[str]:
-    """Its fields, including those of its unions."""
+    """Yield the names of a structure's fields, including those of its unions."""
     unions = getattr(structure, "_anonymous_", ())
     for name, kind, *_ in structure._fields_:
         if name in unions:
@@ -112,7 +112,7 @@ def _asserted(what: str, value: int) -> str:
 
 
 def _statements(folder: Path, declared: _Declared) -> Iterator[str]:
-    """The declarations of all headers, included ones first, without function definitions."""
+    """Yield the declarations of all headers, included ones first, without function definitions."""
     done: set[str] = set()
 
     def read(name: str) -> Iterator[str]:
@@ -132,7 +132,7 @@ def _statements(folder: Path, declared: _Declared) -> Iterator[str]:
 
 
 def _split(text: str, end: str = ";") -> Iterator[str]:
-    """The pieces that end with `end` outside of braces and parentheses. Function definitions are left out."""
+    """Yield the pieces that end with `end` outside of braces and parentheses. Function definitions are left out."""
     depth, begin = 0, 0
     for at, character in enumerate(text):
         if character in "{(":
@@ -184,7 +184,7 @@ def _declare_enum(tag: str, body: str, declared: _Declared) -> None:
 
 
 def _members(body: str) -> list[_Member] | None:
-    """The members; None if one has a type that ctypes lacks, for example a function pointer or an atomic."""
+    """Return the members; None if one has a type that ctypes lacks, for example a function pointer or an atomic."""
     made: list[_Member] = []
     for text in _split(body):
         if text.startswith("union {"):
@@ -210,7 +210,7 @@ def _plain(text: str) -> str:
 
 
 def _function(statement: str) -> Iterator[tuple[str, tuple[str, str]]]:
-    """The function's name and ctypes signature, unless Python cannot call it."""
+    """Yield the function's name and ctypes signature, unless Python cannot call it."""
     head, _, taken = statement.partition("(")
     returned, name = re.fullmatch(r"(.*?)(\w+)", _plain(head)).groups()  # type: ignore[union-attr]
     parameters = [each for each in map(_plain, _split(_inside_parentheses(taken), ",")) if each != "void"]
@@ -225,7 +225,7 @@ def _inside_parentheses(text: str) -> str:
 
 
 def _passed(declared: str) -> str:
-    """The ctypes type of a parameter, '' if there is none. Any pointer may be an address, bytes or an array."""
+    """Return the ctypes type of a parameter, '' if there is none. Any pointer may be an address, bytes or an array."""
     declared = declared.strip()
     if "*" in declared:
         return "ctypes.c_void_p"
@@ -281,7 +281,7 @@ def _enums(enums: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
 
 
 def _known(structures: Mapping[str, list[_Member]]) -> Iterator[tuple[str, list[_Member]]]:
-    """The structures of which Python knows all members; others are used only through pointers."""
+    """Yield the structures of which Python knows all members; others are used only through pointers."""
     known: set[str] = set()
 
     def is_known(member: _Member) -> bool:
@@ -312,7 +312,7 @@ def _fields(owner: str, members: Iterable[_Member], known: Mapping[str, object])
 
 
 def _held(member: _Member, known: Mapping[str, object]) -> str:
-    """The type of a field."""
+    """Return the type of a field."""
     tag = member.type.removeprefix("struct ")
     plain = _PLAIN.get(member.type) or ("ctypes.c_int" if member.type.startswith("enum ") else "")
     if member.pointers > 1:

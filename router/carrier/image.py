@@ -107,7 +107,7 @@ class _Symbol:
 
 
 class _Publication:
-    """As `ros.endpoints.Publication`. The head start provides the byte `wanted`."""
+    """Stands for `ros.endpoints.Publication`. The head start provides the byte `wanted`."""
 
     def __init__(self, symbols: _Symbols, topic: str) -> None:
         self.address = symbols.address("publisher", topic)
@@ -115,7 +115,7 @@ class _Publication:
 
 
 _LISTENER = SimpleNamespace(is_inherited=False, socket=SimpleNamespace(fileno=lambda: -1))
-"""As `net.udp.Listener`: the head start fills in the socket."""
+"""Stands for `net.udp.Listener`: the head start fills in the socket."""
 
 
 class _Recorder(State):
@@ -138,7 +138,7 @@ class _Recorder(State):
 
 
 def _plain(argument: object) -> object:
-    """An argument for the head start: (number,) of a symbol, a list of a deadman's destinations, or the value."""
+    """Return an argument for the head start: (number,) for a symbol, a list for deadman destinations, or the value."""
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), ctypes.string_at(_address_in(each, "datagram"), each.size), each.sent,
@@ -151,7 +151,7 @@ def _plain(argument: object) -> object:
 
 
 def _address_in(structure: Any, field: str) -> int:
-    """The address in a pointer field of a structure."""
+    """Return the address in a pointer field of a structure."""
     return ctypes.c_uint64.from_buffer(structure, getattr(type(structure), field).offset).value
 
 
@@ -171,7 +171,7 @@ class _Memory:
         self._ends = {ctypes.addressof(block): ctypes.addressof(block) + ctypes.sizeof(block) for block in self._blocks}
 
     def offset(self, address: int) -> int:
-        """The offset in the image of an address in a block. Raises LookupError if it is in no block."""
+        """Return the offset in the image of an address in a block. Raises LookupError if it is in no block."""
         if address in self._offsets:
             return self._offsets[address]
         before = self._addresses[bisect_right(self._addresses, address) - 1]
@@ -180,12 +180,12 @@ class _Memory:
         return self._offsets[before] + address - before
 
     def adoption(self, adoption: Adoption) -> tuple[int, bool, int | None, int | None]:
-        """The symbol of a timer, whether it is for a topic, and the offsets of its targets."""
+        """Return the symbol of a timer, whether it is for a topic, and the offsets of its targets."""
         to, target = (None if each is None else self.offset(each) for each in (adoption.targets, adoption.target))
         return adoption.timer - _FIRST, adoption.is_topic, to, target
 
     def image(self) -> tuple[bytes, list[int], list[tuple[int, int]]]:
-        """The bytes; the places of words that hold offsets; and the places of symbols, each with its number."""
+        """Return the bytes; the places of words that hold offsets; and the places of symbols, each with its number."""
         image = bytearray(self._size)
         relocations, imports = [], []
         for block in self._blocks:
@@ -205,7 +205,7 @@ class _Memory:
         return bytes(image), relocations, imports
 
     def _pointers(self, block: Any, address: int) -> Iterator[int]:
-        """The offsets of pointers in a block."""
+        """Yield the offsets of pointers in a block."""
         for at, is_certain in _pointers_in(cast("Hashable", type(block))):
             if is_certain or address + at in self._references:
                 yield at
@@ -213,7 +213,7 @@ class _Memory:
 
 @cache
 def _pointers_in(kind: Any) -> tuple[tuple[int, bool], ...]:
-    """The offsets of pointers in a C type, each with whether it always is one: a `struct value` may hold a number."""
+    """Return the offsets of pointers in a C type. False marks one that may hold a number, as in a `struct value`."""
     if issubclass(kind, ctypes.Array):
         size, within = ctypes.sizeof(kind._type_), _pointers_in(kind._type_)
         return tuple(

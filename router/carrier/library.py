@@ -27,7 +27,7 @@ LIBRARY = f"{NATIVE}/libcarrier.so"
 
 @cache
 def library() -> ctypes.CDLL:
-    """The library, loaded once. Raises StartError if it cannot be used."""
+    """Return the library, loaded once. Raises StartError if it cannot be used."""
     return load()
 
 
@@ -56,7 +56,7 @@ def _text(function: ctypes._NamedFuncPointer) -> str:
 
 
 def _changes() -> Iterator[int]:
-    """The modification times of the sources, as reading all sources takes longer than the rest of a start."""
+    """Yield the modification times of the sources, as reading all sources takes longer than the rest of a start."""
     for folder, endings in (NATIVE, (".c", ".h")), (_CARRIER, ("build.py", "headers.py")):
         with os.scandir(folder) as files:
             yield from (file.stat().st_mtime_ns for file in files if file.name.endswith(endings))

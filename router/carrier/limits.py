@@ -21,7 +21,7 @@ class Born(NamedTuple):
 
 
 class Freshness:
-    """`struct freshness`: tracks the jumps of the wall clock. For one thread."""
+    """`struct freshness`: tracks the jumps of the wall clock. Not thread-safe."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._structure = c.Freshness()
@@ -39,7 +39,7 @@ class Freshness:
 
 
 class RateLimit:
-    """`struct limit`, open for one thread at a time: passes at most `hertz` messages per second."""
+    """`struct limit`, for one thread at a time: passes at most `hertz` messages per second."""
 
     def __init__(self, library: ctypes.CDLL, hertz: float) -> None:
         self._at = opened(library, "limit_open", period(hertz))
@@ -55,5 +55,5 @@ class RateLimit:
 
 
 def period(hertz: float) -> int:
-    """The time between two messages at `max_rate`, in ns."""
+    """Return the time between two messages at `max_rate`, in ns."""
     return ceil(_NS / hertz)

@@ -38,7 +38,7 @@ class Routines:
         return c.Routine(operations=made, count=len(routine))
 
     def layout(self) -> Any:
-        """A pointer to the layout. Call it once all routines are made, as it contains their literals."""
+        """Return a pointer to the layout. Call it once all routines are made, as it contains their literals."""
         layout = self._layout
         sections = [self._section(section) for section in layout.sections]
         closed = [self._closed(numbers) for numbers in layout.closed]
@@ -72,7 +72,7 @@ def _native_read(read: WantedField | ReadOperation) -> c.WantedField | c.ReadOpe
 
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) -> Any:
-    """The contents of slots; None is an empty list."""
+    """Return the contents of slots; None is an empty list."""
     made = arrays.add((c.Value * len(values))())
     for to, value in zip(made, values, strict=True):
         if isinstance(value, bytes):

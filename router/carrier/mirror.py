@@ -23,7 +23,7 @@ class MirrorRing:
         self._name = names.name
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
-        """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. For one thread."""
+        """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. Not thread-safe."""
         taken: list[tuple[int, str, Peer, str, str, bytes]] = []
         while records := self.ring.take():
             position = 0

@@ -24,5 +24,5 @@ class Names:
         return self._names[number]
 
     def all(self) -> list[str]:
-        """All names, by number."""
+        """Return all names, by number."""
         return [*self._names]

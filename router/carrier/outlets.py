@@ -52,18 +52,18 @@ class Outlets:
     boards: NativeBoards | None = None
 
     def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
-        """The deadmen that commands of the route feed (its own) or disarm."""
+        """Return the deadmen that commands of the route feed (its own) or disarm."""
         return [c.Feed(deadman=self.deadmen[name].address, disarms=name != plan.route) for name in target.deadmen]
 
     def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
-        """The limit of a target with `max_rate` for one source of its route."""
+        """Return the limit of a target with `max_rate` for one source of its route."""
         rate = target.max_rate
         assert rate is not None  # noqa: S101 - checked by the caller
         place = "limit", plan.route, plan.topic, source, target.label
         return self.state.open(place, target, self._native("limit"), "limit_open", period(rate))
 
     def pacers(self) -> list[Adoption]:
-        """The pacers of all endpoints with a bandwidth."""
+        """Return the pacers of all endpoints with a bandwidth."""
         return [Adoption(self._pacer(endpoint).address) for endpoint in self.bandwidths]
 
     def _pacer(self, endpoint: str) -> Native:
@@ -76,7 +76,7 @@ class Outlets:
         return lambda address: Native(getattr(self.library, f"{kind}_close"), address, keep)
 
     def deferral(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
-        """The deferral that holds back the messages of one source for a target, for the same sender or publisher."""
+        """Return the deferral that holds back one source's messages for a target, and for one sender or publisher."""
         pacer = self._pacer(target.label) if not target.is_topic and target.label in self.bandwidths else None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
         place = "deferral", plan.route, plan.topic, source, target.label
@@ -84,7 +84,7 @@ class Outlets:
         return self.state.open(place, destination, self._native("deferral", pacer), "deferral_open", address)
 
     def collector(self, plan: RoutePlan) -> Native:
-        """The collector that makes frames of the route's payload for its topics."""
+        """Return the collector that makes frames of the route's payload for its topics."""
         timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
         assert timeout is not None  # noqa: S101 - checked by the caller
         rest = timeout, plan.case.message_class, targets

@@ -60,7 +60,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
 def change_to(
     program: NativeProgram, timers: c.TimerChange, deadmen: Sequence[tuple[NativeDeadman, NativeDeadman]] = ()
 ) -> c.Change:
-    """The change for the receive thread. `deadmen` are pairs of a deadman and the earlier one that it replaces."""
+    """Return the change for the receive thread. `deadmen` are pairs of a deadman and the one that it replaces."""
     addresses = [deadman.address for pair in deadmen for deadman in pair]
     return c.Change(
         program=ctypes.pointer(program.structure),
@@ -123,7 +123,7 @@ class _Writer:
         )
 
     def _peers(self, listener: str) -> Iterator[c.Peer]:
-        """The peers by address; those with a port come first, as they have priority."""
+        """Yield the peers by address; those with a port come first, as they have priority."""
         by_host, by_address = recognisers(self.program.table.endpoints, listener)
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
@@ -133,7 +133,7 @@ class _Writer:
             yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen, id=number)
 
     def _choices(self) -> Iterator[c.Choice]:
-        """The choices row by row, as in `cases`: a column for each endpoint, and a last one for unknown senders."""
+        """Yield the choices by row, as in `cases`: a column for each endpoint, and a last one for unknown senders."""
         for plans in self.program.inbound.values():
             by_source = {source: plan for plan in plans for source in plan.sources}
             stranger = self._choice(by_source.get(STRANGER), STRANGER)

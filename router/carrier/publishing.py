@@ -32,7 +32,7 @@ class PublishThread(NativeThread):
     def start(self, functions: tuple[int, int, int], first: c.PublishChange | None = None) -> None:
         """Start the thread if it is not running. `functions` are the addresses in `ros.rcl.PublishFunctions`.
 
-        `first` is a change whose messages are already waiting; it belongs to the caller until its generation has
+        `first` is a change whose messages are already waiting; the caller keeps it alive until its generation has
         passed. Raises StartError if memory, descriptors or threads run out.
         """
         if self._address:
@@ -51,14 +51,14 @@ class PublishThread(NativeThread):
     def change(self, change: c.PublishChange) -> None:
         """Change timers when the generation is reached. Call it before the first message of that generation.
 
-        The change belongs to the caller until then.
+        The caller keeps the change alive until then.
         """
         with self._in_use:
             if self._address:
                 self._library.publish_change(self._address, ctypes.byref(change))
 
     def advance(self, generation: int) -> None:
-        """Go on to that generation once all earlier messages are handled. No more of them may be added."""
+        """Switch to that generation once all earlier messages are handled. No more earlier ones may be added."""
         with self._in_use:
             if self._address:
                 self._library.publish_advance(self._address, generation)
@@ -73,7 +73,7 @@ class PublishThread(NativeThread):
         return False
 
     def stalled(self) -> tuple[str, float] | None:
-        """The topic on which the thread is publishing now, and for how many seconds; None if there is none."""
+        """Return the topic on which the thread is publishing now, and for how many seconds; None if there is none."""
         topic = ctypes.c_uint32()
         with self._in_use:
             since = self._library.publish_since(self._address, ctypes.byref(topic)) if self._address else 0

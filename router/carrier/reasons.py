@@ -48,7 +48,7 @@ def why_refused(refusal: NativeRefusal, text: bytes) -> str:
 
 
 def _integers(refusal: NativeRefusal) -> list[int]:
-    """The values; the flags say which are unsigned."""
+    """Return the values; the flags say which are unsigned."""
     signs = Sign.FIRST_UNSIGNED, Sign.SECOND_UNSIGNED, Sign.THIRD_UNSIGNED
     values: list[int] = list(refusal.values)
     return [value % (1 << 64) if refusal.flags & sign else value for sign, value in zip(signs, values, strict=True)]

@@ -44,7 +44,7 @@ class Counted(NamedTuple):
 
 
 class Left(NamedTuple):
-    """A datagram for an endpoint, or a message for a topic; its counter follows."""
+    """A datagram for an endpoint, or a message for a topic; the next record counts it."""
 
     target: str
     data: bytes
@@ -71,7 +71,7 @@ class Stage:
         finalize(self, self._opened.close)
 
     def counters(self, count: int) -> list[int]:
-        """The first counters."""
+        """Return the first `count` counters."""
         return self._opened.counters[:count]
 
     def adopt(self, program: Program) -> None:
@@ -120,7 +120,7 @@ class Stage:
         self.now = max(self.now, to)
 
     def set_clock(self, ahead: int) -> None:
-        """Set the wall clock."""
+        """Set how far the wall clock is ahead of the boot clock."""
         self._library.rehearsal_set_clock(self._opened.address, ahead)
 
     def end(self) -> None:
@@ -128,7 +128,7 @@ class Stage:
         self._library.rehearsal_end(self._opened.address)
 
     def records(self) -> Iterator[Record]:
-        """The records since the last call. Raises MemoryError."""
+        """Yield the records since the last call. Raises MemoryError."""
         size = ctypes.c_size_t()
         address = self._library.rehearsal_records(self._opened.address, ctypes.byref(size))
         if size.value and not address:
@@ -161,7 +161,7 @@ class Stage:
         return why_rejected(self._in_use.program, listener, data, length)
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
-        """The place in the table; "" for messages held since an earlier program."""
+        """Return the place in the table; "" for messages held since an earlier program."""
         is_current = generation == self._generation
         return where_refused(self._in_use.program.lowered, route, topic, target, place) if is_current else ""
 
@@ -249,14 +249,14 @@ class _Sender:
 
 
 class _Listener:
-    """A listener without a socket, as `net.udp.Listener`."""
+    """A listener without a socket. Stands for `net.udp.Listener`."""
 
     is_inherited = False
     socket = SimpleNamespace(fileno=lambda: -1)
 
 
 class _Publication:
-    """A topic with a subscriber, as `ros.endpoints.Publication`."""
+    """A topic with a subscriber. Stands for `ros.endpoints.Publication`."""
 
     def __init__(self) -> None:
         self.address = 0
@@ -315,7 +315,7 @@ class _Running:
             states.release()
 
     def timers(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
-        """The changes of timers for topics or for endpoints; timers in `ended` also end."""
+        """Return the changes of timers for topics or for endpoints; timers in `ended` also end."""
         now, before = (
             [each for each in adopted if each.is_topic is of_topics]
             for adopted in (self.adopted, earlier.adopted if earlier else ())

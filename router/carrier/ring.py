@@ -19,14 +19,12 @@ class Ring:
         self.address: int = library.ring_open(capacity)
         if not self.address:
             raise MemoryError("a queue of the carrier cannot be opened")
-        pages = mmap(
-            -1, max(1 << 16, 2 * LONGEST_RECORD), flags=MAP_PRIVATE
-        )  # mapped memory is used once a record arrives
+        pages = mmap(-1, max(1 << 16, 2 * LONGEST_RECORD), flags=MAP_PRIVATE)  # uses no memory until a record arrives
         self._records = (ctypes.c_char * len(pages)).from_buffer(pages)
         self._view = memoryview(self._records).cast("B")
 
     def take(self) -> memoryview:
-        """Return whole records, the oldest first, valid until the next call. For one thread."""
+        """Return whole records, the oldest first, valid until the next call. Not thread-safe."""
         size = self._library.ring_take(self.address, self._records, len(self._records), 0)
         return self._view[:size]
 

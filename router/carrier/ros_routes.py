@@ -46,7 +46,7 @@ class NativeFromRos:
     subscriptions: Mapping[str, Subscription] = field(default_factory=dict)
 
     def only(self, *, urgent: bool) -> NativeFromRos:
-        """The part for the thread of urgent messages, or for the other thread."""
+        """Return the part for the thread of urgent messages, or for the other thread."""
         return self.without({topic for topic in self.topics if (topic in self.urgent) is not urgent})
 
     def without(self, topics: Container[str]) -> NativeFromRos:
@@ -93,7 +93,7 @@ def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRou
 
 
 def native_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
-    """`for_each` of a route; empty without it."""
+    """Make the `for_each` of a route; empty if it has none."""
     if elements is None:
         return c.ForEach()
     return c.ForEach(

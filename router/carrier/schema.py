@@ -1,4 +1,4 @@
-"""An envelope's message types as the arrays that `envelope_read` parses by."""
+"""The message types of an envelope, as arrays for `envelope_read`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, 
 
 
 def wire_kind(field: FieldDescriptor) -> WireKind:
-    """The encoding of a field; of a repeated one, that of a single element."""
+    """Return the encoding of a field; of a repeated one, that of a single element."""
     return _BY_TYPE.get(field.type) or _BY_WIRE_TYPE[encoding_of(field).wire_type]
 
 

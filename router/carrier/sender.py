@@ -40,7 +40,7 @@ class NativeSender:
         return left
 
     def is_placed(self, source: ListeningSocket | None, listening: Collection[ListeningSocket]) -> bool:
-        """Whether a newly opened socket would have the same source address and port."""
+        """Return whether a newly opened socket would have the same source address and port."""
         if self.source is not source or source is None or not self.is_bound:
             return self.source is source
         return self.leaves_from == address_beside(source, listening)[0]

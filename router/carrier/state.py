@@ -36,7 +36,7 @@ class State:
         return self._kept[key]  # type: ignore[return-value]  # the key says what it is
 
     def open(self, place: Place, rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object) -> T:
-        """As `keep`, for an object that a library function opens; `wrap` gets its address. Raises MemoryError.
+        """Keep an object that a library function opens; `wrap` gets its address. Raises MemoryError.
 
         `place` identifies the object within its program; the key is `place` with `rest`.
         """

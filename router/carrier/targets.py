@@ -102,7 +102,7 @@ class TargetWriter:
     _sources: Any = None
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
-        """Targets that get datagrams; `lowered` are the routines of targets that have some."""
+        """Make the targets that get datagrams; `lowered` are the routines of targets that have some."""
         if lowered is None:
             return self.targets(plan, targets, {}, None)
         routines = Routines(lowered.layout, self.arrays)
@@ -121,7 +121,7 @@ class TargetWriter:
         lowered: Mapping[str, LoweredTarget],
         routines: Routines | None,
     ) -> c.Targets:
-        """The targets, without their layout."""
+        """Make the targets, without their layout."""
         made = []
         for target in targets:
             native = self._topic_target(target) if target.is_topic else self._destination(target)
@@ -180,19 +180,19 @@ class TargetWriter:
         return {column: sender for column, sender in enumerate(senders) if sender in plan.sources}
 
     def _ids_of_senders(self) -> list[int]:
-        """Numbers of the senders' names, by column."""
+        """Return the numbers of the senders' names, by column."""
         return [self.outlets.names.number(label) for label in self._labels_of_senders()]
 
     def _labels_of_senders(self) -> list[str]:
         return [*self.program.table.endpoints, source_label(STRANGER)]
 
     def _names_of_senders(self) -> Any:
-        """Values with the senders' names, by column."""
+        """Return values with the senders' names, by column."""
         if self._sources is None:
             self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources
 
 
 def _held_period(target: TargetPlan) -> int:
-    """The time between two messages of a target with `on_limit: latest`, in ns; otherwise 0."""
+    """Return the time between two messages of a target with `on_limit: latest`, in ns; otherwise 0."""
     return period(target.max_rate) if target.max_rate is not None and target.on_limit is OnLimit.LATEST else 0

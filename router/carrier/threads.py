@@ -30,7 +30,7 @@ class NativeThread:
         self._address = 0
 
     def counters(self, count: int) -> list[int]:
-        """Return the first counters, as a snapshot between two messages."""
+        """Return the first `count` counters, as a snapshot between two messages."""
         with self._in_use:
             if self._copy is None or not self._address:
                 return self.counts[:count]

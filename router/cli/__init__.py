@@ -146,7 +146,7 @@ def with_help(what: str, hint: str = "") -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb. Return the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for a network fault."""
+    """Run one verb. Return the exit code: the verb's own, or for an error one of those above."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

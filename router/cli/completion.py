@@ -1,6 +1,6 @@
-"""Words from a table that a shell completes: payload cases and fields, endpoints, listeners, gateways and topics.
+"""Shell completion of words from a table: payload cases and fields, endpoints, listeners, gateways and topics.
 
-Most are completed as they are written, without a check of the table. A table that cannot be read gives no words and no
+Most are taken as they are written, without a check of the table. A table that cannot be read gives no words and no
 message: the verb reports the problem.
 """
 
@@ -38,12 +38,12 @@ def completes(action: argparse.Action, words: Words) -> None:
 
 
 def routed(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """The payload cases that the table routes, and its gateways."""
+    """Yield the payload cases that the table routes, and its gateways."""
     yield from _names(args, "routes", "gateways")
 
 
 def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:
-    """The payload cases of the envelope."""
+    """Return the payload cases of the envelope."""
     return _wire(args).envelope.cases
 
 
@@ -52,7 +52,7 @@ def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
 
 
 def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """The endpoints that may send messages."""
+    """Yield the endpoints that may send messages."""
     from router.table.model import EndpointKind
 
     if table := _table(args):
@@ -60,17 +60,17 @@ def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 
 def places(args: argparse.Namespace, _: str = "") -> Iterable[str]:
-    """Places to send datagrams to: listeners and endpoints."""
+    """Return the places to send datagrams to: listeners and endpoints."""
     return _names(args, "listen", "endpoints")
 
 
 def silences(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """`basestation:`, to be followed by seconds."""
+    """Yield each endpoint and route with a colon, to be followed by seconds."""
     yield from (f"{name}:" for name in _names(args, "endpoints", "routes"))
 
 
 def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """The topics of routes and gateways by their full names, as gateways send them."""
+    """Yield the topics of routes and gateways by their full names, as gateways send them."""
     from router.compiler.topics import resolved
 
     if table := _table(args):
@@ -78,7 +78,7 @@ def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 
 def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
-    """Places of `router listen`: the schemes, then names from the table for `envelope://` and `topic://`."""
+    """Return the places of `router listen`: the schemes, then names from the table for `envelope://` and `topic://`."""
     scheme, separator, _ = prefix.partition("://")
     if not separator:
         return [f"{name}://" for name in ("envelope", "topic", "udp", "tcp", "ws", "zenoh")]
@@ -91,7 +91,7 @@ def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
 
 
 def fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
-    """`accel_x=`, `bbox.x=` or `state=NAME` for the payload case given before."""
+    """Return `accel_x=`, `bbox.x=` or `state=NAME` for the payload case given before."""
     case = getattr(args, "case", None) or args.names[0]
     return _assignments(_wire(args).envelope.cases[case].type, prefix)
 
@@ -117,7 +117,7 @@ def _assignments(kind: MessageType, prefix: str) -> Iterator[str]:
 
 
 def _field(kind: MessageType, step: str) -> Field:
-    """Raises LookupError."""
+    """Return a field. Raises LookupError if it does not exist."""
     name = step.partition("[")[0]
     return {field.name: field for field in kind.fields}[name]
 
@@ -134,7 +134,7 @@ def _topics(table: RouteTable) -> Iterator[str]:
 
 
 def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
-    """The keys in these sections of the table and of the tables that it extends, valid or not."""
+    """Yield the keys in these sections of the table and of the tables that it extends, valid or not."""
     from router.table.extends import load_chain
     from router.table.nodes import MappingNode
 
@@ -144,7 +144,7 @@ def _names(args: argparse.Namespace, *keys: str) -> Iterator[str]:
 
 
 def _table(args: argparse.Namespace) -> RouteTable | None:
-    """The valid part of the table named before, or of the default table."""
+    """Return the valid part of the table named before, or of the default table."""
     from router.table import load_table
 
     path: Path | None = table_if_any(args)
@@ -152,7 +152,10 @@ def _table(args: argparse.Namespace) -> RouteTable | None:
 
 
 def _wire(args: argparse.Namespace) -> Wire:
-    """Like `load_wire`, also for a table with errors elsewhere. Raises TableError, UsageError and FileNotFoundError."""
+    """Load the messages, also from a table with errors elsewhere.
+
+    Raises TableError, UsageError or FileNotFoundError.
+    """
     from router.assets import asset
     from router.datagrams import wire_of_protos, wire_of_table
     from router.table import load_table

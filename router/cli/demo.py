@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from router.log import configure_log
 
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, beside the table
+    os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # the default may be in the installation
     configure_log(coloured=is_coloured(sys.stderr))
     table = _table()
     _, program = good_table(table)

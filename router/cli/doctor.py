@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown(result: CheckResult, *, coloured: bool) -> str:
-    """One line, then the remedy, if there is one, on a second line."""
+    """Return the result on one line, and its remedy, if there is one, on a second line."""
     grade = Paint(coloured)(_STYLES[result.grade.value], f"{result.grade.value:8}")
     text = f"{grade} {result.about:10} {result.text}"
     return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text

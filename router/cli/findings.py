@@ -38,7 +38,7 @@ def severity(finding: Diagnostic, *, strict: bool) -> Severity:
 
 
 def count_line(findings: Sequence[Diagnostic], tables: int, *, strict: bool) -> str:
-    """`2 errors, 1 warning in 1 table`."""
+    """Return `2 errors, 1 warning in 1 table`."""
     errors = sum(severity(finding, strict=strict) is Severity.ERROR for finding in findings)
     counts = [plural(errors, "error")] if errors else []
     if len(findings) > errors:
@@ -62,7 +62,7 @@ def as_github(finding: Diagnostic, *, strict: bool) -> str:
 
 
 def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
-    """The message, the source line with a caret if the file still has it, and the hint."""
+    """Return the message, the source line with a caret if the file still has it, and the hint."""
     level = severity(finding, strict=strict)
     paint, colour = Paint(coloured), RED if level is Severity.ERROR else YELLOW
     head = paint(BOLD, f"{visible(str(finding.span))}: ") + paint(BOLD + colour, f"{level.value}[{finding.code.value}]")
@@ -72,14 +72,14 @@ def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
 
 
 def annotation(level: Severity, span: SourceSpan, title: str, text: str) -> str:
-    """A workflow command that makes GitHub show a text beside a line of a pull request."""
+    """Return a workflow command that makes GitHub show a text beside a line of a pull request."""
     properties = {"file": span.file, "line": span.line, "col": span.column, "endColumn": span.end_column}
     listed = ",".join(f"{name}={_escaped(str(value), ':,')}" for name, value in (properties | {"title": title}).items())
     return f"::{level.value} {listed}::{_escaped(text)}"
 
 
 def place(span: SourceSpan) -> dict[str, str | int]:
-    """A span as JSON. Lines and columns count from 1, `end_column` is exclusive."""
+    """Return a span as JSON. Lines and columns count from 1, `end_column` is exclusive."""
     return {"file": span.file, "line": span.line, "column": span.column, "end_column": span.end_column}
 
 
@@ -98,12 +98,12 @@ def is_coloured(out: TextIO) -> bool:
 
 
 def visible(text: str) -> str:
-    """The text on one line: line ends and control characters as escapes."""
+    """Return the text on one line: line ends and control characters as escapes."""
     return _INVISIBLE.sub(lambda match: repr(match[0])[1:-1], text)
 
 
 def excerpt(span: SourceSpan, paint: Paint, style: str) -> list[str]:
-    """The source line with carets below the span; no lines if the file does not have it."""
+    """Return the source line with carets below the span; no lines if the file does not have it."""
     lines = _lines(span.file)
     text = lines[span.line - 1] if span.line <= len(lines) else ""
     if not text.strip():
@@ -117,7 +117,7 @@ def excerpt(span: SourceSpan, paint: Paint, style: str) -> list[str]:
 
 
 def _window(text: str, column: int) -> tuple[int, str]:
-    """The part of a long line that is shown, after the index of its first character."""
+    """Return the part of a long line that is shown, preceded by the index of its first character."""
     if len(text) <= _LONGEST_LINE:
         return 0, text
     start = max(0, min(column - _LONGEST_LINE // 2, len(text) - _LONGEST_LINE))
@@ -125,7 +125,7 @@ def _window(text: str, column: int) -> tuple[int, str]:
 
 
 def _width(character: str) -> int:
-    """The width of a character in terminal columns; control characters are shown as escapes."""
+    """Return the width of a character in terminal columns; control characters are shown as escapes."""
     if _INVISIBLE.match(character):
         return len(visible(character))
     if unicodedata.combining(character):
@@ -134,7 +134,7 @@ def _width(character: str) -> int:
 
 
 def _lines(file: str) -> tuple[str, ...]:
-    """The lines of a file with a finding; none if the file cannot be read."""
+    """Return the lines of a file with a finding; none if the file cannot be read."""
     path = Path(file)
     try:
         return _read_lines(path.absolute(), path.stat().st_mtime_ns) if path.is_file() else ()
@@ -144,7 +144,7 @@ def _lines(file: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _read_lines(path: Path, changed_at: int) -> tuple[str, ...]:
-    """The lines of a file. `changed_at` (ns) makes the cache read a changed file again."""
+    """Return the lines of a file. `changed_at` (ns) makes the cache read a changed file again."""
     with path.open("rb") as stream:
         data = stream.read(4 << 20)
     return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))

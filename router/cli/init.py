@@ -34,7 +34,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def _rover_parts() -> dict[str, str]:
-    """The files that come with the router. In a wheel, the protos are in the folders that the tables name."""
+    """Return the files that come with the router. In a wheel, the protos are in the folders that the tables name."""
     folder = asset("routes").parent
     if not is_installed(folder):
         return _ROVER

@@ -196,7 +196,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
 
 
 def _printer(as_json: bool) -> Callable[[Heard], None]:
-    """A function that prints a line; on a terminal in colour, and cut to the width."""
+    """Return a function that prints a line; on a terminal in colour, and cut to the width."""
     from router.tools.gateway_messages import json_line, pieces
 
     if as_json:

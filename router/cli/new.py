@@ -92,7 +92,7 @@ def _check(table: Path) -> list[Checked]:
 
 
 def _check_schemas(table: Path) -> None:
-    """Raises UsageError unless the router's ROS messages are those beside the folder of the table."""
+    """Check that the router's ROS messages are those beside the folder of the table. Raises UsageError."""
     from router.assets import asset, is_installed
     from router.errors import UsageError, shown_path
 
@@ -112,7 +112,7 @@ def _site(checked: Checked) -> Site:
 
 
 def _news(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
-    """New findings. They are compared by message, since lines have moved."""
+    """Return the new findings, compared by message, because lines have moved."""
     known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
     found = {finding: None for checked in after for finding in checked.diagnostics}
     return [finding for finding in found if (finding.code, finding.message) not in known]

@@ -11,7 +11,7 @@ from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError
 
 PATIENCE = 60.0
-"""Seconds; compiling a large table takes about one second under heavy traffic."""
+"""Timeout in seconds; compiling a large table takes about one second under heavy traffic."""
 
 _DESCRIPTION = f"""\
 Make a running router read its table again, with all files that the table names. It changes to the new table between two

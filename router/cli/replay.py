@@ -1,4 +1,4 @@
-"""`router replay FILE`: sends a recording again, or `--against NEW` runs it through two tables and compares."""
+"""`router replay FILE`: send a recording again, or with `--against NEW` compare what two tables do with it."""
 
 from __future__ import annotations
 

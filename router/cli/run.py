@@ -101,7 +101,7 @@ def _log(begun: Beginning) -> None:
 
 
 def _checked(begun: Beginning, program: Program, read: inputs.Inputs) -> str:
-    """End a head start of another program than the compiled one. Return how the router starts, as in STARTS."""
+    """Close a head start that differs from the compiled program. Return how the router starts, as in STARTS."""
     from router.carrier.image import image_of
     from router.carrier.library import library
 

@@ -1,6 +1,7 @@
 """`router schema lock`: record the field numbers of the `.proto` files, so that none is ever reused.
 
-It adds new numbers and rejects every other change that is not accepted by name. `router validate` also compares them.
+It adds new numbers and rejects every other change that is not accepted by name. `router validate` reports the same
+changes.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Raises TableError for broken `.proto` files and a broken lock file."""
+    """Write the lock file. Raises TableError for broken `.proto` files or a broken lock file."""
     from router.types.lock import LockComparison
     from router.types.lock_file import read_lock, write_lock
     from router.types.protobuf import find_envelope, load_protos, lock_path
@@ -117,7 +118,7 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
 
 
 def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]:
-    """The conflicts in `found` that `names` refer to. Raises UsageError for a name that fits none or several."""
+    """Return the conflicts in `found` that `names` refer to. Raises UsageError for a name that fits none or several."""
     accepted = [each for name in names for each in _meant(name, found)]
     return [each for each in found if each in accepted]
 
@@ -142,7 +143,7 @@ def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
 
 
 def _summary(old: Lock | None, new: Lock, unbounded: str) -> str:
-    """`unbounded` is the reason why there is no largest envelope, "" if there is one."""
+    """Summarise the lock. `unbounded` says why there is no largest envelope; "" if there is one."""
     added = _numbers(new) - (_numbers(old) if old is not None else set())
     size = f"an envelope takes up to {new.max_size} bytes"
     if unbounded:
@@ -154,6 +155,6 @@ def _summary(old: Lock | None, new: Lock, unbounded: str) -> str:
 
 
 def _numbers(lock: Lock) -> set[tuple[str, int, str]]:
-    """The numbers in use, regardless of the package."""
+    """Return the numbers in use, regardless of the package."""
     declared = (*lock.messages.items(), *lock.enums.items())
     return {(short_name(owner), each.number, each.name) for owner, members in declared for each in members.entries}

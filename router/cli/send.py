@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
-    # Without --count, Ctrl-C stops it, and what was sent is reported.
+    # Without --count, Ctrl-C stops sending; the summary is printed all the same.
     with udp.open_udp(origin, "--from") as sender, until_interrupted():
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))

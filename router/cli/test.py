@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tests_of(path: Path) -> Path:
-    """The test file beside a table; any other path unchanged. Raises UsageError for a good table without one."""
+    """Return the test file beside a table; any other path unchanged. Raises UsageError or TableError."""
     from router.rehearsal.reading import ENDINGS
 
     if not path.is_file() or path.name.endswith(ENDINGS):
@@ -136,7 +136,7 @@ def _print_results(
 
 
 def _summary(results: Sequence[Result], files: int) -> str:
-    """`2 of 31 tests failed, in 1 file`."""
+    """Return `2 of 31 tests failed, in 1 file`."""
     failed = sum(not result.passed for result in results)
     tests = plural(len(results), "test")
     return f"{f'{failed} of {tests} failed' if failed else f'{tests} passed'}, in {plural(files, 'file')}"

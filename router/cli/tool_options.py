@@ -41,7 +41,7 @@ def add_table(parser: argparse.ArgumentParser, *, is_subject: bool = False) -> N
 
 
 def table_path(args: argparse.Namespace) -> Path:
-    """The path of a verb's table. Raises UsageError if none is named and the default table does not exist."""
+    """Return the path of a verb's table. Raises UsageError if none is named and the default table does not exist."""
     if (named := named_table(args)) is not None:
         return named
     if not inputs.exists(DEFAULT_TABLE):
@@ -51,7 +51,7 @@ def table_path(args: argparse.Namespace) -> Path:
 
 
 def named_table(args: argparse.Namespace) -> Path | None:
-    """The table that the command line or the environment names. Raises UsageError for two on the command line."""
+    """Return the table that the command line, which may name only one, or the environment names. Raises UsageError."""
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and inputs.real_path(subject) != inputs.real_path(option):
@@ -61,7 +61,7 @@ def named_table(args: argparse.Namespace) -> Path | None:
 
 
 def table_if_any(args: argparse.Namespace) -> Path | None:
-    """The table that is named, or the default table if it exists."""
+    """Return the table that is named, or the default table if it exists."""
     return named_table(args) or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
 
 
@@ -80,13 +80,13 @@ def good_table(
 
 
 def add_tables(parser: argparse.ArgumentParser, about: str) -> None:
-    """Like `add_table`, for verbs that take several tables, or folders of tables."""
+    """Add the options of a verb that takes several tables, or folders of tables."""
     parser.add_argument("paths", nargs="*", type=Path, metavar="PATH", help=about)
     add_table(parser)
 
 
 def table_paths(args: argparse.Namespace) -> list[Path]:
-    """The paths of a verb with `add_tables`. Raises UsageError."""
+    """Return the paths named to a verb with `add_tables`, or its table. Raises UsageError."""
     paths: list[Path] = args.paths
     if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
         raise UsageError(f"two tables are named: {paths[0]} and, with --table, {args.table}", "name only one")
@@ -107,7 +107,7 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
 
 
 def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
-    """The messages, and the table if one is used. A `place` that is a name requires a table.
+    """Return the messages, and the table if one is used. A `place` that is a name requires a table.
 
     Raises TableError and UsageError.
     """
@@ -140,7 +140,7 @@ def add_url_option(parser: argparse.ArgumentParser) -> None:
 
 
 def running_url(args: argparse.Namespace) -> str:
-    """The URL from --url or from the table, which may have errors elsewhere. Raises TableError and UsageError."""
+    """Return the URL from --url or from the table, which may have errors elsewhere. Raises TableError or UsageError."""
     if args.url:
         return str(args.url).strip()
 
@@ -159,7 +159,7 @@ def running_url(args: argparse.Namespace) -> str:
 def add_for(
     parser: argparse.ArgumentParser, about: str = "stop after this time, for example 10s (default: at Ctrl-C)"
 ) -> None:
-    """`--for 10s`, as `args.seconds`."""
+    """Add `--for DURATION`, as `args.seconds`."""
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
 
 
@@ -184,7 +184,7 @@ def print_batches(
 ) -> None:
     """Print until --count or --for is reached; `waited` seconds of --for are already over.
 
-    Batches may be empty. Each is written with one system call: one per line would cost more than the line.
+    Batches may be empty. Each is written with one system call: one per line would take longer than the rest.
     """
     left, until = args.count, time.monotonic() + (args.seconds or math.inf) - waited
     for batch in batches:
@@ -195,26 +195,26 @@ def print_batches(
 
 
 def seconds(text: str) -> float:
-    """`10s`, `500ms` as seconds."""
+    """Parse a duration such as `10s` or `500ms`. Return seconds."""
     from router.table.units import parse_duration
 
     return _quantity(parse_duration, text, "s") / 1e9
 
 
 def hertz(text: str) -> float:
-    """`20Hz` as Hz."""
+    """Parse a rate such as `20Hz`. Return Hz."""
     from router.table.units import parse_rate
 
     return _quantity(parse_rate, text, "Hz")
 
 
 def factor(text: str) -> float:
-    """`2x` as a factor."""
+    """Parse a factor such as `2x`."""
     return _quantity(_parse_factor, text, "x")
 
 
 def speed(text: str) -> float:
-    """`2x` as a factor; `max` is infinite."""
+    """Parse a factor such as `2x`, or `max`, which is infinite."""
     return math.inf if text == "max" else factor(text)
 
 
@@ -254,7 +254,7 @@ def integer(text: str) -> int:
 
 
 def whole(text: str) -> int:
-    """An integer above zero."""
+    """Parse an integer above zero."""
     value = integer(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
@@ -265,7 +265,7 @@ def whole(text: str) -> int:
 def progress(
     columns: Callable[[], Iterable[ProgressColumn]], total: int | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Show `columns` of rich on stderr if it is a terminal. Yields what updates them: `tell(completed=7)`."""
+    """Show `columns` of rich on stderr if it is a terminal. Yields a function to update them: `tell(completed=7)`."""
     if not sys.stderr.isatty():
         yield lambda **_: None
         return

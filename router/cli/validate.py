@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def find_tables(paths: Sequence[Path]) -> list[Path]:
-    """The files that the paths stand for, each once; they need not exist. Raises UsageError."""
+    """Return the files that the paths stand for, each once; they need not exist. Raises UsageError."""
     tables: dict[Path, None] = {}
     for path in paths:
         if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)

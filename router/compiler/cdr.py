@@ -140,7 +140,7 @@ def message_size(plan: Record) -> tuple[int, bool]:
     return len(HEADER) + size, is_exact
 
 
-def _sizes(plan: Plan) -> Iterator[tuple[int, int, bool]]:  # noqa: C901 - a case a plan
+def _sizes(plan: Plan) -> Iterator[tuple[int, int, bool]]:  # noqa: C901 - one case per plan
     """Yield alignment and size of each scalar, or of known bytes, and whether that size is fixed."""
     match plan:
         case Record():

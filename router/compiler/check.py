@@ -1,4 +1,4 @@
-"""Check of a table and everything that it refers to. Collects all findings.
+"""Checks a table and everything that it refers to, and collects all findings.
 
 `validate`, `explain` and `run` use the same check.
 """

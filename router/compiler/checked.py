@@ -48,7 +48,7 @@ class CheckedTarget:
 
     @property
     def label(self) -> str:
-        """Its name in metrics: that of the endpoint or of the topic."""
+        """The name in metrics: that of the endpoint or of the topic."""
         declared = self.declared
         return declared.topic.value if isinstance(declared, Topic) else declared.endpoint.value
 
@@ -67,9 +67,9 @@ class CheckedTarget:
 class CheckedSubscription:
     """A topic that an outbound route subscribes to, with a target for each destination.
 
-    `when` is the topic's own. With `for_each`, a list, `when` and the targets are evaluated for each element: `item`
-    and `index` of `count`. `stamp` is the message's `header.stamp` (ns), if the route has a `ttl` and the type has a
-    stamp.
+    `when` is the condition of the topic. `for_each` is a list: `when` and the targets are evaluated for each of its
+    elements, with the variables `item`, `index` and `count`. `stamp` is the message's `header.stamp` (ns), if the route
+    has a `ttl` and the type has a stamp.
     """
 
     topic: Topic

@@ -127,7 +127,7 @@ def _turns(lists: Sequence[tuple[str, tree.Node]], variables: _Variables) -> Ite
 # expressions
 
 
-def _value(node: tree.Node, variables: _Variables) -> Any:  # noqa: C901, PLR0912 - a case a node
+def _value(node: tree.Node, variables: _Variables) -> Any:  # noqa: C901, PLR0912 - one case per node
     match node:
         case tree.Constant():
             return node.value

@@ -1,4 +1,4 @@
-"""From a checked value to the plan of the field that it fills.
+"""Converts a checked value to the plan of the field that it fills.
 
 Messages are converted field by field, lists element by element, scalars by a node that converts or checks them. No
 conversion is lossy unless the table requests it. Known ranges are checked here, rounded floats at run time: a value

@@ -1,6 +1,6 @@
-"""Check of deadmen: their timing, the payload that they send, and commands to boards without a deadman.
+"""Checks deadmen: their timing, the payload that they send, and commands to boards without a deadman.
 
-`gateways` uses it for the deadmen of topics that clients publish on.
+`gateways` uses this module for the deadmen of topics that clients publish on.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     case, board = next(iter(forgotten.items()))
     named = [name.value for name in deadman.disarmed_by or ()]
     message = f"the deadman would interrupt commands of '{case}', which '{board}' also receives"
-    # Commands to another motor of the board must not disarm it: it would stay silent as long as they arrive.
+    # Commands to another motor must not disarm this deadman: it would stay silent as long as they arrive.
     beside = "`because: why`" if named else "`disarmed_by: []`"
     cases = ", ".join((*named, *forgotten))
     value = f"[{cases}]" if "," in cases else cases
@@ -174,7 +174,7 @@ def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 
 def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> bool:
-    """Report commands that may be held back beyond the timeout: sent late, they would undo the deadman."""
+    """Report commands that may be sent after the timeout and undo the deadman. Return whether there are any."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
         return False
     for destination in route.destinations:
@@ -196,7 +196,7 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
     ]
     served = {each.case.value for each in found}
     served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-    are_known = all(to.value in table.endpoints for to in deadman.to)  # else they have a finding already
+    are_known = all(to.value in table.endpoints for to in deadman.to)  # otherwise there is a finding already
     for name in deadman.disarmed_by or ():
         if name.value not in lookup.envelope.cases:
             message = f"{lookup.envelope.name} has no payload case '{name.value}'"
@@ -232,7 +232,10 @@ def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> tuple[Recor
 
 
 def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: PayloadCase) -> bool:
-    """Report the first board that cannot decode the deadman's payload. Its size was checked with the payload case."""
+    """Report the first board that cannot decode the deadman's payload. Return whether there is one.
+
+    The size was checked with the payload case.
+    """
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
         bounds = board.fields.get(case.number)

@@ -1,6 +1,6 @@
-"""Check of gateways: their names, their patterns, and the topics that their clients publish on.
+"""Checks gateways: their names, their patterns, and the topics that their clients publish on.
 
-`network` checks clashes of their addresses, `topics` those of their topics.
+`network` checks their addresses for clashes, `topics` their topics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Assembly of the program: routes, the sockets and topics that they need, and the counters.
+"""Assembles the program: routes, the sockets and topics that they need, and the counters.
 
 Expects a table without errors and checks nothing.
 """

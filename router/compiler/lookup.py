@@ -1,4 +1,4 @@
-"""Lookup of the names in a table: `.proto` folders, ROS interfaces, endpoints and payload cases."""
+"""Looks up the names in a table: `.proto` folders, ROS interfaces, endpoints and payload cases."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ NO_NAMES: Mapping[str, Node] = {}
 
 @dataclass
 class Lookup:
-    """Looks up the names of one table and collects findings.
+    """The names that one table can use, and the findings about those that do not exist.
 
     `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint.
     """

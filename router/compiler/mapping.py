@@ -46,11 +46,11 @@ class FieldMapping:
 
 
 _MISSPELT = 0.9
-"""Similarity from which a name can only be a misspelt field of the target."""
+"""Minimum similarity of a name that can only be a misspelt field of the target."""
 
 
 def _of_one_key(spans: Sequence[SourceSpan], depth: int) -> tuple[int, int]:
-    """Return the indexes of the first and last name in the same key, `a.b.c`, as the name at `depth`."""
+    """Return the indexes of the first and last name of the key, such as `a.b.c`, that has the name at `depth`."""
     first = last = depth
     while first > 0 and spans[first - 1].end_column + 1 == spans[first].column:
         first -= 1
@@ -88,8 +88,8 @@ def build(
 ) -> FieldMapping:
     """Map a message of type `target`. `span` is the position of findings that concern no single entry.
 
-    `auto` takes fields of `whole`, or of the source message if that is None. Without `fields`, it is `auto`, and every
-    field of `ros_type`, which is source or target, needs a field of the same name on the other side.
+    `auto` takes fields of `whole`, or of the source message if that is None. Without `fields`, the mapping is `auto`,
+    and every field of `ros_type`, the source or the target, needs a field of the same name on the other side.
     """
     if fields is None:
         outcome = build(FieldMap(span, auto=True, entries=()), target, scope, span, whole)
@@ -185,7 +185,7 @@ class _Builder:
         return holders
 
     def _unknown(self, entry: FieldEntry, depth: int, holder: MessageType) -> None:
-        """Report that `holder` has no field of the name at `depth`, once for a key above several others."""
+        """Report that `holder` has no field of the name at `depth`, once for a key with several others below it."""
         name, span = entry.path[depth], entry.path_spans[depth]
         if (entry.path[: depth + 1], span) in self._reported:
             return

@@ -261,11 +261,13 @@ class Counters:
     the earlier program had are no longer current, but keep their indexes until `settle` frees them.
     """
 
-    _indexes: dict[tuple[str, ...], int] = field(default_factory=dict)  # the first one, by metric and labels
+    _indexes: dict[tuple[str, ...], int] = field(default_factory=dict)  # the first index, by metric and labels
     _current: set[tuple[str, ...]] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
-    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
+    _commanded: dict[tuple[str, str], bool] = field(
+        default_factory=dict
+    )  # by route and target, also of earlier programs
 
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
@@ -328,7 +330,7 @@ class Counters:
         return [0] * self._size
 
     def grow(self, counts: list[int]) -> None:
-        """Extend a thread's list from earlier counters in place, if it is shorter."""
+        """Extend a thread's list with zeros, in place, if it was made for fewer series."""
         if len(counts) < self._size:
             counts.extend([0] * (self._size - len(counts)))
 

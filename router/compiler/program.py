@@ -65,7 +65,7 @@ class TargetPlan:
 
     A target that `is_deferred` may be served later and by another thread: it has `on_limit: latest`, or its endpoint
     has a bandwidth. `is_command`: its messages are commands. `deadmen` are the routes whose deadmen each command feeds
-    (its own route's) or disarms. It contains no positions, because a reload uses it as the key of state.
+    (its own route's) or disarms. The plan contains no positions, because a reload uses it as a key of state.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""Check of routes: resolves every name, types every mapping, and collects all findings."""
+"""Checks routes: resolves every name, types every mapping, and collects all findings."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
 
 
 def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
-    """Yield the findings; those about names that need `for_each` or `collect` once, since the key is the mistake."""
+    """Yield the findings, but a missing `for_each` or `collect` only once, not for each name that needs it."""
     said = set()
     for finding in findings:
         if finding.message not in said:
@@ -242,7 +242,7 @@ def _subscription(
     else:
         scope.absent = _without_for_each(ros_type)
     when = lookup.when(topic.when, scope)
-    own = any(destination.fields for destination, _ in found)  # then the route needs none
+    own = any(destination.fields for destination, _ in found)  # then the route needs no fields of its own
     targets = []
     for destination, endpoint in found:
         fields = destination.fields or route.fields

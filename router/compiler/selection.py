@@ -1,6 +1,6 @@
 """Selection of the topics that a gateway sends, and of their rates, by patterns over absolute topic names.
 
-Except for `pattern_problem`, patterns must be valid.
+Only `pattern_problem` accepts invalid patterns.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _REMEMBERED = 4096
 
 
 class PatternProblem(NamedTuple):
-    """A problem of an invalid pattern, and its remedy."""
+    """Why a pattern is invalid, and the remedy."""
 
     what: str
     hint: str

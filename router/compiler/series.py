@@ -1,4 +1,4 @@
-"""Opening of all series of a program before anything is counted, so that scrapes show every series from the start."""
+"""Opens all series of a program before anything is counted, so that scrapes show every series from the start."""
 
 from __future__ import annotations
 

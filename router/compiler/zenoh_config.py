@@ -1,4 +1,4 @@
-"""Check of the `config` of Zenoh gateways with the library, without opening anything. Findings quote no values."""
+"""Checks the `config` of Zenoh gateways with Zenoh's library. Opens nothing; findings quote no values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.table.model import Gateway, Networks, ZenohConfig
 from router.table.nodes import Path
 
 OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
-"""Keys of the library that tables have beside `config`, with their names there."""
+"""Keys of the library that tables set beside `config`, with their names in tables."""
 
 
 CLIENT = "client"
@@ -96,7 +96,7 @@ _PLACED = (
     r"Error\(\"(?P<what>.*)\", line: (?P<line>\d+), column: (?P<column>\d+)\)",
     r"problem: \"(?P<what>[^\"]*)\", problem_mark: Mark { line: (?P<line>\d+), column: (?P<column>\d+)",
 )
-"""Formats of positions in the library's errors for JSON5 and YAML. JSON5's has the line itself before the text."""
+"""Formats of positions in the library's errors for JSON5 and YAML. In JSON5 errors, the source line comes first."""
 
 
 def _without_values(text: str) -> str:

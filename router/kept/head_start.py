@@ -47,7 +47,7 @@ class HeadStart:
         self.senders: dict[str, NativeSender] = {}
         self.opened: dict[tuple[str | None, ...], int] = {}
         self.sent: dict[str, list[str]] = {}
-        parts: Mapping[str, Any] = kept.parts  # type: ignore[assignment]  # those of carrier/image.py
+        parts: Mapping[str, Any] = kept.parts  # type: ignore[assignment]  # as carrier/image.py makes them
         self._kept: tuple[object, bytes] | None = (kept.parts, bytes(kept.image))
         self.forwarding = Forwarding(self.library, parts["counters"], parts["names"])
         with ExitStack() as undo:
@@ -76,7 +76,7 @@ class HeadStart:
         self._close_sockets()
 
     def is_of(self, parts: object, image: bytes) -> bool:
-        """Whether it runs the program with these parts and this image. To be called once."""
+        """Return whether it runs the program with these parts and this image. Call it only once."""
         kept, self._kept = self._kept, None
         return kept == (parts, image)
 
@@ -92,7 +92,7 @@ class HeadStart:
             source = placed(self.listening.get(source_name), every)
             try:
                 to_send = open_sending(source, every, is_board=is_board)
-            except OSError:  # as in `net.udp`, which logs it when it adopts the sender
+            except OSError:  # as in `net.udp.open_sending`, which logs it later
                 source, to_send = None, open_sending(None, is_board=is_board)
             self.senders[name] = NativeSender(self.library, address, to_send, source)
 
@@ -103,7 +103,7 @@ class HeadStart:
             self.opened[tuple(place)] = opened(self.library, function, *plain)
 
     def _argument(self, argument: object, parts: Mapping[str, Any]) -> object:
-        """An argument, decoded from the form that `image._plain` gives it."""
+        """Decode an argument from the form that `image._plain` gives it."""
         if isinstance(argument, tuple):
             return self._address(parts["symbols"][argument[0]], parts)
         if not isinstance(argument, list):
@@ -165,7 +165,7 @@ class HeadStart:
 
 
 _WANTED, _UNWANTED = (ctypes.c_uint8 * 1)(1), (ctypes.c_uint8 * 1)(0)
-"""Topics that serve late joiners get their messages later; other topics have no known subscriber yet."""
+"""The byte `wanted`. Topics that serve late joiners get their messages later; others have no known subscriber yet."""
 
 
 class _Image:
@@ -186,7 +186,7 @@ class _Image:
             self._places.setdefault(name, []).append(word)
 
     def at(self, kind: Any, offset: int) -> Any:
-        """A pointer to a structure."""
+        """Return a pointer to a structure."""
         return ctypes.pointer(kind.from_address(self.base + offset))
 
     def array(self, kind: Any, offset: int, count: int) -> Any:

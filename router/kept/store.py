@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     """Command line, folder and Python."""
 
 CHANGED = " has changed"
-"""The end of the reason if a table or another input was edited, which is normal."""
+"""The reason ends like this if a table or another input was edited, which is normal."""
 
 _MOST = 4
-"""Most files that are kept."""
+"""Maximum number of files that are kept."""
 _ENDING = ".program"
 _UNFINISHED = ".new"
 _TRIES = ".tries"
@@ -49,7 +49,7 @@ _CHECKSUM = struct.Struct("<I")
 
 
 class Kept:
-    """The content of a complete file. `written`: when, in s of the wall clock.
+    """The content of a complete file, written at `written` (wall clock, s).
 
     `parts` are plain values. `image` is private, writable memory, aligned to a page.
     """
@@ -63,14 +63,14 @@ class Kept:
 
 
 class _UnusableError(Exception):
-    """The message says why a file is not used."""
+    """A file cannot be used; the message says why."""
 
 
 _OF_ANOTHER = "it belongs to another command line, folder or Python"
 
 
 def find() -> tuple[Kept | None, str]:
-    """The kept program of this command line, folder and Python, or why it is not used ("" if nothing is kept)."""
+    """Return the kept program of this command line, folder and Python, or why it is not used ("" if there is none)."""
     try:
         kept, why = _judged(_path(_identity()))
         if kept is not None and kept.identity != _identity():
@@ -92,7 +92,7 @@ def every() -> Iterator[tuple[str, Kept | None, str]]:
 
 
 def _judged(path: str) -> tuple[Kept | None, str]:
-    """The content of a complete file, and why a start does not use it, or "". Raises OSError."""
+    """Return the content of a complete file, and why a start does not use it, or "". Raises OSError."""
     try:
         kept = _read(path)
     except _UnusableError as error:
@@ -151,19 +151,19 @@ def count_try() -> str:
 
 
 def works() -> None:
-    """Reset the count: a router has started with the kept file."""
+    """Reset the count of failed starts: a router has started."""
     with suppress(OSError):
         os.unlink(_path(_identity()) + _TRIES)
 
 
 def _path(identity: Identity) -> str:
-    """The file for a command line, folder and Python. Raises OSError if there is no folder for it."""
+    """Return the file for a command line, folder and Python. Raises OSError if there is no folder for it."""
     command, *others = identity
     return os.path.join(folder(), f"{zlib.crc32(os.fsencode(chr(0).join([*command, *others]))):08x}{_ENDING}")
 
 
 def folder() -> str:
-    """The folder of the files: the service's state directory, or the user's cache. Raises OSError without either."""
+    """Return the folder of the files: the service's state directory, or in the user's cache. Raises OSError."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if os.path.isabs(state):
         return os.path.join(state, "kept")
@@ -187,7 +187,7 @@ def _crc(*parts: bytes | bytearray | memoryview) -> int:
 
 
 def _read(path: str) -> Kept:
-    """Read a file, not mapped, as truncating a mapped one kills the process. Raises OSError or _UnusableError."""
+    """Read a file without mapping it: truncating a mapped file kills the process. Raises OSError or _UnusableError."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
@@ -209,7 +209,7 @@ def _read(path: str) -> Kept:
 
 
 def _parsed(descriptor: int, status: os.stat_result) -> Kept:
-    """The content of an open file. Raises _UnusableError."""
+    """Return the content of an open file. Raises _UnusableError."""
     with open(descriptor, "rb", buffering=0, closefd=False) as stream:
         head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
         values_size, image_size = _sizes(head, status.st_size)
@@ -232,7 +232,7 @@ def _check_owner(status: os.stat_result, what: str) -> None:
 
 
 def _sizes(head: bytes, size: int) -> tuple[int, int]:
-    """The sizes of values and image in a file of this size. Raises _UnusableError."""
+    """Return the sizes of values and image in a file of this size. Raises _UnusableError."""
     if not head.startswith(_MAGIC[: len(head)]):
         raise _UnusableError("it is not a kept program")
     if len(head) < _HEAD.size:
@@ -265,7 +265,7 @@ def _remove_oldest(place: str, newest: str) -> None:
 
 
 def _files(place: str, ending: str) -> list[tuple[float, str]]:
-    """The time of writing and the path of each file."""
+    """Return the time of writing and the path of each file."""
     found = []
     for entry in os.scandir(place):
         if entry.name.endswith(ending):

@@ -1,4 +1,4 @@
-"""Check of an expression, innermost node first, which returns a typed tree.
+"""Checks an expression, innermost node first, and returns a typed tree.
 
 The rules are in `names`, `operators`, `lists` and `calls`.
 """
@@ -36,11 +36,11 @@ from router.table.nodes import TextPlace
 from router.types.model import List, Type
 
 DEEPEST = 60
-"""Maximum nesting of an expression, since functions on syntax trees are recursive, ours and Python's."""
+"""Maximum nesting of an expression: functions on syntax trees are recursive, both ours and Python's."""
 
 
 MOST_CHOICES = 100
-"""Maximum number of values of a map, which nests as deep."""
+"""Maximum number of values of a map, which becomes a chain of choices nested this deep."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Node:
@@ -116,7 +116,7 @@ def _key_hint(name: str, values: Mapping[str, int]) -> str:
 
 
 def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
-    """Reject a map in which two keys have the same value, such as two names of an enum's number."""
+    """Reject a map in which two keys have the same value, such as two names of one enum number."""
     names: dict[object, str] = {}
     for (name, _), key in zip(choices.values, keys, strict=True):
         first = names.setdefault(constant_of(key), name.value)
@@ -163,7 +163,7 @@ class _Checker:
         self.depth -= 1
         return checked
 
-    def _rule(  # noqa: C901, PLR0912 - a case a syntax
+    def _rule(  # noqa: C901, PLR0912 - one case per syntax
         self, node: ast.expr, span: SourceSpan, expected: Type | None
     ) -> Node:
         match node:

@@ -147,7 +147,10 @@ def _double(nodes: Sequence[Node]) -> FloatKind:
 
 
 def _rounded(compute: Callable[[float], int]) -> Rule:
-    """Return the same integer, or for a float a 64-bit integer within the range that clamp() has set."""
+    """Return the rule of a rounding function, which `compute` implements.
+
+    An integer stays as it is. A float becomes a 64-bit integer within the range that clamp() has set.
+    """
 
     def result(nodes: Sequence[Node]) -> Kind:
         kind = nodes[0].kind
@@ -165,7 +168,7 @@ def _rounded(compute: Callable[[float], int]) -> Rule:
 
 def _integer(nodes: Sequence[Node]) -> Kind:
     kind = as_int(nodes[0].kind)
-    assert kind is not None  # noqa: S101 - accepted before
+    assert kind is not None  # noqa: S101 - checked before
     return kind
 
 
@@ -228,7 +231,7 @@ def _clamped(nodes: Sequence[Node]) -> Kind:
 
 def _wrapped(nodes: Sequence[Node]) -> Kind:
     integers = _integers(nodes)
-    assert integers is not None  # noqa: S101 - accepted before
+    assert integers is not None  # noqa: S101 - checked before
     _, low, high = integers
     _want_ordered(low, high)
     return _between([IntKind(low.low, low.low), IntKind(high.high, high.high)])
@@ -275,9 +278,9 @@ class Function:
     """A function of scalars. `result` returns the kind of a call with these arguments.
 
     If `variadic`, the last parameter may be repeated; the last `optional` ones may be omitted. A function with optional
-    bounds takes them from the integer field that it fills (see expressions). If it `gives_an_argument` and one of them
-    is a float, all are converted to floats. `of_list` returns the kind of a call with one whole list, or None for a
-    list that the function does not take.
+    bounds takes them from the integer field that it fills. If its result is one of the arguments (`gives_an_argument`)
+    and one of these is a float, all are converted to floats. `of_list` returns the kind of a call with one whole list,
+    or None for a list that the function does not take.
     """
 
     name: str

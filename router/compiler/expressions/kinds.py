@@ -60,7 +60,10 @@ INT64, UINT64 = IntKind(-(1 << 63), (1 << 63) - 1), IntKind(0, (1 << 64) - 1)
 
 @dataclass(frozen=True, slots=True)
 class FloatKind:
-    """A float. `bits` is 64 if it was computed from a double: a float32 would lose digits. It is in range, or NaN."""
+    """A float between `low` and `high`, or NaN.
+
+    `bits` is 64 if it was computed from a double: a float32 would lose digits.
+    """
 
     bits: int
     low: float = -math.inf
@@ -183,7 +186,7 @@ def length_of(kind: Kind) -> int | None:
 
 
 def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind | None, bool]:
-    """Return the kind of the integers between these that fit 64 bits, and whether some do not.
+    """Return the kind of the integers between `extremes` that fit 64 bits, and whether some do not.
 
     The kind is None if no integer fits.
     """

@@ -38,7 +38,7 @@ from router.types.paths import leads, ways
 
 
 def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
-    """Resolve a single name. `expected` is the type of the field that it fills."""
+    """Resolve a single name. `expected` is the type of the field to be filled."""
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
@@ -85,7 +85,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
 
 
 _MISSPELT = 0.9
-"""Similarity from which a name can only be a misspelt field of the message."""
+"""Minimum similarity of a name that can only be a misspelt field of the message."""
 
 
 def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
@@ -136,7 +136,7 @@ def _given(text: str, span: SourceSpan, scope: Scope) -> Node:
 
 
 def is_source(operand: Node) -> bool:
-    """Return whether an operand is the name of the endpoint that sent the message."""
+    """Return whether an operand is SOURCE, the name of the endpoint that sent the message."""
     return isinstance(operand, Variable) and operand.name == SOURCE
 
 
@@ -162,7 +162,7 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
 
 
 def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
-    """Return the message for `message` in `message.name`, unless it has such a submessage; None for anything else."""
+    """Return the message for `message` in `message.name`, unless that is a submessage; None for anything else."""
     member = scope.message.field(MESSAGE)
     is_meant = (
         isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)

@@ -71,9 +71,9 @@ def constant(value: object, span: SourceSpan) -> Constant:
 
 
 def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False) -> tuple[IntKind, bool]:
-    """Return the kind of an integer between these, and whether a result must be checked at run time.
+    """Return the kind of an integer between `extremes`, and whether a result must be checked at run time.
 
-    Raises ExpressionError if it never fits.
+    Raises ExpressionError if the integer never fits 64 bits.
     """
     found = [*extremes]
     kind, is_checked = within_64_bits(found, is_rounded)

@@ -136,7 +136,7 @@ def _word(name: str) -> str:
 
 
 def _comment(text: str) -> int | None:
-    """Return where a Python comment begins in the text, outside its quotes; None without."""
+    """Return the index at which a Python comment begins, outside of quotes; None if there is no comment."""
     with suppress(tokenize.TokenError, SyntaxError):
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT:

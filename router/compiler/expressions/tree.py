@@ -75,7 +75,7 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """Whether a field of a payload that can be missing is set."""
+    """Whether a payload's field that may be missing is set."""
 
     kind: Kind
     span: SourceSpan

@@ -1,4 +1,4 @@
-"""Lowering of the routes of a table without errors to the routines that the carrier executes.
+"""Lowers the routes of a table without errors to the routines that the carrier executes.
 
 Each target is lowered once. A routine that is too large is a finding.
 """
@@ -37,7 +37,7 @@ __all__ = [
 
 
 def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnostic]]:
-    """Lower all targets of a table without errors."""
+    """Lower all targets of a table without errors. Return findings for those that are too large."""
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}

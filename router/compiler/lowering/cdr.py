@@ -1,4 +1,4 @@
-"""From the plan of a ROS message to the operations that write it as CDR."""
+"""Lowers the plan of a ROS message to the operations that write it as CDR."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ _LOSE = frozenset({Op.PUT_TEXT, Op.PUT_BYTES, Op.REPEAT, Op.AGAIN})
 
 
 def _padded(placed: Iterable[Placed], offset: Offset) -> Iterator[Placed]:
-    """Prepend known padding to known bytes, which then need no alignment. They begin at `offset`."""
+    """Prepend known padding to known bytes, which then need no alignment. The first operation writes at `offset`."""
     for operation, place in placed:
         if operation.kind is not Op.KNOWN:
             yield operation, place

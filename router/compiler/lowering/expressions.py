@@ -1,4 +1,4 @@
-"""From a checked expression to the operations that compute it.
+"""Lowers a checked expression to the operations that compute it.
 
 The tree has the kind of each value, the range of each integer, and the results that must be checked. A value on the
 stack is an integer, a real number, text, bytes or a list, depending on its kind; a time is its nanoseconds. A message
@@ -82,7 +82,7 @@ class Lowering:
         return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
 
     def _unchanged(self, node: tree.Node) -> int | None:
-        """Return the outermost loop in which a node is invariant, with all loops inside it; None if there is none."""
+        """Return the index in `loops` of the outermost loop in which a node is invariant; None if there is none."""
         loops = self.names.loops
         if not loops or not _can_be_kept(node):
             return None
@@ -91,7 +91,7 @@ class Lowering:
             level -= 1
         return level if level < len(loops) else None
 
-    def _value(self, node: tree.Node) -> Routine:  # noqa: C901, PLR0912 - a case a node
+    def _value(self, node: tree.Node) -> Routine:  # noqa: C901, PLR0912 - one case per node
         if isinstance(node.kind, ListKind):
             return lists.stored(self, node).routine
         match node:
@@ -155,7 +155,7 @@ class Lowering:
         return routine(made, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else made
 
     def time(self, before: Routine, moment: Section) -> Routine:
-        """Return the nanoseconds of a message with seconds and nanoseconds. They always fit."""
+        """Return the operations that push a message with seconds and nanoseconds as nanoseconds, which always fit."""
         seconds, nanoseconds = moment.type.fields
         whole = routine(load(moment.value(seconds)), integer(NS_PER_SECOND), Operation(Op.MULTIPLY))
         return routine(before, whole, load(moment.value(nanoseconds)), Operation(Op.ADD))

@@ -1,4 +1,4 @@
-"""Lowering of the language's functions, and of the checks of `conversion`."""
+"""Lowers the language's functions, and the checks of `conversion`."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _seconds(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _named(lowering: Lowering, node: tree.Call) -> Routine:
-    """Lower the number of an enum's name. Other text is rejected."""
+    """Lower the conversion of an enum's name to its number. Other text is rejected."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
     found: Routine = (load(slot), Operation(Op.NAMELESS))
@@ -133,7 +133,7 @@ def _named(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _member(lowering: Lowering, node: tree.Call) -> Routine:
-    """Lower a number of a closed enum. Other numbers are rejected."""
+    """Lower the check that a number is a value of a closed enum. Other numbers are rejected."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     numbers = sorted({number for _, number in node.kind.enum.values})
     data = struct.pack(f"<{len(numbers)}i", *numbers)

@@ -101,7 +101,7 @@ class Numbering:
 
 
 def protobuf_layout(slots: Sequence[Slot], payload: Section, elements: Sequence[Section]) -> Layout:
-    """Number `slots`, from 0, then those of the payload, and those of elements of lists."""
+    """Number `slots` from 0, then those of the payload, then those of list elements. Return the layout."""
     maker = _ProtobufNumbering(slots)
     roots = payload, *elements
     maker.number_sections([*chain.from_iterable(map(_all, roots))])

@@ -87,7 +87,7 @@ def stored(lowering: Lowering, node: tree.Node) -> Stored:
 
 
 def are_messages(node: tree.Node) -> bool:
-    """Return whether the elements of a list are messages that must be read: times in a field are, computed ones not."""
+    """Return whether elements are messages that must be read. Times in a field must be; computed times are values."""
     match node:
         case tree.Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
@@ -99,7 +99,7 @@ def are_messages(node: tree.Node) -> bool:
 
 def _read(lowering: Lowering, node: tree.Read) -> Stored:
     before, holder = lowering.message(node.holder)
-    assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
+    assert isinstance(node.kind, ListKind)  # noqa: S101 - the caller ensures it
     element = node.kind.element
     message = holder.inner(node.field) if isinstance(element, (MessageKind, TimeKind)) else None
     is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
@@ -112,7 +112,7 @@ def _payloads(lowering: Lowering, node: tree.Variable) -> Stored:
     items, payload = lowering.names.variables[node.name], lowering.names.variables[tree.MESSAGE]
     assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
     assert isinstance(payload, Section)  # noqa: S101
-    assert isinstance(node.kind, ListKind)  # noqa: S101 - said by the caller
+    assert isinstance(node.kind, ListKind)  # noqa: S101 - the caller ensures it
     message = Section(payload.type, payload.descriptor, f"{node.name}[].")
     return Stored((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
@@ -190,7 +190,7 @@ def looped(
 ) -> Routine:
     """Repeat `body`, which uses the variables of `lists`, for each index of these parallel lists.
 
-    It may change the top of the stack, but nothing below.
+    `body` may change the top of the stack, but nothing below.
     """
     counted, each = gone_through(lowering, lists)
     before, turn = routine_of_each(lowering, each, body)
@@ -264,7 +264,7 @@ def element(lowering: Lowering, node: tree.Element) -> Routine:
 def entered(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
     """Read a message in a list into a section."""
     of = stored(lowering, node.values)
-    assert of.message is not None  # noqa: S101 - said by the caller
+    assert of.message is not None  # noqa: S101 - the caller ensures it
     made = lowering.names.element(of.message)
     return routine(
         of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)

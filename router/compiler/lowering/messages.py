@@ -33,7 +33,7 @@ def at(place: Place, *parts: Operation | Routine) -> list[Placed]:
 
 
 def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
-    """Join known bytes with following ones that need no padding. The place of the first ones remains."""
+    """Join known bytes with following ones that need no padding. They have the place of the first bytes."""
     last: Placed | None = None
     for operation, place in placed:
         if last is not None and operation.kind is Op.KNOWN and operation.slot == 1:

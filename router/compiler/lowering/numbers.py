@@ -33,7 +33,7 @@ def is_unsigned(kind: Kind) -> bool:
 
 
 def signs(result: Kind, *operands: Kind) -> int:
-    """Return the flag of an operation with integers."""
+    """Return the flags that mark unsigned operands, and an unsigned result, of an operation with integers."""
     flags = (Sign.FIRST_UNSIGNED, Sign.SECOND_UNSIGNED, Sign.THIRD_UNSIGNED)
     unsigned = sum(int(flag) for flag, kind in zip(flags, operands, strict=False) if is_unsigned(kind))
     return unsigned + int(Sign.RESULT_UNSIGNED) * is_unsigned(result)
@@ -47,7 +47,7 @@ def to_real(made: Routine, kind: Kind) -> Routine:
 
 
 def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
-    """Convert a value to a common kind."""
+    """Convert a value of `kind` to the common kind `to`."""
     if isinstance(to, FloatKind):
         return to_real(made, kind)
     if isinstance(to, IntKind) and not isinstance(kind, BoolKind):
@@ -56,7 +56,7 @@ def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
 
 
 def fitted(made: Routine, kind: Kind, to: Kind) -> Routine:
-    """Reject an integer outside the range of another kind."""
+    """Add operations that reject an integer outside the range of the kind `to`."""
     (low, high), (least, most) = bounds(kind), bounds(to)
     if least <= low and high <= most:
         return made

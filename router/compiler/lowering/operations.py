@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False, slots=True)
 class Slot:
-    """A place for a value, numbered by a layout. `default` is its value if nothing was read; None for a list.
+    """A place for a value; a layout assigns its `index`. `default` is its value if nothing was read; None for a list.
 
     `name` describes the value in the words of the table; it is empty for a temporary.
     """
@@ -31,7 +31,7 @@ class Flag(Slot):
 
 
 class Operation(NamedTuple):
-    """`struct operation`; `slot` may be an object with an index, `data` are bytes of the literals."""
+    """`struct operation`. `slot` may be an object with an index; `data` is added to the layout's literals."""
 
     kind: Op
     slot: Union[int, Slot, Section] = 0
@@ -85,7 +85,7 @@ DROP, SIZE = Operation(Op.DROP), Operation(Op.SIZE)
 def repeat(body: Routine, *, keeps: bool = False) -> Routine:
     """Return a loop over `body`; the number of iterations is on the stack.
 
-    `keeps`: lists and text that it makes are used after the loop.
+    `keeps`: lists and text that the body makes are used after the loop.
     """
     return (Operation(Op.REPEAT, flag=keeps, size=len(body) + 1), *body, Operation(Op.AGAIN))
 
@@ -169,7 +169,7 @@ def _flag(operation: Operation) -> Flag | None:
 
 
 def most_executed(operations: Sequence[Operation]) -> int:
-    """Return the maximum number of operations for a datagram: a loop has as many elements as a datagram has bytes."""
+    """Return the maximum number of operations for a datagram. A loop has at most MAX_DATAGRAM iterations."""
     total, times = 0, [1]
     flags: dict[int, int] = {}  # how often a flag is cleared
     ends: list[int] = []  # ends of code that is executed once
@@ -182,7 +182,7 @@ def most_executed(operations: Sequence[Operation]) -> int:
         if operation.kind in _BYTEWISE or (operation.kind is Op.ENTER and previous is not Op.NEXT):
             cost += MAX_DATAGRAM // _BYTES_AT_A_TIME
         elif operation.kind is Op.ELEMENT:
-            cost += int(operation.number)  # cells are traversed
+            cost += int(operation.number)  # cells are traversed one by one
         total += cost * times[-1]
         if operation.kind is Op.REPEAT:
             times.append(times[-1] * MAX_DATAGRAM)

@@ -1,4 +1,4 @@
-"""From the plan of a payload to the operations that write the envelope around it.
+"""Lowers the plan of a payload to the operations that write its envelope.
 
 The bytes equal those of the protobuf library: fields by ascending number; fields without presence only if not zero.
 """
@@ -125,7 +125,7 @@ def _encoded(value: bool | float | str | bytes, to: FieldDescriptor) -> bytes:
 
 
 def _is_set(value: bool | float | str | bytes, to: FieldDescriptor) -> bool:
-    """Return whether a constant differs from zero, so that it is written without presence. Minus zero does."""
+    """Return whether a field without presence writes a constant: it is not zero, or it is minus zero."""
     is_real = encoding_of(to).write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE)
     return any(_encoded(value, to)) if is_real else bool(value)
 

@@ -51,14 +51,14 @@ class Section:
 
     def declared(self, member: Member) -> FieldDescriptor:
         """Return the descriptor of a field of a protobuf message."""
-        assert self.descriptor is not None  # noqa: S101 - said by the caller
+        assert self.descriptor is not None  # noqa: S101 - the caller ensures it
         return self.descriptor.fields_by_name[member.name]
 
     def inner(self, member: Member) -> Section:
         """Return a new section for the message in a field, or for the elements of a list."""
         is_list = isinstance(member.type, List)
         declared = member.type.element if isinstance(member.type, List) else member.type
-        assert isinstance(declared, MessageType)  # noqa: S101 - said by the caller
+        assert isinstance(declared, MessageType)  # noqa: S101 - the caller ensures it
         descriptor = None if self.is_cdr else message_of(self.declared(member))
         return Section(declared, descriptor, f"{self.path}{member.name}{'[]' * is_list}.")
 
@@ -84,7 +84,7 @@ class Section:
 
     def stored(self, member: Member) -> Scalar:
         """Return how a list is stored."""
-        assert isinstance(member.type, List)  # noqa: S101 - said by the caller
+        assert isinstance(member.type, List)  # noqa: S101 - the caller ensures it
         is_scalar = not isinstance(member.type.element, (MessageType, String))
         return scalar_of(member.type.element) if self.is_cdr and is_scalar else Scalar.IN_CELLS
 

@@ -68,7 +68,10 @@ class _Source:
     def condition(
         self, lowering: Lowering, conditions: Sequence[tree.Node | None], *, is_bounded: bool = False
     ) -> tuple[Routine, str]:
-        """Lower the conjunction of conditions, with its place. `is_bounded`: the receive thread evaluates it."""
+        """Lower the conjunction of conditions, with its place. Raises TooLargeError.
+
+        `is_bounded`: the receive thread evaluates it.
+        """
         given = [each for each in conditions if each is not None]
         if not given:
             return (), ""
@@ -137,7 +140,7 @@ class RosMessage(_Source):
         super().__init__(Section(declared, None), topic)
 
     def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
-        """Lower the routines of a route for the messages. Raises TooLargeError."""
+        """Lower a route's routines for these messages. Raises TooLargeError."""
         elements = self._for_each(feed.for_each) if feed.for_each is not None else None
         stamp = self._stamp(feed.stamp) if feed.stamp is not None else None
         place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""

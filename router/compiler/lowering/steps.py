@@ -15,7 +15,7 @@ from router.types.model import List, MessageType, String, Type
 
 
 def cdr_layout(slots: Sequence[Slot], message: Section, elements: Sequence[Section], span: SourceSpan) -> Layout:
-    """Number `slots`, from 0, then those of the message, and those of elements of lists.
+    """Number `slots` from 0, then those of the message, then those of list elements. Return the layout.
 
     Raises TooLargeError at `span` if the message nests more lists of messages than a routine can read.
     """
@@ -91,7 +91,7 @@ class _Steps:
         if length is None:
             self._flush()
             self._add(ReadOperation(ReadKind.SEQUENCE, size, scalar_of(element)), slot)
-            self.offset.lose(min(size, 4))  # there may be none after the length
+            self.offset.lose(min(size, 4))  # an empty sequence ends after its length
         elif slot is None:
             self._scalars(size, length)
         else:
