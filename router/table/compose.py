@@ -144,10 +144,16 @@ class _Composer:
         if found := surprise(text):
             # Shows a variable by name, since its value may be secret.
             what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
-            hint = (f"{found.remedy}; for text, " if found.remedy else "") + f'quote it: "{event.value}"'
+            remedy = f"{found.remedy}; for text, " if found.remedy and not self._is_key() else ""
+            hint = f'{remedy}quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)
+
+    def _is_key(self) -> bool:
+        """Return whether the next node is a key of a mapping."""
+        parent = self._open[-1] if self._open else None
+        return parent is not None and isinstance(parent.event, yaml.MappingStartEvent) and not len(parent.children) % 2
 
     def _place(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextPlace:
         line, first, end_line, last = _marks(event)
@@ -267,13 +273,16 @@ class Surprise(NamedTuple):
 
 _NUMBERS = frozenset("0123456789+-.")
 """First characters of numbers; nearly all other scalars begin differently."""
-_TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
 _OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
 _BINARY = Surprise("a binary number", "write a decimal number")
 _HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
 _GROUPED = Surprise("a number", "leave out the '_'")
 _WORD_SURPRISES: dict[str, Surprise] = {
-    **dict.fromkeys(_TRUTH, Surprise("a truth value", "write true or false")),
+    **{
+        spelling: Surprise("a truth value", f"write {meaning}")
+        for word, meaning in (("yes", "true"), ("on", "true"), ("no", "false"), ("off", "false"))
+        for spelling in (word, word.title(), word.upper())
+    },
     "~": Surprise("an empty value", "leave the key out, or in a route write {ignore: why}"),
 }
 _NUMBER_SURPRISES = (

@@ -11,7 +11,7 @@ from router.table.compose import resolve
 from router.table.nodes import MAP, Entry, MappingNode, Node, Path, ScalarNode, node_at, to_data
 from router.table.schema import SchemaError, keys_of, matches, table_schema
 from router.table.source import in_braces
-from router.table.units import meant_quantity
+from router.table.units import EACH, PERIOD, TOPIC_RATE, meant_quantity
 
 NAME_FIELDS = ("fields", "send")
 """Keys whose mappings contain field names, each with an expression."""
@@ -109,8 +109,10 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
     """Return a hint for an unknown key, with this value, of the mapping at `path`."""
     if words := in_other_words(name, known):
         return words
+    if is_topics_of_source(name, path):
+        return _source_with_topics(value)
     if ":" in name:
-        return f"a space is missing after ':', write `{': '.join(name.split(':', 1))}`"
+        return f"write `{': '.join(name.split(':', 1))}`, with a space after ':'"
     if key := meant(name, known):
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
@@ -121,6 +123,28 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
         is_listed = isinstance(value, ScalarNode) and value.value is None
         return f"write a list: [{name}, ...]" if is_listed else f"write a list: [{{{key}: {name}, ...}}]"
     return did_you_mean(name, known, CLOSE)
+
+
+def is_topics_of_source(name: str, path: Path) -> bool:
+    """Return whether a key of the mapping at `path` is `topics` in a source, which has one topic."""
+    return name == "topics" and [step for step in path if isinstance(step, str)][-1:] == ["source"]
+
+
+def _source_with_topics(value: Node) -> str:
+    written = to_data(value)
+    if isinstance(written, dict):
+        written = _in_flow(written.get("topic")) or "NAME"
+        return f"write the keys of 'topics' directly under 'source': `source: {{topic: {written}, ...}}`"
+    if isinstance(written, list):
+        names = [item.get("topic") if isinstance(item, dict) else item for item in written]
+        rest = ", ..." if any(isinstance(item, dict) and len(item) > 1 for item in written) else ""
+        return f"write a list of topics: `source: [{_each(names, 'topic', rest)}]`"
+    return f"write `source: {{topic: {_in_flow(written) or 'NAME'}}}`"
+
+
+def _each(names: Iterable[object], key: str, rest: str = "") -> str:
+    """Return a mapping for each name, as written inside brackets."""
+    return ", ".join(f"{{{key}: {_in_flow(name) or 'NAME'}{rest}}}" for name in names)
 
 
 def _owners(name: str, path: Path) -> str:
@@ -144,19 +168,44 @@ def for_value(error: SchemaError) -> str:
     value = str(error.value)
     if error.keyword == "pattern":
         pattern = error.limit
-        hint = as_variable(value) or meant_quantity(value, lambda each: matches(each, pattern))
         is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited")
-        return f"leave '{error.path[-1]}' out" if is_unset else hint
+        return f"leave '{error.path[-1]}' out" if is_unset else as_variable(value) or _meant_quantity(value, pattern)
+    if error.keyword == "maximum" and matches(EACH, str(error.schema.get("pattern", ""))):
+        return _MOST_OFTEN[1]
     if error.keyword == "const" and value == str(error.limit):
         return f"write it without quotes: {value}"
     if error.keyword != "enum":
         return ""
     if error.path[-1] in ("qos", "profile") and (key := _QOS_WORDS.get(value)):
         return f"write `qos: {{{key}}}`"
-    near = nearest(value, error.limit)
-    return f"did you mean '{near}'?" if near else ""
+    if near := nearest(value, error.limit):
+        return f"did you mean '{near}'?"
+    if error.path[-1] == "fields":
+        return _AUTO if value in ("*", "all") else _for_fields([value])
+    return ""
 
 
+def _meant_quantity(text: str, pattern: str) -> str:
+    if not (meant := meant_quantity(text, lambda each: matches(each, pattern))) or not matches(EACH, pattern):
+        return meant
+    supported = meant_quantity(text, lambda each: matches(each, pattern) and _is_supported(each))
+    return supported or _MOST_OFTEN[matches("1 Hz", pattern)]
+
+
+def _is_supported(often: str) -> bool:
+    """Return whether gateways can send that often."""
+    try:
+        (TOPIC_RATE if often.endswith("Hz") else PERIOD).parse(often)
+    except ValueError:
+        return False
+    return True
+
+
+_MOST_OFTEN = (
+    f"write at least '1ms', or '{EACH}' for every message",
+    f"write at most '1000 Hz', or '{EACH}' for every message",
+)
+"""What to write in place of a period and of a rate that gateways do not support."""
 _OPTIONAL = ("ttl", "age", "max_rate")
 """Limits that do not apply if the key is missing."""
 _QOS_WORDS = {
@@ -176,14 +225,21 @@ _INSTEAD: Mapping[Path, str] = {
     ("endpoints", "*"): "{{address: {0}, kind: board}}",
     ("node",): "{{name: {0}}}",
     ("record",): "{{directory: {0}}}",
-    ("reload",): "{{on_change: {0}}}",
     ("defaults", "deadman"): "{{timeout: {0}}}",
     ("gateways", "*", "topics"): "{{include: [{0}]}}",
     ("gateways", "*", "inbound", "*"): "{{topic: {0}, type: TYPE}}",
 }
 """Mappings that people write as a single value, and what to write instead."""
 
-
+_ON: Mapping[Path, str] = {
+    ("record",): "{directory: ../recordings}",
+    ("http",): "{address: 127.0.0.1:9108}",
+    ("foxglove",): "{address: 127.0.0.1:8765}",
+    ("reload",): "{on_change: true}",
+}
+"""Parts of the table that people turn on by `true`, and what to write instead."""
+_AUTO = "write `fields: auto`"
+_ADD_SPACE = "add a space after ':'"
 _BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gateways",))
 """Mappings whose keys are names that the table chooses."""
 
@@ -194,7 +250,7 @@ def for_type(error: SchemaError, tree: Node) -> str:
     if value is None:
         return _for_nothing(error, tree, name)
     if isinstance(value, str) and "object" in error.limit and re.match(r"\w+:[^\s/]", value):
-        return "a space is missing after ':'"
+        return _ADD_SPACE
     if error.path[:-1] == ("routes",):
         return f"write `{name}: {{ignore: why}}`" if value in (False, "ignore", "none") else ""
     if error.is_list_in_list:
@@ -207,9 +263,9 @@ def for_type(error: SchemaError, tree: Node) -> str:
 def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
     first, _, rest = name.partition(" ")
     if ":" in name:
-        return "a space is missing after ':'"
+        return _ADD_SPACE
     if rest:
-        return f"a ':' is missing, write `{first.rstrip('=')}: {rest.lstrip('= ')}`"
+        return f"write `{first.rstrip('=')}: {rest.lstrip('= ')}`, with a ':'"
     if "object" in error.limit:
         is_case = error.path[:-1] == ("routes",)
         return "indent its keys below it" + (", or write {ignore: why}" if is_case else "")
@@ -234,11 +290,13 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     """Return a hint with the value in the form that its key takes."""
     if isinstance(value, str) and _is_of(error.limit, resolve(value)):
         return f"write it without quotes: {value}"
+    if isinstance(value, bool):
+        return _for_truth(error.path, value)
     if hint := _for_collection(error, value):
         return hint
     if _is_at(error.path[-3:], ("deadman", "send", "*")):
         return without_case({name: value})
-    if (written := _in_flow(value)) is None or (isinstance(value, bool) and error.path != ("reload",)):
+    if (written := _in_flow(value)) is None:
         return ""
     if instead := next((text for place, text in _INSTEAD.items() if _is_at(error.path, place)), ""):
         if isinstance(value, list) and "[" not in instead:
@@ -251,6 +309,14 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
         return f'quote it: "{written}"'
     return ""
+
+
+def _for_truth(path: Path, value: bool) -> str:
+    if _is_at(path[-3:], ("deadman", "send", "*")):
+        return without_case({str(path[-1]): value})
+    if path in _ON:
+        return f"write `{path[0]}: {_ON[path]}`" if value else f"leave '{path[0]}' out"
+    return _AUTO if value and path[-1:] == ("fields",) else ""
 
 
 def without_case(fields: Mapping[str, object]) -> str:
@@ -270,9 +336,26 @@ def _is_of(kinds: str | list[str], value: object) -> bool:
 def _for_collection(error: SchemaError, value: object) -> str:
     if isinstance(value, dict) and error.limit == "array":
         return "start each item with '-'"
-    if isinstance(value, list) and error.path in _BY_NAME:
+    if not isinstance(value, list):
+        return ""
+    if error.path in _BY_NAME:
         return "replace each '-' with a name and ':'"
-    return ""
+    if error.path[-1] in _NAMED.values():
+        return f"write a list of mappings: [{_each(value, str(error.path[-1]))}]"
+    return _for_fields(value) if error.path[-1] == "fields" else ""
+
+
+def _for_fields(items: list[object]) -> str:
+    """Return a hint for `fields` written as a list."""
+    if items == ["auto"]:
+        return _AUTO
+    first = items[0] if items else None
+    if isinstance(first, dict) and len(first) == 1:
+        [(field, expression)] = first.items()
+        written = f"{field}: {_in_flow(expression) or 'EXPRESSION'}{', ...' * (len(items) > 1)}"
+        return f"remove each '-', as in `fields: {{{written}}}`"
+    field = first if isinstance(first, str) else "FIELD"
+    return f"write each field with its expression, as in `fields: {{{field}: EXPRESSION}}`"
 
 
 def _is_at(path: Path, place: Path) -> bool:

@@ -60,7 +60,7 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
         for error in unknown:
             known = list(error.schema["properties"])
             findings.extend(unknown_keys(tree, error.path, known, subject(error.path), empty))
-            repairs[error.path] = functools.partial(_with_known_keys, known=known)
+            repairs[error.path] = functools.partial(_with_known_keys, path=error.path, known=known)
         tree = rewritten(tree, repairs)
         found = schema_errors(tree, SCHEMA)
     rests = {error.path for error in found if _is_rest(tree, error.path)}
@@ -173,14 +173,15 @@ def unknown_keys(
         said.add(hints.in_other_words(name, known) or None)
 
 
-def _with_known_keys(node: Node, known: list[str]) -> Node:
+def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
     written = mapping(node)
     entries: dict[str, Entry] = {}
     broken = written.broken
     for name, entry in written.entries.items():
         free = [] if hints.in_other_words(name, known) else [key for key in known if key not in written.entries]
         meant = name if name in known else hints.meant(name, free)
-        if meant is None or (meant != name and meant in entries):
+        is_part = hints.is_topics_of_source(name, path) and not isinstance(entry.value, ScalarNode)
+        if meant is None or (meant != name and meant in entries) or is_part:
             broken = True  # the key's content is lost
         else:
             entries[meant] = entry

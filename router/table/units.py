@@ -174,7 +174,7 @@ def parse_topic_rate(value: str | float) -> int:
     """Parse `50 Hz` or a plain number as a period in nanoseconds."""
     period = round(1e9 / parse_rate(value))
     if not MIN_PERIOD <= period <= MAX_DURATION:
-        raise ValueError(f"a topic's rate is at most {10**9 // MIN_PERIOD} Hz, or 'each'")
+        raise ValueError(f"'{value}' is above {10**9 // MIN_PERIOD} Hz; to send every message, write 'each'")
     return period
 
 

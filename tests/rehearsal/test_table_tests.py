@@ -462,7 +462,7 @@ def test_table_is_the_one_that_the_file_is_named_after_or_that_it_names(tmp_path
 @pytest.mark.parametrize(
     ("written_in_full", "hint"),
     [
-        ("tests: {a: {given: {case:ph_info}, expect: any}}", "a space is missing after ':', write `case: ph_info`"),
+        ("tests: {a: {given: {case:ph_info}, expect: any}}", "write `case: ph_info`, with a space after ':'"),
         ("tests: {a: {when: {case: ph_info, from: sensor_board}, expect: any}}", "did you mean 'given'?"),
         ("tests: {a: {then: any}}", "did you mean 'expect'?"),
         ("tests: {a: {given: {case: ph_info, source: sensor_board}, expect: any}}", "did you mean 'from'?"),
