@@ -17,7 +17,7 @@ die() {
   exit 1
 }
 
-find_isolation() {  # print the command that cuts the network off; nothing if the system does not allow it
+find_isolation() {  # print the command that disconnects the network; nothing if the system does not allow it
   local command
   for command in "unshare --net" "unshare --map-root-user --net"; do
     # shellcheck disable=SC2086
@@ -34,9 +34,9 @@ check_wheel() {  # PYTHON FOLDER: install the wheel into a new environment and t
   if [ "$(uname -m)" = x86_64 ]; then requirement+='[ros]'; fi
   mkdir -p "$2/home"
   "$1" -m venv "$2/venv"
-  # With PEP 517, since pip of Python 3.10 and 3.11 cannot build empy by its setup.py without the package wheel.
+  # With PEP 517, because pip of Python 3.10 and 3.11 cannot build empy with its setup.py unless `wheel` is installed.
   "$2/venv/bin/pip" wheel --use-pep517 --wheel-dir "$2/packages" "$requirement"
-  # Nothing of this shell is left, such as a sourced ROS.
+  # Keep nothing from this shell, such as a sourced ROS.
   # shellcheck disable=SC2016,SC2086
   env --ignore-environment --chdir "$2/home" HOME="$2/home" PATH=/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin \
     $isolation bash -euo pipefail -c '

@@ -1,5 +1,5 @@
 # shellcheck shell=bash disable=SC2034
-# To be sourced: the interpreters that the router supports and that are found here.
+# To be sourced: finds the interpreters on this computer that the router supports.
 
 supported_pythons=(3.10 3.11 3.12 3.13)
 

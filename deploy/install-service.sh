@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Installs the router of this checkout as a systemd service, and starts it. `make install-service` calls it, as root.
+# Installs the router of this checkout as a systemd service, and starts it. `make install-service` runs it; needs root.
 #
-#   deploy/install-service.sh [TABLE]     the table is routes/rover.yaml unless said; run it again after changing
-#                                         address or interface of its listeners, its `record.directory`, or the
-#                                         checkout's place
+#   deploy/install-service.sh [TABLE]     the default table is routes/rover.yaml; run it again after changing the
+#                                         address or interface of a listener, `record.directory`, or the path of
+#                                         the checkout
 #
-# It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, /etc/default/rover-router once, and
-# makes the user rover-router. Listeners on an interface, wg0, get rover-router-wg0.socket, and the interface's device
-# unit a shorter timeout. docs/guides/deploy.md tells how to live with the service, and how to remove it.
+# It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, creates /etc/default/rover-router if
+# it does not exist, and adds the user rover-router. Listeners on an interface, for example wg0, get a unit
+# rover-router-wg0.socket, and the interface's device unit a shorter timeout. docs/guides/deploy.md describes how to
+# operate and remove the service.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 units=/etc/systemd/system
@@ -19,7 +20,7 @@ die() {
   exit 1
 }
 
-# Paths go into units, into settings that shell and systemd read, and through sed.
+# Paths are written to units and to settings that shell and systemd read, and pass through sed.
 check_place() {
   case $1 in
     *[[:space:][:cntrl:]\|\&\\\"\'\`\$%\;\#*?\<\>\(\)]*) die "'$1' has characters that systemd or a shell would misread: move it" ;;
@@ -28,7 +29,7 @@ check_place() {
 
 check_place "$root"
 [ "$(id -u)" = 0 ] || die "needs root: sudo make install-service"
-[ -x "$root/.venv/bin/router" ] || die "$root has no .venv yet: run 'make setup' first, as yourself"
+[ -x "$root/.venv/bin/router" ] || die "$root has no .venv yet: run 'make setup' first, as your own user"
 command -v systemctl >/dev/null || die "this computer has no systemd"
 
 chosen=
@@ -37,11 +38,11 @@ if [ $# -gt 0 ]; then
   check_place "$chosen"
 fi
 
-# What the units have to know of the table: "socket ADDRESS INTERFACE" (- for none), "write FOLDER", "read FOLDER";
-# findings go to stderr.
+# What the units need from the table: lines "socket ADDRESS INTERFACE" (- for none), "write FOLDER" and "read FOLDER".
+# Findings go to stderr.
 facts=$(
   set -a
-  RECORDINGS=/var/lib/$user  # as the unit says, unless the settings say something else
+  RECORDINGS=/var/lib/$user  # as in the unit; the settings may change it
   ROUTER_TABLE=$root/routes/rover.yaml
   # shellcheck disable=SC1090
   if [ -e "$settings" ]; then . "$settings"; fi
@@ -79,7 +80,7 @@ id "$user" >/dev/null 2>&1 || useradd --system --no-create-home --home-dir /none
 
 if [ ! -e "$settings" ]; then
   cat >"$settings" <<END
-# What rover-router.service is started with, for its next restart. After another ROUTER_TABLE, or other addresses of its
+# Environment of rover-router.service, read at each start. After changing ROUTER_TABLE, or the addresses of its
 # listeners, run deploy/install-service.sh again.
 ROUTER_TABLE=$root/routes/rover.yaml
 ROS_DOMAIN_ID=0
@@ -96,11 +97,11 @@ if [ -n "$chosen" ]; then
   fi
 fi
 
-# A socket unit has one BindToDevice=, and what it starts must be its own: so there is a pair of units for each interface.
+# A socket unit has one BindToDevice=, and needs a service of its own, so each interface has a pair of units.
 new=$(mktemp -d)
 trap 'rm -r "$new"' EXIT
 sockets=()
-rm -f "$units"/*.device.d/rover-router.conf  # of a table before
+rm -f "$units"/*.device.d/rover-router.conf  # of a previous table
 while read -r interface; do
   on=${interface:+-$interface}
   sockets+=("rover-router$on.socket")
@@ -111,8 +112,8 @@ while read -r interface; do
   addresses=$(printf '%s\n' "$facts" | awk -v on="${interface:--}" '$1 == "socket" && $3 == on { print "ListenDatagram=" $2 }')
   if [ -n "$interface" ]; then
     addresses+=$'\n'"BindToDevice=$interface"
-    # systemd waits for it at each start of the service, also after a crash: not for 90 s, since the router takes it
-    # when it comes.
+    # systemd waits for the interface at each start of the service, even after a crash. Do not wait 90 s: the router
+    # opens the listener when the interface appears.
     device=$units/$(systemd-escape --path --suffix=device "/sys/subsystem/net/devices/$interface").d
     mkdir -p "$device"
     printf '# Written by deploy/install-service.sh.\n[Unit]\nJobRunningTimeoutSec=10s\n' >"$device/rover-router.conf"
@@ -124,7 +125,7 @@ done < <(printf '%s\n' "$facts" | awk '$1 == "socket" { print $3 == "-" ? "" : $
 sed -e "s|/opt/rover-router|$root|g; s|^Sockets=.*|Sockets=${sockets[*]}|" "$root/deploy/systemd/rover-router.service" \
   >"$new/rover-router.service"
 
-# Home folders are hidden from the service, but for what it needs there.
+# Home folders are hidden from the service, except for the paths that it needs.
 mkdir -p "$units/rover-router.service.d"
 {
   printf '# Written by deploy/install-service.sh.\n[Service]\n'
@@ -136,7 +137,7 @@ done
 
 same_sockets=yes
 for socket in "${sockets[@]}"; do cmp -s "$new/$socket" "$units/$socket" || same_sockets=no; done
-for unit in "$units"/rover-router*.socket "$units"/rover-router-hold*.service; do  # of a table before
+for unit in "$units"/rover-router*.socket "$units"/rover-router-hold*.service; do  # of a previous table
   if [ -e "$unit" ] && [ ! -e "$new/${unit##*/}" ]; then
     same_sockets=no
     systemctl stop "${unit##*/}"
@@ -147,5 +148,5 @@ install -m 644 "$new"/* "$units"
 systemctl daemon-reload
 if [ $same_sockets = no ]; then systemctl stop rover-router.service "${sockets[@]}"; fi
 systemctl enable --quiet rover-router.service
-systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"
+systemctl restart rover-router.service || die "the service did not start; see: journalctl -u rover-router -e"
 echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Builds .venv: the router, ROS 2 Jazzy and the interfaces of schemas/comms; and the carrier's library.
+# Builds .venv with the router, ROS 2 Jazzy and the interfaces of schemas/comms, and the carrier's library.
 # `make setup` calls it.
 #
-#   PYTHON=...  the interpreter to use, 3.10 to 3.13; found without it
-#   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; a sourced one is found without it
-#   DEV=no      leave out what only developers need, for tests, lint and documentation; DEV=yes brings it back
+#   PYTHON=...  the interpreter to use, 3.10 to 3.13; default: the first suitable one
+#   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; default: the sourced one, if any
+#   DEV=no      leave out what only tests, lint and documentation need; DEV=yes adds it again
 #
-# Each step leaves the checksum of what it was made from in .venv/.made and is repeated when that changes.
-# These choices are remembered there. Details of each step are in .venv/setup.log.
+# Each step stores the checksum of its inputs in .venv/.made, and runs again when it changes. The choices above are also
+# stored there. The output of all steps is in .venv/setup.log.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -30,13 +30,13 @@ is_made() {  # STEP CHECKSUM
   [ -f "$made/$1" ] && [ "$(cat "$made/$1")" = "$2" ]
 }
 
-step() {  # STEP CHECKSUM TITLE COMMAND...: unless it is made; one line for the person, the rest for the log
+step() {  # STEP CHECKSUM TITLE COMMAND...: run it unless it is made; print one line, write its output to the log
   local name=$1 sum=$2 title=$3 started=$SECONDS status
   shift 3
   ! is_made "$name" "$sum" || return 0
   rm -f "$made/$name"
   printf 'setup: %s ... ' "$title"
-  set +e  # not `if ! "$@"`: a condition would switch off `set -e` inside the step
+  set +e  # not `if ! "$@"`: a condition would disable `set -e` inside the step
   (set -e; "$@") >>"$log" 2>&1
   status=$?
   set -e
@@ -65,7 +65,7 @@ is_supported() {  # PYTHON
   "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null
 }
 
-missing_for() {  # PYTHON: the Debian packages without which it cannot build the environment
+missing_for() {  # PYTHON: print the missing Debian packages that it needs to build the environment
   "$1" - <<'END'
 import importlib.util, pathlib, sys, sysconfig
 name = f"python{sys.version_info[0]}.{sys.version_info[1]}"
@@ -76,10 +76,10 @@ if not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists():
 END
 }
 
-find_python() {  # prints the first supported interpreter that has all it needs, else the first supported one
+find_python() {  # print the first supported interpreter that has all it needs, else the first supported one
   local candidate candidates first='' library
-  # The distribution's first: it is built with profile-guided optimization and runs the router a fifth faster than one
-  # that was compiled from source with default options.
+  # The distribution's first: it is built with profile-guided optimization and runs the router a fifth faster than an
+  # interpreter compiled from source with default options.
   candidates=(/usr/bin/python3 python3 python3.13 python3.12 python3.11 python3.10)
   if [ -n "$ros" ]; then  # rclpy there works with one interpreter only
     candidates=()
@@ -105,14 +105,14 @@ check_tools() {
   if [ -n "$base" ]; then
     mapfile -t -O "${#missing[@]}" missing < <(missing_for "$base")
   elif [ -n "${PYTHON:-}" ]; then
-    die "PYTHON=$PYTHON is no Python 3.10 to 3.13"
+    die "PYTHON=$PYTHON is not a Python 3.10 to 3.13"
   else
     missing+=(python3 python3-venv python3-dev)
   fi
   if [ -n "$ros" ] && [ ! -d "$ros/share/rosidl_default_generators" ]; then
     missing+=(ros-jazzy-rosidl-default-generators)
   fi
-  [ ${#missing[@]} -eq 0 ] || die "this machine lacks something; on Debian or Ubuntu:" "  apt-get install ${missing[*]}"
+  [ ${#missing[@]} -eq 0 ] || die "packages are missing; on Debian or Ubuntu:" "  apt-get install ${missing[*]}"
 }
 
 make_environment() {
@@ -131,7 +131,7 @@ install_packages() {
     grep -v '^numpy==' "$root/constraints.txt" >"$constraints"
   fi
   if [ "$dev" = yes ]; then extras=${extras:+$extras,}dev; fi
-  # The variable, unlike pip's option, also holds for what pip fetches to build this package.
+  # Unlike pip's option, the variable also applies to the packages that pip needs to build this one.
   PIP_CONSTRAINT=$constraints PIP_DISABLE_PIP_VERSION_CHECK=1 \
     "$python" -m pip install --no-input --editable "$root${extras:+[$extras]}"
 }
@@ -143,7 +143,7 @@ build_carrier() {
 build_comms() (
   build=$venv/build/comms
   installed=$made/comms.files
-  rm -rf "$build"  # of a failed build; keeping one saves no time, because the generators write every file anew
+  rm -rf "$build"  # left by a failed build; reusing it saves no time, because the generators rewrite every file
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
     # shellcheck disable=SC1091
@@ -156,32 +156,32 @@ build_comms() (
   cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
     -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF -DCMAKE_PROJECT_comms_INCLUDE="$root/deploy/interfaces.cmake"
   cmake --build "$build" --parallel "$(nproc)"
-  # Only now, so that a failed build leaves the old ones: also the files of messages that are no more.
+  # Remove the old files only now, so that a failed build keeps them. This includes files of deleted messages.
   if [ -f "$installed" ]; then xargs -d '\n' rm -f <"$installed"; fi
   cmake --install "$build"
   mv "$build/install_manifest.txt" "$installed"
   rm -r "$build"
 )
 
-# The service may not write to the checkout, and would compile all of it with each start.
+# The service may not write to the checkout, so without this it would compile the bytecode at each start.
 compile_router() {
   "$python" -m compileall -q router
 }
 
-is_usable() {  # the environment: made here, its interpreter still there, and the one asked for
+is_usable() {  # whether the environment was made here and has an interpreter that works and is the requested one
   local identity='import sys; print(sys.base_prefix, sys.version)'
   is_made environment "$environment" && "$python" -c '' 2>/dev/null || return 1
   [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" -c "$identity")" = "$("$python" -c "$identity")" ]
 }
 
-# One at a time: the lock is this file itself, and ends with the process.
+# One set-up at a time. The lock is on this file itself, and ends with the process.
 exec 9<"${BASH_SOURCE[0]}"
 flock 9
 
 remembered=$(cat "$made/ros" 2>/dev/null || find_sourced_ros)
 ros=${ROS:-$remembered}
-# What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere. ROS's script leaves
-# AMENT_CURRENT_PREFIX behind, which that of the interfaces would take for where they are.
+# What must be sourced before .venv/bin/router runs: nothing with ROS from wheels. ROS's script leaves
+# AMENT_CURRENT_PREFIX set, and the script of the interfaces would use it as their location.
 to_source=${ros:+. \"$ros/setup.sh\"
 unset AMENT_CURRENT_PREFIX
 . \"$venv/share/comms/local_setup.sh\"}
@@ -189,9 +189,9 @@ dev=${DEV:-$(cat "$made/dev" 2>/dev/null || echo yes)}
 [[ $dev =~ ^(yes|no)$ ]] || die "DEV=$dev is neither yes nor no"
 environment=$(printf '%s\n' "$root" "$to_source" "$dev" | checksum)
 packages=$(cat pyproject.toml constraints.txt | checksum)
-carrier=library  # which has the checksum of its sources in it
+carrier=library  # a constant: the library contains the checksum of its sources
 "$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"
-# The pins of what the generated code is compiled against belong to it as much as the messages.
+# The generated code also depends on the pinned packages that it is compiled against.
 comms=$({ find schemas/comms deploy/interfaces.cmake -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
 
 if is_usable && is_made packages "$packages" && is_made carrier "$carrier" && is_made comms "$comms"; then

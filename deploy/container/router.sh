@@ -1,5 +1,5 @@
 #!/bin/bash
-# `router` in the container: sets up ROS and the comms interfaces first, also where `docker exec` calls it.
+# `router` in the container: sources ROS and the comms interfaces first, so that it also works with `docker exec`.
 set -e
 # shellcheck disable=SC1091
 source /opt/rover_router/ros/setup.bash

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Makes the keys and the configuration of a WireGuard tunnel between the rover and its basestations.
+# Writes keys and configuration of a WireGuard tunnel between the rover and its basestations.
 #
 #   deploy/wireguard/keys.sh ROVER [BASESTATION...]
 #
-# ROVER is the address (or name) by which basestations reach the rover over the radio, 192.168.1.20 or 192.168.1.20:51820.
-# Each BASESTATION is a name, `basestation` unless said. For each computer there is then a folder NAME/wg0.conf beside
-# this script, in keys/, which git ignores: copy it to /etc/wireguard/wg0.conf there, and remove it here. Run again with
-# other names, it adds these to the rover's file and leaves the others as they are. docs/guides/security.md tells the rest.
+# ROVER is the rover's address or host name on the radio, such as 192.168.1.20 or 192.168.1.20:51820. Each BASESTATION
+# is a name; the default is `basestation`. The script writes keys/NAME/wg0.conf beside itself for each computer (git
+# ignores keys/). Move each file to /etc/wireguard/wg0.conf on its computer. Further runs with other names add these to
+# the rover's file and keep the existing ones. docs/guides/security.md describes the tunnel.
 set -euo pipefail
 umask 077
 keys=${KEYS:-$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)/keys}
@@ -17,16 +17,16 @@ die() {
   exit 1
 }
 
-[ $# -ge 1 ] || die "say by which address the rover is reached: $0 192.168.1.20 [BASESTATION...]"
+[ $# -ge 1 ] || die "give the rover's address on the radio: $0 192.168.1.20 [BASESTATION...]"
 command -v wg >/dev/null || die "needs wg: apt install wireguard-tools"
 endpoint=$1
 shift
-[[ $endpoint =~ ^[A-Za-z0-9.-]+(:[0-9]+)?$ ]] || die "'$endpoint' is no address"
+[[ $endpoint =~ ^[A-Za-z0-9.-]+(:[0-9]+)?$ ]] || die "'$endpoint' is not an address"
 [[ $endpoint == *:* ]] || endpoint+=:51820
 [ $# -ge 1 ] || set -- basestation
 for name in "$@"; do
-  [[ $name =~ ^[A-Za-z0-9_-]+$ && $name != rover ]] || die "'$name' is no name for a basestation"
-  [ ! -e "$keys/$name" ] || die "$name has keys already: remove $keys/$name, and its [Peer] in rover/wg0.conf, for new ones"
+  [[ $name =~ ^[A-Za-z0-9_-]+$ && $name != rover ]] || die "'$name' cannot be the name of a basestation: use letters, digits, - and _, but not 'rover'"
+  [ ! -e "$keys/$name" ] || die "$name already has keys: to make new ones, remove $keys/$name and its [Peer] in rover/wg0.conf"
 done
 
 rover=$keys/rover/wg0.conf

@@ -65,7 +65,7 @@ def test_keys_are_nobody_elses_and_stay_when_a_basestation_is_added(tmp_path: Pa
     assert {stat.S_IMODE(path.stat().st_mode) for path in after} == {0o600}
     assert {stat.S_IMODE(path.parent.stat().st_mode) for path in after} == {0o700}
     assert len(set(re.findall("PrivateKey = (.*)", "".join(after.values())))) == 3
-    assert "has keys already" in make_keys(tmp_path, "192.168.1.20", "second", check=False)
+    assert "already has keys" in make_keys(tmp_path, "192.168.1.20", "second", check=False)
     assert {path: path.read_text() for path in after} == after
 
 

@@ -14,11 +14,11 @@ PACKAGE = "rover_router"
 
 ARGUMENTS = {
     "table": (str(Path(get_package_share_directory(PACKAGE), "routes", "rover.yaml")), "route table"),
-    "params_file": ("", "YAML file of ROS parameters, which fill the table's variables: basestation is ${BASESTATION}"),
-    "name": ("", "name of the node; where empty, the table's"),
-    "namespace": ("", "namespace of the node and of its relative topics; where empty, the table's"),
-    "log_level": ("info", "least that is logged: debug, info, warning or error"),
-    "respawn": ("false", "start it again 2 s after it has ended; a wrong table is no exception"),
+    "params_file": ("", "YAML file of ROS parameters, which set the table's variables: basestation for ${BASESTATION}"),
+    "name": ("", "name of the node; if empty, the table's"),
+    "namespace": ("", "namespace of the node and its relative topics; if empty, the table's"),
+    "log_level": ("info", "lowest level that is logged: debug, info, warning or error"),
+    "respawn": ("false", "restart 2 s after an exit, even if the table has errors"),
 }
 
 
@@ -31,7 +31,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _router(context: LaunchContext) -> list[Node]:
-    """A function, because an empty name, namespace or file must not be handed on."""
+    """A function, because an empty name, namespace or file must not be passed on."""
     chosen = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     return [
         Node(
