@@ -88,7 +88,11 @@ def every() -> Iterator[tuple[str, Kept | None, str]]:
     Raises OSError.
     """
     for _, path in sorted(_files(folder(), _ENDING), reverse=True):
-        yield path, *_judged(path)
+        try:
+            judged = _judged(path)
+        except FileNotFoundError:  # a router has just removed it
+            continue
+        yield path, *judged
 
 
 def _judged(path: str) -> tuple[Kept | None, str]:

@@ -83,7 +83,10 @@ def _warn_once(event: str) -> None:
 
 
 def drops(opened: socket.socket) -> int:
-    """Datagrams that the kernel dropped before they were received, since the socket was opened."""
+    """Datagrams that the kernel dropped before they were received, since the socket was opened.
+
+    Raises OSError for a closed socket.
+    """
     # Linux before 4.12 lacks this, and qemu-user returns one word: use the table of all sockets then.
     with suppress(OSError, struct.error):
         words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))

@@ -160,8 +160,12 @@ class ListeningSocket:
             self.receive_buffer = ask_for_receive_buffer(self.socket, size)
 
     def has_lost_interface(self) -> bool:
-        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears."""
-        return self.interface is not None and bound_interface(self.socket) is None
+        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears.
+
+        Thread-safe; false for a closed socket.
+        """
+        is_lost = self.interface is not None and bound_interface(self.socket) is None
+        return is_lost and self.socket.fileno() >= 0
 
     @contextmanager
     def shared(self) -> Iterator[None]:

@@ -5,6 +5,7 @@ If the writer was killed, it reads all complete chunks of the file.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -56,7 +57,7 @@ class Recording:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from error
-        self.size = path.stat().st_size
+        self.size = os.fstat(self._file.fileno()).st_size  # the file may be removed meanwhile
         self._records = StreamReader(self._file, validate_crcs=True, record_size_limit=self.size).records
         try:
             self._begin()

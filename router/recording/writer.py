@@ -118,8 +118,9 @@ class RecordingFile:
 
     def abandon(self) -> None:
         """Close a file after a write error; remove it if it has no chunk."""
-        if not self._indexes:
-            self.path.unlink(missing_ok=True)
+        with suppress(OSError):
+            if not self._indexes:
+                self.path.unlink()
         with suppress(OSError):
             self.close()
 

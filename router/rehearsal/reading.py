@@ -11,7 +11,17 @@ from typing import Any, TypeVar
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, did_you_mean_file, shown_path
+from router.errors import (
+    Code,
+    Diagnostic,
+    Located,
+    SourceSpan,
+    TableError,
+    UsageError,
+    did_you_mean,
+    did_you_mean_file,
+    shown_path,
+)
 from router.rehearsal.fields import offset
 from router.rehearsal.steps import Expected, ExpectedReader, GivenReader, Names, Step
 from router.table.compose import compose
@@ -47,11 +57,14 @@ class TestFile:
 
 
 def find_test_files(paths: Sequence[Path]) -> list[Path]:
-    """The files that the paths stand for, each once: a folder stands for the test files in it."""
+    """The files that the paths stand for, each once: a folder stands for the test files in it. Raises UsageError."""
     files: dict[Path, None] = {}
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
-            found = sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS) and file.name[0] != ".")
+            try:
+                found = sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS) and file.name[0] != ".")
+            except OSError as error:
+                raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
             files.update(dict.fromkeys(found))
         else:
             files[path] = None

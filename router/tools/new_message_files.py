@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -95,11 +96,13 @@ class Written:
     def undo(self) -> None:
         for path, before in self._before.items():
             if before is None:
-                path.unlink(missing_ok=True)
+                with suppress(FileNotFoundError, NotADirectoryError):  # it was not written
+                    path.unlink()
             elif path.read_bytes() != before:
                 path.write_bytes(before)
         for folder in self._folders:  # the innermost first
-            folder.rmdir()
+            with suppress(OSError):  # it was not made, or has other files by now
+                folder.rmdir()
 
 
 def locked(site: Site) -> str:

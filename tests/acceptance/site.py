@@ -22,6 +22,7 @@ from typing import Any
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS, ROUTER, TOPICS_FROM_ROS
 from tests.ports import free_port
+from tests.tasks import of_threads
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -135,8 +136,8 @@ class RouterProcess:
             self.process.send_signal(signal.SIGCONT)
 
     def _is_stopped(self) -> bool:
-        threads = Path(f"/proc/{self.process.pid}/task").glob("*/stat")
-        return all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads)
+        states = of_threads(self.process.pid, lambda task: (task / "stat").read_text().rpartition(")")[2].split()[0])
+        return set(states) == {"T"}
 
     def text(self) -> str:
         """The router's stderr so far."""

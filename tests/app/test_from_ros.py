@@ -9,7 +9,6 @@ import struct
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
@@ -20,6 +19,7 @@ from router.carrier.from_ros import FromRosThread
 from router.threads import StuckError
 from tests.app.conftest import BRAKE, Site
 from tests.ros.peers import Publisher, wait_until
+from tests.tasks import thread_names
 
 TYPE = "comms/msg/DrivingBoardMotorMessage"
 TIMEVAL = struct.Struct("@ll")
@@ -68,10 +68,6 @@ def numbers(site: Site, until: int) -> list[int]:
         if not datagram.startswith(BRAKE[:2]):
             got.append(int(struct.unpack_from("<f", datagram, 3)[0]))
     return got
-
-
-def thread_names() -> list[str]:
-    return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
 
 
 @pytest.fixture

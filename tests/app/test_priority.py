@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.site import RouterProcess, site, wait_until
+from tests.tasks import name_of, of_threads
 
 THREADS = {"receive", "timers", "ros urgent"}
 UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
@@ -35,7 +36,4 @@ def test_native_threads_run_first_where_they_may(within: Sequence[str], policy: 
 
 def policies(router: RouterProcess) -> dict[str, int]:
     """By the name of the thread, which asks for its own when it first runs."""
-    return {
-        (thread / "comm").read_text().strip(): os.sched_getscheduler(int(thread.name))
-        for thread in Path(f"/proc/{router.process.pid}/task").iterdir()
-    }
+    return dict(of_threads(router.process.pid, lambda task: (name_of(task), os.sched_getscheduler(int(task.name)))))

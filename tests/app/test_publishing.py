@@ -8,7 +8,6 @@ import struct
 import threading
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
@@ -20,6 +19,7 @@ from router.errors import StartError
 from tests.app.conftest import Site, numbered
 from tests.ports import free_port
 from tests.ros.peers import Subscriber, wait_until
+from tests.tasks import thread_names
 
 FLOAT = "std_msgs/msg/Float32"
 ROUTES = f"""\
@@ -33,10 +33,6 @@ ROUTES = f"""\
 def subscriber() -> Iterator[Subscriber]:
     with closing(Subscriber("published_ph", FLOAT)) as made:
         yield made
-
-
-def thread_names() -> list[str]:
-    return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
 
 
 def await_subscriber(router: Router, subscriber: Subscriber) -> None:

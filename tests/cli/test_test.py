@@ -228,6 +228,18 @@ def test_folder_without_tests_is_wrong_usage(tmp_path: Path, capsys: pytest.Capt
     assert "no tests (*.test.yaml)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("verb", ["test", "validate"])
+def test_a_folder_that_cannot_be_read_is_wrong_usage(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(_: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    assert main([verb, str(tmp_path)]) == BAD_USAGE
+    assert f"the folder '{tmp_path}' cannot be read: Permission denied" in capsys.readouterr().err
+
+
 LISTED = """
 version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}

@@ -126,6 +126,17 @@ async def test_what_the_kernel_drops_is_known_and_a_burst_is_kept(headset: socke
 
 
 @asynchronous
+async def test_a_socket_that_closes_while_another_thread_asks_has_no_new_drops(
+    headset: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with served(headset) as (transport, _):
+        with monkeypatch.context() as closing, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+            closing.setattr(transport, "_socket", closed)
+            closed.close()
+            assert transport.kernel_drops() == 0
+
+
+@asynchronous
 async def test_a_client_that_is_not_there_costs_nothing() -> None:
     events = Events()
     transport = UdpTransport(local(), local(), events)

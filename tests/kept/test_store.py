@@ -269,6 +269,18 @@ def test_at_most_four_are_kept_and_the_oldest_go(cache: Path, monkeypatch: pytes
     assert store.find()[0] is not None
 
 
+def test_a_file_that_is_removed_while_all_are_read_is_left_out(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keep()
+    oldest = only(cache)
+    os.utime(oldest, (0, 0))
+    monkeypatch.setattr(sys, "argv", ["router", "run", "other.yaml"])
+    keep()
+    found = store.every()
+    assert next(found)[1] is not None
+    oldest.unlink()
+    assert list(found) == []
+
+
 def test_what_another_process_is_writing_stays_and_what_one_has_left_goes(cache: Path) -> None:
     keep()
     young, old = cache / f"1.program.1-1{store._UNFINISHED}", cache / f"2.program.1-1{store._UNFINISHED}"

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
@@ -94,6 +95,24 @@ def test_datagrams_that_the_kernel_drops_are_known(stack: ExitStack, peer: socke
     assert listener.kernel_drops() == 500 - received > 0
     listener.close()
     assert listener.kernel_drops() == 500 - received
+
+
+class _ClosedMeanwhile(socket.socket):
+    """A socket that a reload closes while another thread looks at it."""
+
+    def getsockopt(self, *arguments: Any) -> Any:
+        self.close()
+        return super().getsockopt(*arguments)
+
+
+def test_a_socket_that_is_closed_while_it_is_looked_at_has_lost_nothing(stack: ExitStack) -> None:
+    listener = stack.enter_context(closing(Listener(replace(plan(), interface="lo"))))
+    assert not listener.has_lost_interface()
+    listener.opened.socket = _ClosedMeanwhile(fileno=os.dup(listener.socket.fileno()))
+    assert not listener.has_lost_interface()
+    with listener.socket:
+        listener.socket = _ClosedMeanwhile(fileno=os.dup(listener.socket.fileno()))
+    assert listener.kernel_drops() == 0
 
 
 def _drain(nonblocking: socket.socket) -> int:

@@ -287,6 +287,21 @@ def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
         monkeypatch.undo()
 
 
+def test_a_disk_that_becomes_read_only_is_no_fault_of_the_router(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    with capture_logs() as logs, running_recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "write", _full_after_the_head)
+        monkeypatch.setattr(Path, "unlink", refuse)  # so the empty file stays
+        show(made, mirror, now(imu(1)))
+        monkeypatch.undo()
+    assert [each["log_level"] for each in logs] == ["error"]
+    assert counted(made)["record_dropped write_error"] == 1
+
+
 def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with running_recorder(tmp_path) as (made, mirror):
         monkeypatch.setattr(recorder_module, "MOST_QUEUED", 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any
 
 import pytest
@@ -160,6 +160,22 @@ def test_what_is_no_recording_is_refused(content: bytes | None, said: str, tmp_p
         path.write_bytes(content)
     with pytest.raises(UsageError, match=said):
         Recording(path)
+
+
+class _RemovedOnceOpen(PosixPath):
+    """A file that the router removes, to make room, as soon as somebody has opened it."""
+
+    def open(self, *arguments: Any, **options: Any) -> Any:
+        opened = super().open(*arguments, **options)
+        self.unlink()
+        return opened
+
+
+def test_a_recording_that_is_removed_while_it_is_opened_is_still_read(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "it.mcap", *BATCHES)
+    found = Recording(_RemovedOnceOpen(path))
+    assert len([*found.datagrams()]) == sum(map(len, BATCHES))
+    assert not path.exists()
 
 
 def test_mcap_of_somebody_else_is_refused(tmp_path: Path) -> None:

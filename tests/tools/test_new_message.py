@@ -143,6 +143,17 @@ def test_what_is_interrupted_is_taken_back(
     assert set(site.rglob("*")) == folders
 
 
+def test_a_file_in_the_place_of_a_folder_is_told_and_all_is_taken_back(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_the_way = site / "protos/components/container_board"
+    in_the_way.touch()
+    before, folders = contents(site), set(site.rglob("*"))
+    assert main(["new", "ContainerBoardRadiationInfo", "--number", "27", "--board", "container"]) == BAD_USAGE
+    assert f"{in_the_way} cannot be written: File exists" in capsys.readouterr().err
+    assert (contents(site), set(site.rglob("*"))) == (before, folders)
+
+
 def test_what_is_interrupted_while_it_is_checked_is_taken_back(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = contents(site)
     really = router.cli.new._check

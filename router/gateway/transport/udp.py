@@ -9,6 +9,7 @@ import asyncio
 import socket
 from collections import deque
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
 from router.gateway.transport.binding import Binding
@@ -57,8 +58,10 @@ class UdpTransport:
 
     def kernel_drops(self) -> int:
         """Return how many datagrams, from any sender, the kernel has dropped. Thread-safe."""
-        opened = self._socket
-        return self._drops_at_close if opened is None else drops(opened)
+        if (opened := self._socket) is not None:
+            with suppress(OSError):  # it was closed meanwhile
+                return drops(opened)
+        return self._drops_at_close
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
         for client in clients:
