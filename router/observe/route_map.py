@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from router.compiler.metrics import CLIENTS
+from router.compiler.program import Program
 from router.compiler.topics import resolved
 from router.table.keys import phrases
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
@@ -77,6 +78,20 @@ def nodes_and_edges(table: RouteTable) -> tuple[list[Node], list[Edge]]:
             nodes.setdefault(node.key, node)
         edges += _gateway_edges(gateway, table)
     return list(nodes.values()), edges
+
+
+def deadman_edges(program: Program) -> Iterator[Edge]:
+    """Yield what deadmen send in place of commands, counted by `deadman_datagrams_sent{route, destination=label}`."""
+    for route in program.table.routes:
+        if route.deadman is not None:
+            about = f"{route.deadman.case.value}, sent by the deadman"
+            for name in (to.value for to in route.deadman.to):
+                yield Edge(f"case:{route.case.value}", f"to:@{name}", route.name, name, about)
+    for gateway in program.gateways:
+        for topic, inbound in gateway.inbound.items():
+            if inbound.deadman is not None:
+                about = "published by the deadman"
+                yield Edge(_key(gateway.settings), f"to:{topic}", inbound.deadman.route, topic, about)
 
 
 def _case(route: Route) -> Node:

@@ -7,12 +7,13 @@ from typing import Any
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import INTENDED_REASONS
+from router.compiler.program import Program
 from router.observe.last_values import LastValues
-from router.observe.route_map import endpoint_node, nodes_and_edges
+from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
 from router.observe.watch import Health
-from router.table.model import RouteTable, Transport
+from router.table.model import Transport
 
 Json = dict[str, Any]
 
@@ -94,13 +95,14 @@ class Status:
     def map(self) -> Json:
         """Return everything that is fixed while a table runs. `keeps`: seconds that can be saved, or None. `intended`:
         reasons of intended losses."""
-        table = self._running.program.table
+        program = self._running.program
+        table = program.table
         kept = table.record.last if self._can_save and table.record is not None else None
         return {
             "map": table.sha256,
             "keeps": None if kept is None else kept / 1e9,
             "intended": sorted(INTENDED_REASONS),
-            **_map_json(table),
+            **_map_json(program),
         }
 
     def close(self) -> None:
@@ -141,12 +143,13 @@ def _steps(metric: str, path: str) -> tuple[str | int, ...]:
 _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
-def _map_json(table: RouteTable) -> Json:
-    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: the
-    payload case that each route's deadman sends, and its endpoints."""
+def _map_json(program: Program) -> Json:
+    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: links of
+    what deadmen send."""
+    table = program.table
     nodes, edges = nodes_and_edges(table)
-    deadmen = {route.name: route.deadman for route in table.routes if route.deadman is not None}
-    halted = [endpoint_node(table.endpoints[to.value], "to", 2) for each in deadmen.values() for to in each.to]
+    deadmen = [*deadman_edges(program)]
+    halted = [endpoint_node(table.endpoints[each.label], "to", 2) for each in deadmen if each.label in table.endpoints]
     return {
         "name": table.node.name,
         "listeners": {name: str(listener.address.value) for name, listener in table.listeners.items()},
@@ -155,9 +158,7 @@ def _map_json(table: RouteTable) -> Json:
             for gateway in table.gateways.values()
             if gateway.transport.value is Transport.WEBSOCKET and gateway.address is not None
         },
-        "deadmen": {
-            route: {"case": each.case.value, "to": [to.value for to in each.to]} for route, each in deadmen.items()
-        },
+        "deadmen": [asdict(edge) for edge in deadmen],
         "nodes": [{**asdict(node), "kind": node.kind.value} for node in dict.fromkeys([*nodes, *halted])],
         "links": [asdict(edge) for edge in edges],
     }

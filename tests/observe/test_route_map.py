@@ -9,7 +9,7 @@ import pytest
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.observe.route_map import NodeKind, nodes_and_edges
+from router.observe.route_map import NodeKind, deadman_edges, nodes_and_edges
 from router.table.model import ANY
 from tests.tables import ROUTES
 
@@ -39,6 +39,16 @@ def test_links_are_named_as_the_metrics_name_what_flows(name: str) -> None:
             metric = "messages_published" if kinds[edge.end] is NodeKind.TOPIC else "datagrams_sent"
             assert (metric, edge.route, edge.label) in series
             assert any(each[:3] == ("messages_dropped", edge.route, edge.label) for each in series)
+
+
+def test_what_a_deadman_sends_is_named_as_the_metrics_name_it(counted: Program) -> None:
+    """Of boards, and of clients of gateways."""
+    series = {each.labels for each, _ in counted.counters.series() if each.metric == "deadman_datagrams_sent"}
+    edges = [*deadman_edges(counted)]
+    assert {(edge.route, edge.label) for edge in edges} == series
+    assert ("dashboard:/cmd_vel", "/cmd_vel") in series
+    nodes, _ = nodes_and_edges(counted.table)
+    assert {key for edge in edges for key in (edge.start, edge.end)} <= {node.key for node in nodes}
 
 
 def test_every_delivery_of_the_books_has_a_link() -> None:

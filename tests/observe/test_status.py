@@ -96,7 +96,9 @@ def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Statu
     drawn = shown.map()
     assert (drawn["name"], drawn["keeps"]) == ("rover_router", None)
     assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
-    assert drawn["deadmen"]["manual_drive"] == {"case": "manual_brake", "to": ["driving_board"]}
+    [drive] = [each for each in drawn["deadmen"] if each["route"] == "manual_drive"]
+    assert (drive["start"], drive["end"], drive["label"]) == ("case:manual_drive", "to:@driving_board", "driving_board")
+    assert drive["about"].startswith("manual_brake")
     board = next(node for node in drawn["nodes"] if node["key"] == "from:@sensor_board")
     assert (board["address"], board["role"]) == ("127.0.0.30:25008", "board")
 
@@ -127,7 +129,7 @@ def test_the_map_has_a_board_that_only_a_deadman_sends_to(tmp_path: Path) -> Non
     with closing(Status(running, cast("Health", FakeHealth(running)))) as shown:
         drawn = shown.map()
     running.mirror.close()
-    assert drawn["deadmen"]["manual_drive"]["to"] == ["driving_board", "arm_board"]
+    assert [each["end"] for each in drawn["deadmen"]] == ["to:@driving_board", "to:@arm_board"]
     assert [node["key"] for node in drawn["nodes"] if node["column"] == 2] == ["to:@driving_board", "to:@arm_board"]
 
 

@@ -304,6 +304,58 @@ def test_a_deadman_that_sends_is_drawn_from_its_commands_to_the_board(
     page.until(f"!({is_seen})")
 
 
+CLIENT_DEADMEN = """\
+version: 1
+gateways:
+  phone:
+    transport: {websocket: 127.0.0.1:28765}
+    inbound:
+      - {topic: /cmd_vel, type: geometry_msgs/msg/Twist, deadman: {timeout: 500ms, send: {}}}
+      - {topic: /arm_vel, type: geometry_msgs/msg/TwistStamped, deadman: {timeout: 500ms, send: {}}}
+      - {topic: /horn, type: std_msgs/msg/Bool}
+"""
+
+
+def test_a_deadman_of_a_client_is_drawn_from_its_gateway_to_its_topic(browser: Browser, tmp_path: Path) -> None:
+    table = tmp_path / "clients.yaml"
+    table.write_text(CLIENT_DEADMEN)
+    program = check_table(table).program
+    assert program is not None
+    running = FakeRunning(program)
+    running.count("config_last_reload_successful", to=1)
+    health = FakeHealth(running)
+    drawn, other = (f"links.find((link) => link.route === 'phone:{topic}')" for topic in ("/cmd_vel", "/arm_vel"))
+    is_seen = f"{drawn}.line.checkVisibility() && {drawn}.mark.checkVisibility()"
+    with closing(served(running, health=health)) as server:
+        page = open_page(browser, f"http://{server.address}/")
+        until_compared(page)
+        assert page.evaluate("boxes(2).map(({ name }) => name)") == ["clients of phone", "/cmd_vel", "/arm_vel"]
+        assert not page.evaluate(is_seen)
+        running.count("messages_published", "phone", "/cmd_vel", to=9)
+        running.count("deadman_active", "phone:/cmd_vel", to=1)
+        running.count("deadman_datagrams_sent", "phone:/cmd_vel", "/cmd_vel", to=40)
+        page.until(f"{drawn}.state === 'sending' && {is_seen}")
+        assert page.evaluate(f"{other}.state") == ""
+        commands = line("gateway:phone", "to:/cmd_vel")
+        assert page.evaluate(f"{drawn}.line.getAttribute('d') === {commands}.line.getAttribute('d')")
+        assert "■ deadman" in page.evaluate(f"{box('gateway:phone')}.innerText")
+        shown = page.until(f"/[0-9]\\/s/.test({box('to:/cmd_vel')}.innerText) && {box('to:/cmd_vel')}.innerText")
+        assert "geometry_msgs/msg/Twist" in shown
+        assert "◆ subscribed" in shown
+        choose(page, "gateway:phone")
+        assert "published by the deadman" in page.text("#facts")
+        assert "■ the deadman sends to /cmd_vel" in page.text("#facts")
+        assert page.evaluate("nodes.get('gateway:phone').words.children.length") == 3
+        choose(page, "clients:gateway:phone")
+        assert page.evaluate(f"{drawn}.element.classList.contains('near')")
+        health.parked = 27 * 60
+        page.until(f"{drawn}.state === 'calm' && {is_seen}")
+        assert page.complaints() == []
+        page.close()
+    running.mirror.close()
+    assert running.failures == []
+
+
 def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
     running: FakeRunning, health: FakeHealth, page: Page
 ) -> None:
