@@ -134,7 +134,7 @@ def numbers(now: Snapshot) -> Json:
 
 
 def _steps(metric: str, path: str) -> tuple[str | int, ...]:
-    """Return the keys of a path, with indexes in place of labels."""
+    """Return the keys of a path, with the index of the label in place of each label."""
     return tuple(SERIES[metric].index(key[1:-1]) if key.startswith("{") else key for key in path.split())
 
 
@@ -142,8 +142,9 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
 def _map_json(table: RouteTable) -> Json:
-    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: the
-    payload case that each route's deadman sends, and its endpoints."""
+    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: the
+    payload case that each route's deadman sends, and its endpoints.
+    """
     nodes, edges = nodes_and_edges(table)
     deadmen = {route.name: route.deadman for route in table.routes if route.deadman is not None}
     halted = [endpoint_node(table.endpoints[to.value], "to", 2) for each in deadmen.values() for to in each.to]
