@@ -18,7 +18,7 @@ class ClientQueue:
 
     While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema). A newer frame
     replaces the one in the queue and keeps its place. `sent` and `dropped` count frames since the client joined. Times
-    are of the boot clock, in ns.
+    are on the boot clock, in ns.
     """
 
     def __init__(self, client: Client, number: int, on_wire: Callable[[Sequence[Frame]], Sequence[Frame]]) -> None:
@@ -27,7 +27,7 @@ class ClientQueue:
         self.sent = 0
         self.dropped = 0
         self.lacking: set[str] = set()
-        """Topics with frames that newer ones replaced."""
+        """Topics with a queued frame that a newer one replaced."""
         self._on_wire = on_wire
         self._behind_since: int | None = None
         self._schemas: dict[Hashable, Frame] = {}
@@ -103,7 +103,7 @@ class ClientQueue:
         return passed
 
     def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[str, Frame], frames: int, now: int) -> int:
-        """Queue `schemas` and `values`, the newest of `frames` frames. Return how many were replaced by newer ones."""
+        """Queue `schemas` and `values`, the newest per key of `frames` frames. Return how many newer ones replaced."""
         if self._behind_since is None:
             self._behind_since = now
         before = self.waiting
@@ -161,7 +161,7 @@ class Clients:
         self.log = FloodLog()
 
     def __bool__(self) -> bool:
-        """Whether there are any clients."""
+        """Return whether there are any clients."""
         return bool(self.queues)
 
     def send(self, frames: Sequence[Frame]) -> None:
@@ -228,7 +228,7 @@ class Clients:
         self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))
 
     def _log_change(self, event: str, queue: ClientQueue) -> None:
-        """Log that a client joined or left; repetitions from one host are summed up."""
+        """Log that a client joined or left; the log summarizes repetitions from one host."""
         address = queue.client.label
         key = event, address.rpartition(":")[0]
         self.log.note(key, logger.info, event, gateway=self._gateway, client=queue.number, address=address)

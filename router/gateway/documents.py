@@ -36,7 +36,7 @@ class PublishRequest(NamedTuple):
 
 
 class SchemaRequest(NamedTuple):
-    """A client wants the schema of a type, or of all."""
+    """A client's request for the schema of a type, or of all types."""
 
     type_name: str | None
 

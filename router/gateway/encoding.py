@@ -17,7 +17,7 @@ from router.table.units import LARGEST_DATAGRAM
 from router.types.model import MessageType
 
 LARGE = 64 << 10
-"""Bytes above which a message is converted in another thread, so that smaller ones need not wait for it."""
+"""Bytes above which a message is converted in another thread, so that smaller ones do not wait for it."""
 
 
 class ReadyType:

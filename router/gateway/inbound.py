@@ -153,10 +153,10 @@ class InboundPublisher:
         self._counts[topic.published] += 1
 
     def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:
-        """Raises RefusedError if a message is older than `ttl`, since `sent` or its arrival, whichever is earlier.
+        """Raise RefusedError if more than `ttl` has passed since `sent` or the arrival, whichever is earlier.
 
-        If a client's clock is ahead, its messages stay valid for that much longer. The log compares `sent` with now,
-        since `arrived_ns` is the earliest possible arrival if the event loop was blocked.
+        If a client's clock is ahead, its messages stay valid for that much longer. The log compares `sent` with the
+        present time: if the event loop was blocked, `arrived_ns` is only the earliest possible arrival.
         """
         wall = self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
@@ -179,6 +179,6 @@ class InboundPublisher:
     def _dropped(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
         """Count an accepted message that is not published, and report it. Return the error."""
         self._counts[topic.dropped[reason]] += 1
-        if reason != "rate_limited":  # the table asks for it
+        if reason != "rate_limited":  # intended: the table sets the rate
             self._outputs.report(Report("drop", self._gateway, topic.plan.label, reason, error, detail))
         return RefusedError(reason, detail, topic.plan.label)

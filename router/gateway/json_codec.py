@@ -48,7 +48,7 @@ class InvalidMessageError(ValueError):
 # -- CDR to JSON ------------------------------------------------------------------------------------------------------
 
 _SHORT = 64
-"""Elements up to which `struct` is faster than a NumPy array."""
+"""The longest list, in elements, for which `struct` is faster than a NumPy array."""
 _CHUNK = 4096
 """Elements in one call of orjson, which holds the interpreter lock: other threads run between calls."""
 _NUMPY = orjson.OPT_SERIALIZE_NUMPY
@@ -243,7 +243,7 @@ def _in_chunks(values: Any) -> Any:
 
 
 def _sequence(letter: str) -> Callable[[bytes], Any]:
-    """Make a function from the bytes of a list of scalars to a value that orjson can write."""
+    """Make a function that turns the bytes of a list of scalars into a value that orjson can write."""
     size = struct.calcsize(letter)
 
     def sequence(data: bytes) -> Any:
@@ -287,7 +287,7 @@ _BEGIN, _END = 70, 50
 def decoder(message: MessageType, style: Style) -> Decode:
     """Make a function that reads messages of this type: all fields and no others, each with its type and range.
 
-    Nothing is converted: 3.0 is not an integer, 1 is not a bool. Only integers are accepted as floats.
+    Values are not converted: 3.0 is not an integer, 1 is not a bool. An integer is accepted as a float, however.
     """
     writing = _Writing(style)
     read: Callable[[bytes], Any] = reader(msgspec.json.Decoder(writing.struct(message)))
@@ -314,7 +314,7 @@ def reader(decoder: msgspec.json.Decoder[T]) -> Callable[[bytes], T]:
             try:
                 return decoder.decode(text)
             except msgspec.ValidationError:
-                _AnyJson.decode(text)  # raises DecodeError if what follows is not JSON
+                _AnyJson.decode(text)  # raises DecodeError if the rest is not JSON
                 raise
         except msgspec.ValidationError:
             raise

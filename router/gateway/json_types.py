@@ -19,7 +19,7 @@ class Style(enum.Enum):
     WRAPPED = enum.auto()
     """The style of the C++ gateway: single values are arrays of one; a wstring is a list of UTF-16 units."""
     PLAIN = enum.auto()
-    """Scalars and messages bare; a wstring is a string."""
+    """Single values are bare; a wstring is a string."""
 
 
 def schema_text(message: MessageType) -> str:
@@ -45,7 +45,7 @@ def _field_schema(field: Field) -> dict[str, object]:
 
 
 def _type_name(element: Type) -> str:
-    """Return the name that rosidl uses, without bounds; `char` is uint8 here already."""
+    """Return the name that rosidl uses, without bounds; a `char` is already a uint8 here."""
     match element:
         case MessageType():
             return "message"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # which imports rclpy
 
 MOST_KEPT = 1000
 MOST_KEPT_BYTES = 64 << 20
-"""The most messages of one topic, and bytes, that late joiners get; the newest ones."""
+"""Maximum messages of one topic, and their bytes, that late joiners get: the newest ones."""
 
 POLL_S = 0.02
 QUIET_S = 0.1
@@ -31,14 +31,14 @@ PATIENCE_S = 2.0
 """How long to wait for publishers that deliver nothing: they may have published nothing yet."""
 
 FRESH_S = 1.0
-"""How long the messages are reused unless another one arrives, so that frequent clients cost no subscriptions."""
+"""How long fetched messages are reused if none arrives, so that many clients cost few subscriptions."""
 
 
 class KeptMessages:
     """Fetches the messages from the publishers with a short-lived subscription.
 
-    Others do not know how many messages a publisher keeps, and they vanish with it, so they cannot be cached here.
-    `arrived` returns the number of messages that have arrived on the topic so far.
+    They are not cached here: only a publisher knows how many messages it keeps, and they vanish with it. `arrived`
+    returns the number of messages that have arrived on the topic so far.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class KeptMessages:
     async def get(self) -> Sequence[Sample]:
         """Return the messages in the order of publication. Concurrent calls share one subscription.
 
-        Returns nothing if the subscription fails, which is logged, or is closed meanwhile.
+        The result is empty if the subscription fails, which is logged, or is closed meanwhile.
         """
         if self._asking is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
@@ -81,7 +81,7 @@ class KeptMessages:
         return self._found
 
     def close(self) -> None:
-        """Unsubscribe and forget."""
+        """Unsubscribe, and forget the messages."""
         if self._asking:
             self._asking.cancel()
             self._asking = None

@@ -31,7 +31,7 @@ LENGTH = struct.Struct("<H")
 """The length of a packet in a batch."""
 
 LONGEST_NAME = 255
-"""The most bytes of a topic or type. ROS allows no longer topics."""
+"""Maximum bytes of a topic or type; ROS does not allow longer topics."""
 
 
 class PacketError(ValueError):
@@ -53,7 +53,7 @@ class Packet(NamedTuple):
 
 
 def prefix(topic: str, type_name: str) -> bytes:
-    """The bytes between head and payload."""
+    """Return the bytes between head and payload."""
     return f"{topic}\0{type_name}\0".encode()
 
 
@@ -164,7 +164,7 @@ _compressors = _Compressors()
 
 
 def compress(data: bytes, level: int) -> bytes:
-    """Return one zstd frame with the content size in its header, which some clients need. `level`: 1 to 22."""
+    """Return one zstd frame with the content size in its header, which some clients need. `level` is 1 to 22."""
     if len(data) > _SMALL:
         return zstd.compress(data, level)
     compressor = _compressors.by_level.get(level)
@@ -177,7 +177,7 @@ def compress(data: bytes, level: int) -> bytes:
 def decompress(data: bytes, most: int) -> bytes:
     """Return the content of one zstd frame, at most `most` bytes. Its window is limited to that size, or 8 MiB.
 
-    Raises TooLargeError for more; PacketError for damage, a second frame, or a frame that needs a dictionary.
+    Raises TooLargeError for more; PacketError for damaged data, a second frame, or a frame that needs a dictionary.
     """
     if not data.startswith(_MAGIC):
         raise PacketError("the payload is not a zstd frame")

@@ -19,7 +19,7 @@ from router.gateway.transport.base import PER_TURN, Frame
 from router.table.model import EACH, Gateway, Transport
 
 MOST_UNCONVERTED = 4
-"""The most large messages of one topic that wait to be converted, if every message is sent."""
+"""Maximum large messages of one topic that wait to be converted, if every message is sent."""
 
 MOST_LOOKS = 20
 """How often to check whether a topic of several publishers is quiet, before giving up."""
@@ -27,12 +27,13 @@ MOST_LOOKS = 20
 
 @dataclass(slots=True)
 class ServedTopic:
-    """State of a topic that a gateway serves. `period` in ns, EACH for every message; `number` selects its turn in it.
+    """The state of a topic that a gateway serves.
 
-    `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` if every message
-    is sent), `reported` the part in the rates for clients. `sample` is the latest one taken, `readable` the latest that
-    could be converted. `is_busy` while a large one is being converted; `unconverted` ones wait. Kept messages sent
-    until `refused_ns` have been counted if they cannot be sent.
+    `period` is in ns, or EACH for every message; `number` selects the topic's turn within it. `counted` is how many
+    messages of `subscription.arrived` are already in the counters (of `subscription.missed` if every message is sent),
+    `reported` how many are in the rates for clients. `sample` is the latest message taken, `readable` the latest that
+    could be converted. `is_busy` is set while a large message is being converted; `unconverted` ones wait. Kept
+    messages that were published up to `refused_ns` and cannot be sent have already been counted.
     """
 
     subscription: TopicSubscription
@@ -65,7 +66,7 @@ class ServedTopic:
     def is_quiet(self) -> bool:
         """Return whether nothing has arrived since the last call.
 
-        With several publishers, one may never stop while another keeps messages: after MOST_LOOKS calls this is true.
+        With several publishers, one may never pause while another keeps messages: after MOST_LOOKS calls, return True.
         """
         before, self.seen = self.seen, self.subscription.arrived
         self.looks = 0 if before == self.seen else self.looks + 1
@@ -74,7 +75,7 @@ class ServedTopic:
         return is_quiet
 
     def uncounted(self) -> int:
-        """Return the number of messages since the last call, and mark them as counted; with EACH, only missed ones."""
+        """Return the number of messages since the last call (with EACH, of missed ones), and mark them as counted."""
         total = self.subscription.missed if self.period == EACH else self.subscription.arrived
         new, self.counted = total - self.counted, total
         return new

@@ -68,7 +68,7 @@ class TopicSubscription:
 
     @property
     def is_open(self) -> bool:
-        """False once the topic is subscribed to as another type, or this has no users: then join again, or leave."""
+        """Whether it is subscribed. Joining the topic as another type closes it; its users then join again or leave."""
         return self._tap is not None
 
     @property
@@ -203,7 +203,7 @@ class Subscriptions:
         return frozenset(map(self._topics.resolved, names))
 
     async def discover(self, inbound: Collection[str], is_wanted: Callable[[str], bool]) -> dict[str, Selection]:
-        """Return the wanted topics that have publishers; on `inbound` topics this router does not count.
+        """Return the wanted topics that have publishers; on `inbound` topics this router's own do not count.
 
         Loads types, so that `join` is fast. Yields to other tasks between topics.
         """

@@ -54,11 +54,10 @@ def send_arrivals(opened: socket.socket) -> None:
 
 
 def arrivals(opened: socket.socket) -> Callable[[], int]:
-    """Have the kernel stamp datagrams. Return a function for the arrival of the last received one, in ns (wall clock).
+    """Have the kernel stamp datagrams. Return a function for the arrival (wall clock, ns) of the last received one.
 
-    That is the time before the datagram waited in the receive buffer, or the present time if the kernel cannot stamp.
-    The function makes one system call and is for the receiving thread; it raises FileNotFoundError before the first
-    datagram.
+    That is when the kernel put it into the receive buffer, or the present time if the kernel cannot stamp. The function
+    makes one system call and is for the receiving thread. It raises FileNotFoundError before the first datagram.
     """
     stamp = bytearray(_TIMESPEC.size)
 
@@ -83,7 +82,7 @@ def _warn_once(event: str) -> None:
 
 
 def drops(opened: socket.socket) -> int:
-    """Datagrams that the kernel dropped before they were received, since the socket was opened.
+    """Return the number of datagrams that the kernel has dropped since the socket was opened.
 
     Raises OSError for a closed socket.
     """
@@ -108,13 +107,13 @@ def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
 
 
 def receive_buffer(opened: socket.socket) -> int:
-    """The size in bytes, without the kernel's overhead."""
+    """Return the size in bytes, without the kernel's overhead."""
     # The kernel doubles the requested size, to cover its overhead, and returns the doubled value.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
 def bound_interface(opened: socket.socket) -> str | None:
-    """The network interface that a socket is bound to, "" for none; None if the interface is gone."""
+    """Return the network interface that a socket is bound to, "" for none; None if the interface is gone."""
     try:
         return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
     except OSError:
@@ -134,13 +133,13 @@ def refuse_input(opened: socket.socket) -> None:
 
 
 def interface_is_up(name: str) -> bool | None:
-    """Whether a network interface is up; None if there is no such interface."""
+    """Return whether a network interface is up; None if there is no such interface."""
     answer = _ask_interface(name, SIOCGIFFLAGS)
     return None if answer is None else bool(int.from_bytes(answer[:2], "little") & IFF_UP)
 
 
 def interface_address(name: str) -> str | None:
-    """The first IPv4 address of a network interface, or None."""
+    """Return the first IPv4 address of a network interface, or None."""
     answer = _ask_interface(name, SIOCGIFADDR)
     return None if answer is None else socket.inet_ntoa(answer[4:8])
 
@@ -178,7 +177,7 @@ def port_holder(protocol: str, port: int) -> str:
 
 
 def is_listening(port: int) -> bool:
-    """Whether a TCP socket of this computer listens on a port."""
+    """Return whether a TCP socket of this computer listens on a port."""
     return any(True for _ in _inodes("tcp", port))
 
 
@@ -203,7 +202,7 @@ def _inodes(protocol: str, port: int) -> Iterator[str]:
 
 
 def _rows(table: str) -> Iterator[list[str]]:
-    """The rows of a table in /proc/net, as lists of columns. The kernel may have no table for IPv6."""
+    """Yield the rows of a table in /proc/net, as lists of columns. The kernel may have no table for IPv6."""
     from pathlib import Path
 
     with suppress(FileNotFoundError):

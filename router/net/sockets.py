@@ -65,7 +65,7 @@ class Inherited:
         return None
 
     def unclaimed(self) -> list[socket.socket]:
-        """The sockets that no listener has taken."""
+        """Return the sockets that no listener has taken."""
         return [held for held in self._sockets if held not in self._taken]
 
 
@@ -79,7 +79,7 @@ def is_udp(held: socket.socket) -> bool:
 
 @cache
 def inherited() -> Inherited:
-    """The sockets that this process has inherited. Child processes do not inherit them."""
+    """Return the sockets that this process has inherited. Child processes do not inherit them."""
     return Inherited(socket.socket(fileno=descriptor) for descriptor in _inherited_descriptors(os.environ))
 
 
@@ -160,7 +160,7 @@ class ListeningSocket:
             self.receive_buffer = ask_for_receive_buffer(self.socket, size)
 
     def has_lost_interface(self) -> bool:
-        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears.
+        """Return whether its interface is gone. It then receives nothing, even if one of that name reappears.
 
         Thread-safe; false for a closed socket.
         """
@@ -169,7 +169,7 @@ class ListeningSocket:
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Allow sockets with SO_REUSEADDR to bind its address and port inside."""
+        """Allow sockets with SO_REUSEADDR to bind its address and port within the context."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             yield
@@ -177,9 +177,9 @@ class ListeningSocket:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
 
     def end_input(self) -> None:
-        """Accept nothing new. Queued datagrams can still be received, then an end with the peer None.
+        """Accept nothing new. Queued datagrams can still be received; after them, receiving returns the peer None.
 
-        An inherited socket is not changed, for the next process: its receiver must stop without an end.
+        An inherited socket stays unchanged for the next process: its receiver must stop without this signal.
 
         A socket that is connected to itself accepts nothing from others, so a flood cannot keep the receiver busy
         forever; shutting it down wakes a waiting receiver.
@@ -197,7 +197,7 @@ class ListeningSocket:
 
 
 def placed(source: Source | None, every: Iterable[Source]) -> Source | None:
-    """The listener to send from; while it is waiting, another one with the same address and port."""
+    """Return the listener to send from; while it is waiting, another one with the same address and port."""
     if source is None or not source.is_waiting:
         return source
     return next((each for each in every if each.address == source.address and not each.is_waiting), source)
@@ -218,17 +218,17 @@ def open_sending(
 
 
 def is_beside(opened: socket.socket) -> bool:
-    """Whether it sends from the port of a listener."""
+    """Return whether a socket sends from the port of a listener."""
     return opened.family == socket.AF_INET6
 
 
 def leaves_from(opened: socket.socket) -> str:
-    """The source address of a sending socket; 0.0.0.0 if the kernel chooses one for each datagram."""
+    """Return the source address of a sending socket; 0.0.0.0 if the kernel chooses one for each datagram."""
     return str(opened.getsockname()[0]).removeprefix("::ffff:")
 
 
 def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]) -> tuple[str, int]:
-    """The address to bind a socket that sends from a listener's port.
+    """Return the address to bind a socket that sends from a listener's port.
 
     If another listener has all addresses of another interface, a socket with a specific address would receive its
     datagrams: Linux prefers such sockets.
@@ -238,7 +238,7 @@ def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]
 
 
 def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
-    """A socket that reports ICMP errors, and receives nothing."""
+    """Open a socket that reports ICMP errors and receives nothing."""
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setblocking(False)
     report_sending_errors(opened)
@@ -247,7 +247,7 @@ def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
 
 
 def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]) -> socket.socket:
-    """A socket that sends from a listener's address and port, while only the listener receives.
+    """Open a socket that sends from a listener's address and port, while only the listener receives.
 
     It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
     one with the datagram's address family.

@@ -17,7 +17,7 @@ from router.table.model import bound_to
 
 
 def unclaimed() -> list[str]:
-    """The inherited sockets that no listener has taken: UDP addresses, and descriptions of other sockets."""
+    """Return the inherited sockets that no listener has taken: UDP addresses, and descriptions of other sockets."""
     return [_described(held) for held in sockets.inherited().unclaimed()]
 
 
@@ -29,7 +29,7 @@ def _described(held: socket.socket) -> str:
 
 
 def absence(address: Address, interface: str | None) -> tuple[str, str] | None:
-    """Why a listener must wait for its address or interface, with a remedy; None if it need not."""
+    """Return why a listener must wait for its address or interface, with a remedy; None if it need not."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             sockets.bind(probe, address, interface)
@@ -80,15 +80,15 @@ class Listener:
         return self._settings.interface
 
     def has_lost_interface(self) -> bool:
-        """Whether its interface is gone. Then it receives nothing, even if an interface of the same name appears."""
+        """Return whether its interface is gone. It then receives nothing, even if one of that name reappears."""
         return self.opened.has_lost_interface()
 
     def lacks_network(self) -> bool:
-        """Whether its address or network interface is missing. Then it receives nothing."""
+        """Return whether its address or network interface is missing. Then it receives nothing."""
         return self.is_waiting or self.has_lost_interface() or _is_absent(self.address.host)
 
     def is_replaceable(self) -> bool:
-        """Whether it can no longer receive, but a new Listener could."""
+        """Return whether it can no longer receive, but a new Listener could."""
         has_ended = self.is_waiting or self.has_lost_interface()
         return has_ended and absence(self._settings.address.value, self._settings.interface) is None
 
@@ -101,11 +101,16 @@ class Listener:
             self._check_receive_buffer()
 
     def kernel_drops(self) -> int:
+<<<<<<< HEAD
         """Datagrams that the kernel dropped before they were received, since the socket was opened. Thread-safe."""
         try:
             return drops(self.socket)
         except OSError:  # it is closed
             return self._drops_at_close
+=======
+        """Return datagrams that the kernel dropped before they were received, since the socket was opened."""
+        return self._drops_at_close if self.socket.fileno() < 0 else drops(self.socket)
+>>>>>>> e-py2
 
     def end_input(self) -> None:
         """See `ListeningSocket.end_input`."""
@@ -136,7 +141,7 @@ def _refused(settings: model.Listener, error: OSError) -> StartError:
 
 
 def nobody_listens(address: Address) -> str:
-    """The meaning of "Connection refused" for UDP: the computer answers, but no process has the port."""
+    """Return the meaning of "Connection refused" for UDP: the computer answers, but no process has the port."""
     return f"nobody listens at {address}"
 
 
@@ -158,7 +163,7 @@ def why_not_sent(error: OSError, address: Address) -> str:
 
 
 def why_unreachable(address: Address) -> tuple[str, str] | None:
-    """Why nothing can be sent to an address now, with a remedy; None if a route leads there.
+    """Return why nothing can be sent to an address now, with a remedy; None if a route leads there.
 
     Raises BadAddressError for a broadcast address, which depends on the computer's interfaces.
     """
@@ -179,13 +184,13 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
 
 
 def usual_source(address: Address) -> str | None:
-    """The source address of the route to an address; None if there is no route."""
+    """Return the source address of the route to an address; None if there is no route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         return str(probe.getsockname()[0]) if probe.connect_ex(address) == 0 else None
 
 
 def _is_broadcast(address: Address) -> bool:
-    """Whether the kernel accepts the address with SO_BROADCAST, unlike one that a route prohibits."""
+    """Return whether the kernel accepts the address with SO_BROADCAST, unlike one that a route prohibits."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         return probe.connect_ex(address) == 0

@@ -124,8 +124,9 @@ class Look:
 
     @cached_property
     def halted(self) -> frozenset[str]:
-        """The routes that nobody drives: the deadman has been sending for long, reaches its endpoints, and no command
-        is dropped."""
+        """The routes that nobody drives: the deadman has been sending for a long time, reaches its endpoints, and no
+        command is dropped.
+        """
         failing = {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
         for labels, _ in self.grown(Kind.MESSAGES_DROPPED.metric):
             named = dict(zip(SERIES[Kind.MESSAGES_DROPPED.metric], labels, strict=True))
@@ -174,7 +175,7 @@ class Look:
                 yield self._problem(Kind.GATEWAY_DISCONNECTED, {"route": name})
 
     def _silent(self) -> Iterator[Problem]:
-        """Yield silent endpoints, those whose commands a deadman replaces first."""
+        """Yield silent endpoints, first those whose commands a deadman replaces."""
         silent, away = self._stale, set(chain.from_iterable(self.away.values()))
         held = set(chain.from_iterable(self._sources.get(route, ()) for route in self.tripped))
         for name in sorted(silent - away, key=lambda name: (name not in held, name)):

@@ -117,7 +117,7 @@ class HttpServer:
 class _Server:
     """Serves each admitted connection in a thread of its own; rejects others at once (503).
 
-    If memory, threads or descriptors run out, the connection is closed, and the next one accepted after a pause.
+    If memory, threads or descriptors run out, the connection is closed, and the next one is accepted after a pause.
     """
 
     def __init__(self, address: Address, responder: Responder) -> None:
@@ -364,7 +364,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "HEAD":
             return
         with closing(Tap(running.mirror, is_wanted)) as tap:
-            self._send()  # at once: after the response, the client misses nothing
+            self._send()  # at once: from the response on, the client misses nothing
             self._out = BytesIO()
             self._stream(tap.stream())
 

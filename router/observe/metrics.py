@@ -22,7 +22,7 @@ _EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
 _BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
-"""Returns label values, in the metric's order, and value of each current series."""
+"""Returns the label values, in the metric's order, and the value of each current series."""
 
 
 class CountersCollector(Collector):

@@ -31,7 +31,7 @@ class Level(enum.Enum):
 
 
 class Kind(enum.Enum):
-    """A kind of problem, first those that explain others.
+    """A kind of problem; kinds that explain others come first.
 
     `words` contain labels of `metric`. There is a problem while its value exceeds `threshold`: for losses per second,
     for times in seconds. `remedy` can also contain the `{address}` of what the labels name.
@@ -181,7 +181,7 @@ class Kind(enum.Enum):
 
 
 class Problem(NamedTuple):
-    """A problem of a running router. `labels` are those of its metric; `more` says by how much, which changes.
+    """A problem of a running router. `labels` are those of its metric; `more` gives the amount, which changes.
 
     `routes`: the routes and gateways whose messages are affected.
     """
@@ -210,7 +210,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, read: Mapping[str, Any]) -> Problem:
-        """Return the problem with this `json()`. Raises KeyError if it is not that of a problem."""
+        """Return the problem with this `json()`. Raises KeyError if it is not the JSON of a problem."""
         kind = {kind.alert: kind for kind in Kind}[read["kind"]]
         labels = {label: str(read["labels"][label]) for label in {*kind.labels, *read["labels"]}}
         return cls(kind, labels, read["more"], read["remedy"], tuple(read["routes"]))

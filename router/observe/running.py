@@ -36,7 +36,7 @@ class Running(Protocol):
         """Whether everything is open, and datagrams are received."""
 
     def collect(self) -> Iterator[Family]:
-        """All metrics, for prometheus_client."""
+        """Return all metrics, for prometheus_client."""
 
     def mismatches(self) -> Mapping[Mismatch, int]:
         """Return messages from hosts that no route accepts them from, and their latest time (boot clock, ns)."""

@@ -136,17 +136,24 @@ def numbers(now: Snapshot) -> Json:
 
 
 def _steps(metric: str, path: str) -> tuple[str | int, ...]:
-    """Return the keys of a path, with indexes in place of labels."""
+    """Return the keys of a path, with the index of the label in place of each label."""
     return tuple(SERIES[metric].index(key[1:-1]) if key.startswith("{") else key for key in path.split())
 
 
 _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
+<<<<<<< HEAD
 def _map_json(program: Program) -> Json:
     """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: links of
     what deadmen send."""
     table = program.table
+=======
+def _map_json(table: RouteTable) -> Json:
+    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: the
+    payload case that each route's deadman sends, and its endpoints.
+    """
+>>>>>>> e-py2
     nodes, edges = nodes_and_edges(table)
     deadmen = [*deadman_edges(program)]
     halted = [endpoint_node(table.endpoints[each.label], "to", 2) for each in deadmen if each.label in table.endpoints]

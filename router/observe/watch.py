@@ -36,7 +36,7 @@ class Watch:
     def __init__(self, running: Running) -> None:
         self._running = running
         self._snapshots: deque[Snapshot] = deque()
-        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and its boot clock
+        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, also on the boot clock
         self._tripped: dict[str, tuple[float, int]] = {}  # by route: number of trips, and when it was first seen
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
@@ -71,7 +71,7 @@ class Watch:
             return (now - self._progressed) / 1e9
 
     def _seen(self, endpoint: str, latest: Snapshot, earlier: int, now: int, wall: int) -> int:
-        """Return when an endpoint was last heard, or first looked for (boot clock, ns). Stamps: wall clock."""
+        """Return when an endpoint was last heard, or first looked for (boot clock, ns). Its stamp is wall time."""
         stamp = latest.of(LAST_SEEN, endpoint).get((), 0.0)
         if endpoint not in self._last_seen or self._last_seen[endpoint][0] != stamp:
             age = min(max(0, wall - int(stamp * 1e9)), now - earlier)

@@ -41,7 +41,7 @@ class Holds(enum.Enum):
 
 
 class Channels:
-    """Assigns numbers to schemas and channels, equal ones for equal content. Numbers are never reused."""
+    """Assigns numbers to schemas and channels, the same number for the same content. Numbers are never reused."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}

@@ -208,7 +208,7 @@ _NOBODY: tuple[dict[str, str], dict[Peer, str]] = {}, {}
 def first_field(data: bytes) -> int:
     """Return the number (below 2048) of the first field of a message, 0 if there is none.
 
-    Usually that is the payload's, at a fraction of the cost of `Classifier.payload`.
+    Usually that is the payload's number, found at a fraction of the cost of `Classifier.payload`.
     """
     if not data:
         return 0

@@ -31,7 +31,7 @@ _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupE
 class Recorded(NamedTuple):
     """A datagram, with its time of reception (ns): `at` by the wall clock, `steady` without steps of that clock.
 
-    `endpoint` is the sender's name in the table of that time, "" for a stranger. `reason` is why no route accepted the
+    `endpoint` is the sender's name in the table that ran then, "" for a stranger. `reason` is why no route accepted the
     datagram, "" if one did.
     """
 

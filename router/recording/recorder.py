@@ -42,7 +42,7 @@ class RecordError(RouterError):
 
 
 class Ring:
-    """The chunks of the last `last` ns, at most `most` bytes in total: in a flood, of less time."""
+    """The chunks of the last `last` ns, at most `most` bytes in total: in a flood they cover less time."""
 
     def __init__(self, last: int, most: int) -> None:
         self._last = last

@@ -241,7 +241,7 @@ class ContinuousWriter:
     """Writes all chunks to a series of files, and counts datagrams that the disk does not accept in `lost`.
 
     Starts a file if there is something to write and the last one is full or old enough; calls `about` for each. Times
-    are of the boot clock, in ns.
+    are on the boot clock, in ns.
     """
 
     def __init__(

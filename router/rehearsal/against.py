@@ -1,4 +1,4 @@
-"""Run a recording through two tables on one clock, compare the deliveries, and report those that differ."""
+"""Runs a recording through two tables on one clock, compares the deliveries, and reports those that differ."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Against:
         return bool(places) and not any(table.sender(*place) for table in tables for place in places)
 
     def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
-        """Deliveries since the last call, by target. Losses are counted."""
+        """Return deliveries since the last call, by target. Losses are counted."""
         found: dict[str, list[Delivery]] = {}
         for event in self._runs[side].events:
             if isinstance(event, (Sent, Published)):
@@ -141,7 +141,7 @@ class Against:
         return left
 
     def _without_moved(self, found: Sequence[Delivery], unmatched: Counter[tuple[str, bytes]]) -> Iterator[Delivery]:
-        """Deliveries without those that the other table made earlier."""
+        """Yield deliveries without those that the other table made earlier."""
         for each in found:
             if unmatched[key := _key(each)]:
                 unmatched[key] -= 1
@@ -200,7 +200,7 @@ class Report:
         self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
 
     def lines(self, found: Against) -> Iterator[str]:
-        """The whole report; a short one if both tables deliver the same."""
+        """Yield the whole report; a short one if both tables deliver the same."""
         old, new = (checked.path for checked in self._tables)
         yield f"{found.datagrams} datagrams of {found.span / 1e9:.1f} s, through {old} and {new}"
         if not found.differs:
@@ -277,7 +277,7 @@ def _losses(found: Against) -> Iterator[str]:
 
 
 def _same_losses(found: Against) -> Iterator[str]:
-    """What both tables lost: everything if the recording is from another network."""
+    """Yield what both tables lost: everything if the recording is from another network."""
     counts: Counter[str] = Counter()
     for (done, _, _, reason), count in found.losses[0].items():
         counts[f"{done} ({reason})"] += count
@@ -286,7 +286,7 @@ def _same_losses(found: Against) -> Iterator[str]:
 
 
 def _strangers(found: Against) -> Iterator[str]:
-    """Why almost nothing was delivered, if the tables are for a different network from the recording."""
+    """Yield why almost nothing was delivered, if the tables are for a different network from the recording."""
     if not found.is_among_strangers:
         return
     named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in found.senders})
@@ -297,7 +297,7 @@ def _strangers(found: Against) -> Iterator[str]:
 
 
 def _is_reported(row: Row, before: Delivery | None, after: Delivery | None) -> bool:
-    """Whether an example is reported: deliveries that only changed their time are not."""
+    """Return whether an example is reported: deliveries that only changed their time are not."""
     if before is None:
         return row.added > 0
     return after is not None or row.lost > 0

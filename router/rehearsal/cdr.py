@@ -16,7 +16,7 @@ from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 
 
 def serialize(message: MessageType, values: Mapping[str, Any], padding: int = 0) -> bytes:
-    """The bytes of a message with their header, from all its values by name. Gaps for alignment are `padding`."""
+    """Return a message as CDR with its header, from all its values by name. Gaps for alignment are `padding`."""
     writer = _Writer(padding)
     writer.write(message, values)
     return b"\x00\x01\x00\x00" + bytes(writer.data)
@@ -39,7 +39,7 @@ class _Writer:
         self.data = bytearray()
 
     def scalar(self, format_: str, value: object) -> None:
-        """A scalar, aligned to its own size, counted from the end of the header."""
+        """Append a scalar, aligned to its own size, relative to the end of the header."""
         packed = struct.pack("<" + format_, value)
         while len(self.data) % len(packed):
             self.data.append(self.padding)
@@ -51,7 +51,7 @@ class _Writer:
                 for field in declared.fields:
                     self.write(field.type, value[field.name])
                 if not declared.fields:
-                    self.scalar("B", 0)  # what ROS puts into a message without fields
+                    self.scalar("B", 0)  # ROS puts this into a message without fields
             case List():
                 if declared.length is None:
                     self.scalar("I", len(value))

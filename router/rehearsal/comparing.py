@@ -1,4 +1,4 @@
-"""Compare what happened in a step with what a test expects, and name the places of differences in test and table."""
+"""Compares what happened in a step with what a test expects, and names the places of differences in test and table."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What happened in a step: events before its time (`early`) and in it. `given` are the times and bytes given."""
+    """What happened in a step: events before its time (`early`) and in it. `given` has times and bytes of messages."""
 
     step: Step
     early: Sequence[Event]
@@ -38,7 +38,7 @@ class Outcome:
     given: Sequence[tuple[int, bytes]]
 
     def given_at(self, at: int) -> int:
-        """When the last message arrived that a delivery at this time can contain, ns."""
+        """Return the arrival (ns) of the last message that a delivery at this time can contain."""
         return max((time for time, _ in self.given if time <= at), default=at)
 
 
@@ -52,7 +52,7 @@ class Comparison:
         self._table = program.table
 
     def failures(self, outcome: Outcome) -> Iterator[Failure]:
-        """Failures in the order in which a person would look for them."""
+        """Yield the failures, in the order in which a person would look for them."""
         expected, events = outcome.step.expected, outcome.events
         yield from self._early(outcome)
         if expected.anything:
@@ -86,7 +86,7 @@ class Comparison:
     def _delivered(
         self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
-        """`explained`: a rejection that was already reported is why targets got nothing."""
+        """`explained`: a rejection that was already reported explains why targets got nothing."""
         for target in dict.fromkeys((*expected, *came)):
             deliveries, events = expected.get(target, ()), came.get(target, [])
             if deliveries and not events:
@@ -103,7 +103,7 @@ class Comparison:
                     yield from self._differences(delivery, event, outcome)
 
     def _missing(self, target: str, span: SourceSpan, outcome: Outcome) -> Failure:
-        """A failure that says what happened to the message instead, if there is an event for it."""
+        """Return a failure that says what happened to the message instead, if there is an event for it."""
         for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}{in_brackets(event.detail)}"

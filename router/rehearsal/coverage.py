@@ -62,7 +62,7 @@ class Coverage:
         self._touched |= {key for key, item in self._items.items() if places.get(key) == _real(item.span)}
 
     def gaps(self) -> list[Item]:
-        """What no test has touched."""
+        """Return what no test has touched."""
         return [item for key, item in self._items.items() if key not in self._touched]
 
     @property
@@ -70,14 +70,14 @@ class Coverage:
         return not self.gaps()
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """By kind, how many items were touched, and how many there are."""
+        """Return, by kind, how many items were touched, and how many there are."""
         there = [item.kind for item in self._items.values()]
         missing = [item.kind for item in self.gaps()]
         return {kind: (there.count(kind) - missing.count(kind), there.count(kind)) for kind in KINDS}
 
 
 def _real(span: SourceSpan) -> SourceSpan:
-    """The span with the real path of its file: tables may extend it by different paths."""
+    """Return the span with the real path of its file: tables may extend it by different paths."""
     return replace(span, file=os.path.realpath(span.file))
 
 
@@ -115,7 +115,7 @@ def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
 
 
 def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
-    """The settings of a table that keep messages of a route from its targets."""
+    """Yield the settings of a table that keep messages of a route from its targets."""
     name = route.route.name
     if ttl := route.route.ttl:
         yield ("stale", name), Item("rejection", ttl.span, f"no test has a message of {name} that is older than this")
@@ -132,14 +132,14 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
 
 
 def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Node | None]]:
-    """Every target of a route, with its `when` or that of the topic that feeds it."""
+    """Yield every target of a route, with its `when` or that of the topic that feeds it."""
     yield from ((target, target.when) for target in route.targets)
     for subscription in route.subscriptions:
         yield from ((target, target.when or subscription.when) for target in subscription.targets)
 
 
 def _keys(event: Event, expected: Expected) -> Iterator[Key]:
-    """The keys that an event touches in a step that expects this."""
+    """Yield the keys that an event touches in a step with these expectations."""
     match event:
         case Received():
             yield "route", event.route

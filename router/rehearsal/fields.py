@@ -51,7 +51,7 @@ class AnyValue:
     span: SourceSpan
 
     def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
-        """None."""
+        """Yield nothing: any value is accepted."""
         yield from ()
 
 
@@ -144,8 +144,8 @@ _WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
 class FieldReader:
     """Reads the fields of messages. With `exact`, as for given messages, `any` and tolerances are not allowed.
 
-    `constants` are the numbers of enum values by name; several if enums share a name. `any` is that word without
-    quotes; in quotes it is text. A value that does not fit its type raises InvalidValueError at its place.
+    `constants` are the numbers of enum values by name; several if enums share a name. The word `any` means any value
+    only without quotes; in quotes it is text. A value that does not fit its type raises InvalidValueError at its place.
     """
 
     def __init__(self, constants: Mapping[str, set[int]], *, exact: bool) -> None:
@@ -216,7 +216,7 @@ class FieldReader:
             raise invalid(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
 
     def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
-        """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
+        """Return the value of a ROS constant of the message (`STATUS_FIX`), or of an enum (`GPSFixQuality.RTK_FIX`)."""
         found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
         if isinstance(found, int):
             return found
@@ -268,18 +268,18 @@ def _offset(node: ScalarNode) -> int | None:
 
 
 def protobuf_message(message_class: type[Message], given: Fields, now: int) -> Message:
-    """A protobuf message with these fields set; `now` is when it arrives, ns."""
+    """Return a protobuf message with these fields set; `now` is when it arrives, ns."""
     return message_class(**_plain(given, now, complete=False))
 
 
 def ros_values(given: Fields, now: int) -> Mapping[str, Any]:
-    """All values of a ROS message by name; values that were not given are at their default."""
+    """Return all values of a ROS message by name; values that were not given are at their default."""
     values: Mapping[str, Any] = _plain(given, now, complete=True)
     return values
 
 
 def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
-    """A given value as protobuf's constructors accept it, with messages and maps as dicts.
+    """Return a given value as protobuf's constructors accept it, with messages and maps as dicts.
 
     `complete`: including the defaults of fields that are not given.
     """
@@ -303,7 +303,7 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
 
 
 def _default_of(kind: Type, default: object = None) -> Any:
-    """The value of a field that nothing fills; for a message, its values by name. `default` is the declared one."""
+    """Return the value of an unset field; for a message, its values by name. `default` is the declared one."""
     if default is not None:
         return default
     match kind:
@@ -348,7 +348,7 @@ class _Entry(NamedTuple):
 
 
 def _elements(kind: List, value: Any) -> Sequence[Any]:
-    """The elements of a list; for a protobuf map, its entries sorted by key."""
+    """Return the elements of a list; for a protobuf map, its entries sorted by key."""
     element = kind.element
     if isinstance(element, MessageType) and element.is_map_entry:
         return [_Entry(key, value[key]) for key in sorted(value)]  # its own order differs from run to run
@@ -357,7 +357,7 @@ def _elements(kind: List, value: Any) -> Sequence[Any]:
 
 
 def _time_of(kind: MessageType, value: Any) -> int:
-    """A message of STAMP_TYPES in ns of the wall clock."""
+    """Return a message of STAMP_TYPES in ns of the wall clock."""
     seconds, nanoseconds = (getattr(value, field.name) for field in kind.fields)
     return int(seconds * NS_PER_SECOND + nanoseconds)
 
@@ -366,7 +366,7 @@ def _time_of(kind: MessageType, value: Any) -> int:
 
 
 def shown(kind: Type, value: Any) -> str:
-    """A value as a test would write it, on one line; messages without the fields at their default."""
+    """Return a value as a test would write it, on one line; messages without the fields at their default."""
     match kind:
         case MessageType() if kind.name in STAMP_TYPES:
             return offset(_time_of(kind, value) - START)
@@ -383,7 +383,7 @@ def shown(kind: Type, value: Any) -> str:
 
 
 def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]:
-    """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text.
+    """Yield every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text.
 
     A submessage that is not set has none: its type may contain itself.
     """
@@ -405,5 +405,5 @@ def path_text(path: Path) -> str:
 
 
 def offset(ns: int) -> str:
-    """A time after the beginning of the test, as a test would write it; negative before."""
+    """Return a time relative to the beginning of the test, as a test would write it; negative before the beginning."""
     return f"{'-' if ns < 0 else ''}{duration(abs(ns)) if ns else '0 ms'}"

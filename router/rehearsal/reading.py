@@ -1,4 +1,4 @@
-"""Find test files, check them against their schema and read them, and compile the table under test."""
+"""Finds test files, checks them against their schema, reads them, and compiles the table under test."""
 
 from __future__ import annotations
 
@@ -57,7 +57,11 @@ class TestFile:
 
 
 def find_test_files(paths: Sequence[Path]) -> list[Path]:
+<<<<<<< HEAD
     """The files that the paths stand for, each once: a folder stands for the test files in it. Raises UsageError."""
+=======
+    """Return the files that the paths stand for, each once: a folder stands for the test files in it."""
+>>>>>>> e-py2
     files: dict[Path, None] = {}
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
@@ -190,7 +194,7 @@ class _Reader:
         )
 
     def _read(self, read: Callable[[Node], R], node: Node | None) -> R | None:
-        """The value that `read` returns; None for a missing key, and for a value with a finding."""
+        """Return the value that `read` returns; None for a missing key, and for a value with a finding."""
         if node is None:
             return None
         try:
@@ -204,7 +208,7 @@ class _Reader:
 
 
 def _duration(node: Node) -> int:
-    """The value of `at` or `until`, which may be zero, unlike other durations."""
+    """Return the value of `at` or `until`, which may be zero, unlike other durations."""
     assert isinstance(node, ScalarNode)  # noqa: S101 - the schema saw to it
     is_zero = not node.text.strip("0. nsumih")
     return 0 if is_zero else parsed(parse_duration, Located(node.text, node.span))
@@ -214,7 +218,7 @@ def _duration(node: Node) -> int:
 
 
 def _checked_nodes(path: Path) -> MappingNode:
-    """The nodes of a test file that fits its schema. Raises TableError with every finding."""
+    """Return the nodes of a test file that fits its schema. Raises TableError with every finding."""
     findings: list[Diagnostic] = []
     source = read_source(path)
     message = "a test file is a mapping with the key 'tests'"

@@ -205,5 +205,5 @@ class Rehearsal:
 
 
 def _series(program: Program) -> dict[int, Series]:
-    """The series of events by the counters of a program."""
+    """Return the series of events by the counters of a program."""
     return {index: series for series, index in program.counters.series() if series.metric in EVENTS}

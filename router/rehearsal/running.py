@@ -1,4 +1,4 @@
-"""Run table tests: each on a rehearsal of its table, step by step."""
+"""Runs table tests, each on a rehearsal of its table, step by step."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, byt
 
 
 def _datagram(given: Given, wire: Wire, now: int) -> bytes:
-    """The bytes that arrive. Raises InvalidValueError if they are longer than `pad`."""
+    """Return the bytes that arrive. Raises InvalidValueError if they are longer than `pad`."""
     data = given.data or b""
     if given.case is not None and given.fields is not None:
         data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
@@ -110,7 +110,7 @@ def _datagram(given: Given, wire: Wire, now: int) -> bytes:
 
 
 def _message(given: Given, now: int) -> bytes:
-    """The CDR bytes that arrive."""
+    """Return the CDR bytes that arrive."""
     if given.fields is None:
         return given.data or b""
     return cdr.serialize(given.fields.type, ros_values(given.fields, now))

@@ -76,9 +76,9 @@ Deliveries = Mapping[str, tuple[Delivery, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """All that happens in a step; with `anything`, nothing is compared.
+    """Everything that may happen in a step. With `anything`, nothing is compared.
 
-    `filtered` and `route` are None where the test does not say.
+    `rejected`, `filtered` and `route` are None if the test does not mention them.
     """
 
     span: SourceSpan
@@ -137,7 +137,7 @@ class Names:
         return envelope.cases[name]
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
-        """The address that an endpoint sends from, or an address written HOST:PORT."""
+        """Return the address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
             address = endpoint.address.value
             return address.host, endpoint.source_port.value if endpoint.source_port else address.port
@@ -149,7 +149,7 @@ class Names:
             raise invalid(span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)) from error
 
     def listener(self, named: Located[str] | None, sender: str, span: SourceSpan) -> str:
-        """The listener that is named, else the one at which the sender is accepted, else the only one."""
+        """Return the listener that is named, else the one at which the sender is accepted, else the only one."""
         listeners = self._table.listeners
         if named is not None:
             return self._known(named.value, listeners, named.span, "listener")
@@ -161,7 +161,7 @@ class Names:
         return next(iter(listeners))
 
     def endpoint(self, name: str, span: SourceSpan) -> str:
-        """An endpoint that something is sent to."""
+        """Return an endpoint that something is sent to."""
         self._known(name, self._table.endpoints, span, "endpoint", Code.UNKNOWN_ENDPOINT)
         return self._known(name, self._destinations, span, "route to the endpoint", Code.UNKNOWN_ENDPOINT)
 
@@ -175,7 +175,7 @@ class Names:
         return self._subscribed[self._known(name, self._subscribed, span, "route from the topic")]
 
     def target(self, name: str, span: SourceSpan) -> str:
-        """An endpoint or a topic that a route delivers to."""
+        """Return an endpoint or a topic that a route delivers to."""
         return self._known(name, [*self._destinations, *self._published], span, "route to")
 
     @cached_property
@@ -297,7 +297,7 @@ class ExpectedReader:
         self._given = FieldReader(names.constants, exact=True)
 
     def expected(self, span: SourceSpan, node: Node, given: Node | None) -> Expected:
-        """`given` is what 'unchanged' refers to: the step's given message. Raises InvalidValueError."""
+        """Read what a step expects; 'unchanged' refers to `given`, the step's message. Raises InvalidValueError."""
         if isinstance(node, ScalarNode):
             return Expected(span, anything=node.text == ANY)
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
@@ -361,7 +361,7 @@ class ExpectedReader:
         return [Delivery(span, fields=fields)] * times
 
     def _content(self, kind: MessageType, node: Node, given: Node | None) -> Fields:
-        """Fields as written here, or as given."""
+        """Return the fields as written; for 'unchanged', those of the step's given message."""
         if not _is(node, UNCHANGED):
             return self._fields.message(kind, node)
         if not isinstance(given, MappingNode) or "hex" in given.entries:
@@ -384,7 +384,7 @@ class ExpectedReader:
 
 
 def _reasons(node: Node, known: Iterable[str]) -> Counts:
-    """A reason, a list of them, or how many of each."""
+    """Return a reason, a list of them, or how many of each."""
     if isinstance(node, MappingNode):
         named = [(name, entry.key.span) for name, entry in node.entries.items()]
     else:
@@ -447,7 +447,7 @@ def _name(node: Node) -> tuple[str, SourceSpan]:
 
 
 def _listed(node: Node | None) -> Sequence[Node]:
-    """One node, or the items of a list; none for None."""
+    """Return one node, or the items of a list; nothing for None."""
     if node is None:
         return ()
     return node.items if isinstance(node, SequenceNode) else (node,)

@@ -1,4 +1,4 @@
-"""Describe what happened in a rehearsal, with the places in the table."""
+"""Describes what happened in a rehearsal, with the places in the table."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class TableIndex:
         return Related(found[0].span, note) if found else None
 
     def type(self, route: str, topic: str) -> MessageType | None:
-        """The type of a topic that a route publishes on."""
+        """Return the type of a topic that a route publishes on."""
         return next((found.type for found in self._targets.get((route, topic), ())), None)
 
     def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
-        """The target of this name in one of the `routes` that took a message, or else in any."""
+        """Return the target of this name in one of the `routes` that took a message, or else in any."""
         taken = [name for name in routes if name in self._routes]
         found = next((found for name in taken if (found := self.target(name, target))), None)
         if found is None and taken:
@@ -79,7 +79,7 @@ class TableIndex:
         return Related(deadman.span, "sent by this deadman") if deadman else None
 
     def field(self, route: str, target: str, path: Path) -> Related | None:
-        """What fills a field, or else the target that leaves it at its default."""
+        """Return what fills a field, or else the target that leaves it at its default."""
         for found in self._targets.get((route, target), ()):
             if found.plan is None:
                 return Related(found.span, "forwarded here")
@@ -112,7 +112,7 @@ class Teller:
         self._wire = Wire(program.envelope)
 
     def lines(self, events: Iterable[Event]) -> list[str]:
-        """Everything that happened, in order, each with its place in the table."""
+        """Return everything that happened, in order, each with its place in the table."""
         lines = []
         for _, same in groupby(events, _what):
             alike = [*same]
@@ -171,7 +171,7 @@ class Teller:
 
 
 def _what(event: Event) -> tuple[object, ...]:
-    """A key that is equal for events that differ only in time and content."""
+    """Return a key that is equal for events that differ only in time and content."""
     names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
     return type(event), *names
 

@@ -51,7 +51,7 @@ def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
 
 
 def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
-    """The table's variables set by ROS parameters: `listen_port` sets `${LISTEN_PORT}`."""
+    """Return the table's variables set by ROS parameters: `listen_port` sets `${LISTEN_PORT}`."""
     return {name.upper(): value for name, value in parameters.items() if name != ROUTES_PATH}
 
 
@@ -109,14 +109,14 @@ def _for_rule(match: str, topics: Mapping[str, str], node: NodeSettings) -> str:
 
 
 def _topics(program: Program, node: NodeSettings) -> dict[str, str]:
-    """The topics as the table writes them, by absolute name."""
+    """Return the topics as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [each.topic.topic.value for gateway in program.gateways for each in gateway.settings.inbound]
     return {resolved(topic, node): topic for topic in (*plans, *inbound)}
 
 
 def _remapped(node: NodeSettings, rules: Sequence[Rule]) -> NodeSettings:
-    """The node's name and namespace after remapping. The first rule wins, as in ROS."""
+    """Return the node's name and namespace after remapping. The first rule wins, as in ROS."""
     for rule in reversed(rules):
         if _is_for(rule.node, node):
             new = rule.text.partition(":=")[2]
@@ -128,7 +128,7 @@ def _remapped(node: NodeSettings, rules: Sequence[Rule]) -> NodeSettings:
 
 
 def _is_for(owner: str, node: NodeSettings) -> bool:
-    """Whether a parameter or rule for this node name or pattern applies to the router."""
+    """Return whether a parameter or rule for this node name or pattern applies to the router."""
     return not owner or fnmatch.fnmatchcase(node.name, owner.rpartition("/")[2])
 
 
@@ -142,7 +142,7 @@ def _rules(ros_args: Sequence[str]) -> Iterator[Rule]:
 
 
 def _parameters(ros_args: Sequence[str]) -> Iterator[Parameter]:
-    """All parameters, in order. Raises StartError."""
+    """Yield all parameters, in order. Raises StartError."""
     for option, word in pairwise(ros_args):
         name, assigned, value = word.partition(":=")
         if option in ("-p", "--param") and assigned:

@@ -43,7 +43,7 @@ _error_string = function("rcutils_get_error_string", ErrorString)
 
 
 def _rcl_error() -> Exception:
-    """The error of this thread's last failed call to rcl."""
+    """Return the error of this thread's last failed call to rcl."""
     text = _error_string().text.decode(errors="replace")
     RCL.rcutils_reset_error()
     error: Exception = rclpy_implementation.RCLError(text)
@@ -91,7 +91,7 @@ class Publication:
             sleep(_POLL_S)
 
     def stalled(self) -> float:
-        """For how many seconds a call of `publish` has been in the middleware; 0 if no call is running."""
+        """Return how long (s) a call of `publish` has been in the middleware; 0 if no call is running."""
         since = list(self._calls.values())
         return (monotonic_ns() - min(since)) / 1e9 if since else 0.0
 
@@ -208,5 +208,5 @@ def opened_beside(
 
 
 def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
-    """The open endpoints that are not in `kept`."""
+    """Return the open endpoints that are not in `kept`."""
     return [each for topic, each in now.items() if kept.get(topic) is not each]

@@ -20,9 +20,9 @@ LAST_DOMAIN = 232
 
 SHM = Path("/dev/shm")  # noqa: S108 - Linux's shared memory; the router writes nothing there
 _TRACING = 8 << 10
-"""Bytes that the tracing library of ROS writes there while it is loaded."""
+"""Bytes that the tracing library of ROS writes to /dev/shm while it is loaded."""
 _FAST_DDS = 1 << 20
-"""Bytes there for a participant's segment and ports: 652 KiB in full pages. With less, messages are lost silently."""
+"""Bytes in /dev/shm for a participant's segment and ports, 652 KiB in full pages: less silently loses messages."""
 
 
 def check_environment(environ: Mapping[str, str]) -> None:
@@ -53,13 +53,13 @@ def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str
 
 
 def ros_remedy() -> str:
-    """The remedy if ROS 2 cannot be loaded."""
+    """Return the remedy if ROS 2 cannot be loaded."""
     install = "`pip install 'rover-router[ros]'`" if is_installed(asset("schemas")) else "'make setup'"
     return f"run {install}, or source the setup.sh of an installed ROS 2 Jazzy"
 
 
 def ros_package_remedy(package: str) -> str:
-    """The remedy if a ROS package is missing, cannot be loaded, or differs from the one the table was compiled for."""
+    """Return the remedy if a ROS package is missing, cannot be loaded, or differs from that of the compiled table."""
     ours = asset("schemas")
     if not is_installed(ours):
         return f"run 'make setup' and `. .venv/env.sh`, or install the ROS package '{package}'"
@@ -76,7 +76,7 @@ def ros_package_remedy(package: str) -> str:
 
 
 def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:
-    """The bytes of shared memory that ROS needs in `folder`, and the bytes that are free there."""
+    """Return the bytes of shared memory that ROS needs in `folder`, and the bytes that are free there."""
     needed = _TRACING + (_FAST_DDS if uses_shared_memory(environ) else 0)
     try:
         room = os.statvfs(folder)
@@ -86,14 +86,14 @@ def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, 
 
 
 def uses_shared_memory(environ: Mapping[str, str]) -> bool:
-    """Whether Fast DDS opens its shared memory transport, which is its default."""
+    """Return whether Fast DDS opens its shared memory transport, which is its default."""
     transports = environ.get("FASTDDS_BUILTIN_TRANSPORTS") or "DEFAULT"
     is_fast_dds = (environ.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
     return is_fast_dds and not transports.startswith(("UDP", "TCP", "NONE"))
 
 
 def _middlewares(environ: Mapping[str, str]) -> set[str]:
-    """The middlewares registered by the sourced workspaces and this Python."""
+    """Return the middlewares registered by the sourced workspaces and this Python."""
     prefixes = [*filter(None, environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     folders = [Path(prefix, "share", "ament_index", "resource_index", "rmw_typesupport") for prefix in prefixes]
     return {each.name for folder in folders for each in folder.glob("*")} - {"rmw_implementation"}

@@ -54,7 +54,7 @@ class PeerEvents:
         self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: remaining checks
 
     def of_publisher(self, plan: TopicPlan, wanted: WantedFlag) -> PublisherEventCallbacks:
-        """Callbacks that also set `wanted`: whether there are subscribers."""
+        """Return callbacks that also keep `wanted` up to date: whether there are subscribers."""
 
         def on_matched(status: Any) -> None:
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0

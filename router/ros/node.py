@@ -78,7 +78,7 @@ def close_node(node: Node) -> None:
 
 
 def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
-    """Variables that make FASTDDS_BUILTIN_TRANSPORTS=UDPv4 effective with a discovery range of LOCALHOST.
+    """Return variables that make FASTDDS_BUILTIN_TRANSPORTS=UDPv4 effective with a discovery range of LOCALHOST.
 
     With that range, rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile has the other
     effects of the range, and the range SUBNET does not change the profile.
@@ -102,7 +102,7 @@ def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables inside, where the middleware reads them."""
+    """Set environment variables, which the middleware reads, within the context."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -116,7 +116,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def middleware() -> str:
-    """The name of the middleware, for example `rmw_fastrtps_cpp`. Raises StartError if it cannot be loaded."""
+    """Return the name of the middleware, for example `rmw_fastrtps_cpp`. Raises StartError if it cannot be loaded."""
     try:
         name: str = get_rmw_implementation_identifier()
     except RuntimeError as error:

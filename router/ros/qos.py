@@ -73,12 +73,12 @@ for _actual_qos in (RCL.rcl_publisher_get_actual_qos, RCL.rcl_subscription_get_a
 
 
 def publisher_qos(pointer: int) -> ActualQos:
-    """The policies in effect, with `system_default` and `best_available` resolved. `pointer`: of an open handle."""
+    """Return the policies in effect, with `system_default` and `best_available` resolved. `pointer`: of an open one."""
     return _named(RCL.rcl_publisher_get_actual_qos(pointer).contents)
 
 
 def subscription_qos(pointer: int) -> ActualQos:
-    """As `publisher_qos`."""
+    """Like `publisher_qos`."""
     return _named(RCL.rcl_subscription_get_actual_qos(pointer).contents)
 
 

@@ -36,12 +36,12 @@ class ErrorString(ctypes.Structure):
 
 
 def address(name: str) -> int:
-    """The address of a function."""
+    """Return the address of a function."""
     return ctypes.cast(getattr(RCL, name), c_void_p).value or 0
 
 
 def function(name: str, returned: Any, *taken: Any) -> Any:
-    """A function with its types, not shared with other callers."""
+    """Return a function with its types, not shared with other callers."""
     return ctypes.CFUNCTYPE(returned, *taken)((name, RCL))
 
 
@@ -54,7 +54,7 @@ class PublishFunctions(NamedTuple):
 
 
 def publish_functions() -> PublishFunctions | None:
-    """The addresses; None if rcl lacks a function or its structures differ: then publish only through rclpy."""
+    """Return the addresses; None if rcl lacks a function or its structures differ: then publish only through rclpy."""
     names = "rcl_publish_serialized_message", "rcutils_get_error_string", "rcutils_reset_error"
     try:
         return PublishFunctions(*map(address, names)) if _fills_messages_as_declared() else None
@@ -63,7 +63,7 @@ def publish_functions() -> PublishFunctions | None:
 
 
 def _fills_messages_as_declared() -> bool:
-    """Whether rcl initializes a message with exactly the layout of SerializedMessage."""
+    """Return whether rcl initializes a message with exactly the layout of SerializedMessage."""
     capacity, behind = 1234, b"\xa5" * 64
     default = function("rcutils_get_default_allocator", Allocator)()
     opened = function("rcutils_uint8_array_init", c_int, c_void_p, c_size_t, POINTER(Allocator))

@@ -131,7 +131,7 @@ class Arrivals:
         self.again(subscription)  # for messages that arrived earlier
 
     def remove(self, subscription: RawSubscription) -> None:
-        """No longer wait for this subscription. Do not call during a wait."""
+        """Stop waiting for this subscription. Do not call during a wait."""
         eventfd = self._eventfds.pop(subscription)
         del self._subscriptions[eventfd]
         subscription.announce_to(None)

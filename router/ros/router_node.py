@@ -24,8 +24,8 @@ class RouterNode:
     subscribers or serves late joiners. `topics` are the discovered topics. `name` includes the namespace:
     `rover1/rover_router`. The messages of its subscriptions are taken elsewhere.
 
-    The event thread calls `subscriber_joined(topic)` and, once per second for a topic that has peers with an
-    incompatible QoS, and for some seconds after that, `incompatible(topic, policy, peers)`.
+    The event thread calls `subscriber_joined(topic)`. While a topic has peers with an incompatible QoS, and for some
+    seconds afterwards, it calls `incompatible(topic, policy, peers)` once per second.
 
     Topics are replaced in four steps: `prepare` opens new endpoints, `apply` uses them, `watch` waits for their events,
     `finish` closes the unused ones. After `prepare`, `abandon` undoes it.
@@ -104,7 +104,7 @@ class RouterNode:
             opened.close()
 
     def stalled(self) -> Iterator[tuple[str, float]]:
-        """The topics on which Python threads are publishing now, each with the seconds since they began."""
+        """Yield the topics on which Python threads are publishing now, each with the seconds since they began."""
         for topic, publication in list(self._publications.items()):
             if seconds := publication.stalled():
                 yield topic, seconds

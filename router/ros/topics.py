@@ -51,11 +51,11 @@ class RosTopics:
         self._name = node.get_name(), node.get_namespace()
 
     def names(self) -> list[str]:
-        """The topics with publishers or subscribers."""
+        """Return the topics with publishers or subscribers."""
         return [name for name, _ in self._node.get_topic_names_and_types()]
 
     def publishers(self, topic: str) -> list[DiscoveredPublisher]:
-        """The publishers of `topic`, of any type."""
+        """Return the publishers of `topic`, of any type."""
         return [
             DiscoveredPublisher(
                 type_name=seen["topic_type"],
@@ -68,7 +68,7 @@ class RosTopics:
         ]
 
     def resolved(self, name: str) -> str:
-        """The absolute name of a topic, from the node's namespace and remaps."""
+        """Return the absolute name of a topic, from the node's namespace and remaps."""
         return str(self._node.resolve_topic_name(name))
 
     def _query(self, function: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
@@ -80,11 +80,11 @@ class RosTopics:
         return (seen["node_name"], seen["node_namespace"]) == self._name
 
     def installed_type(self, type_name: str) -> MessageType:
-        """As `types.installed_type`. Takes as long as `load`; thread-safe."""
+        """Like `types.installed_type`. Takes as long as `load`; thread-safe."""
         return installed_type(type_name)
 
     def load(self, type_name: str, definitions: Mapping[str, Definition]) -> Any:
-        """As `types.usable_class`, for `tap`. Thread-safe."""
+        """Like `types.usable_class`, for `tap`. Thread-safe."""
         return usable_class(type_name, definitions)
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
@@ -109,7 +109,7 @@ class RosTopics:
             raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
 
     def _our_types(self, topic: str) -> set[str]:
-        """The types with which our node publishes or subscribes to the topic."""
+        """Return the types with which our node publishes or subscribes to the topic."""
         seen = [
             *self._query(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic),
             *self._query(rclpy_implementation.rclpy_get_subscriptions_info_by_topic, topic),
@@ -137,7 +137,7 @@ class TopicTap:
         self.take = subscription.take
 
     def arrived(self) -> int:
-        """The number of messages that have arrived since the last call, taken or not. Does not wait."""
+        """Return the number of messages that have arrived since the last call, taken or not. Does not wait."""
         try:
             return os.eventfd_read(self.fd)
         except BlockingIOError:
@@ -148,7 +148,7 @@ class TopicTap:
 
 
 def tap_qos(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
-    """A QoS for the newest `depth` messages. Best effort matches every publisher; kept messages need reliable QoS."""
+    """Return a QoS for the newest `depth` messages. Best effort matches all publishers; kept messages need reliable."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -201,7 +201,7 @@ class TopicListener:
 
 
 def _publishers(node: Node, topic: str, patience: float) -> Sequence[DiscoveredPublisher]:
-    """The publishers discovered so far; waits up to `patience` seconds for the first one."""
+    """Return the publishers discovered so far; waits up to `patience` seconds for the first one."""
     topics, name, until = RosTopics(node), node.resolve_topic_name(topic), monotonic() + patience
     while not (publishers := topics.publishers(name)) and monotonic() < until:
         sleep(_DISCOVERY_INTERVAL)

@@ -114,7 +114,7 @@ def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str,
 
 
 def _snake_case(name: str) -> str:
-    """The name in rosidl's snake case, as in its file names."""
+    """Return the name in rosidl's snake case, as in its file names."""
     words = re.sub("(.)([A-Z][a-z]+)", r"\1_\2", name)
     return re.sub("([a-z0-9])([A-Z])", r"\1_\2", words).lower()
 
@@ -132,7 +132,7 @@ def _described(capsule: object) -> Iterator[tuple[str, Definition]]:
 
 
 def _spelled(declared: _FieldType) -> str:
-    """The type of a field in rclpy's notation; "unknown" if no `.msg` file can declare it."""
+    """Return the type of a field in rclpy's notation; "unknown" if no `.msg` file can declare it."""
     base = (declared.id - 1) // _ARRAY * _ARRAY if declared.id <= _LISTS_END else _LISTS_END
     kind = declared.id - base
     if kind == _NESTED:

@@ -39,7 +39,7 @@ _BASIC: dict[str, Type] = {
 
 @contextmanager
 def lean_interfaces() -> Iterator[None]:
-    """Import modules of message types inside, without imports that CDR bytes do not need.
+    """Within the context, import modules of message types without imports that CDR bytes do not need.
 
     These are numpy, for fields of fixed length, and the generator of such modules, with its parsers.
     """
@@ -48,7 +48,7 @@ def lean_interfaces() -> Iterator[None]:
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
-    """As `usable_class`, with the position `span` in the StartError."""
+    """Like `usable_class`, with the position `span` in the StartError."""
     try:
         return usable_class(name, definitions)
     except StartError as error:
@@ -56,7 +56,7 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
 
 def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """The class, or a stand-in, with which rclpy publishes and takes a type as CDR.
+    """Return the class, or a stand-in, with which rclpy publishes and takes a type as CDR.
 
     Raises StartError unless the type and its nested types are installed as in `definitions`.
     """
@@ -77,7 +77,7 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
 
 
 def loaded_class(name: str) -> Any:
-    """As `installed_class`, with the type support loaded, which takes some 10 ms. Raises StartError."""
+    """Like `installed_class`, with the type support loaded, which takes some 10 ms. Raises StartError."""
     message_class = installed_class(name)
     try:
         with lean_interfaces():
@@ -116,13 +116,13 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _has_part(package: str, kind: str) -> bool:
-    """Whether the package is installed, without importing it."""
+    """Return whether the package is installed, without importing it."""
     found = PathFinder.find_spec(package)
     return bool(found and PathFinder.find_spec(f"{package}.{kind}", found.submodule_search_locations or []))
 
 
 def _member(module: ModuleType, name: str) -> Any:
-    """The member or None. A package exports only some messages of an action; the action's module has all."""
+    """Return the member or None. A package exports only some messages of an action; the action's module has all."""
     interface = getattr(module, name.partition("_")[0], None)
     home = module if interface is None else sys.modules[interface.__module__]
     return getattr(module, name, None) or getattr(home, name, None)

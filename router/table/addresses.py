@@ -150,7 +150,7 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     try:
         address = parse_address(locator["address"] if locator else node.text)
     except BadAddressError:
-        if is_locator:  # a host name, IPv6, a path; other addresses have this finding already
+        if is_locator:  # a host name, IPv6, a path; invalid addresses of other kinds already have a finding
             what = f"'{node.text}' under '{key}' of {name} has no IPv4 address to compare with {networks}"
             remedy = _remedy(path, "tcp/127.0.0.1:7447", networks, is_extended)
             yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, remedy)

@@ -145,7 +145,7 @@ Salvage = Callable[[Entry], Union[Entry, None]]
 
 
 def _nothing(_: Entry) -> None:
-    """Return nothing: most parts, such as an endpoint, are valid as a whole or not at all."""
+    """Return None: most parts, such as an endpoint, are valid as a whole or not at all."""
 
 
 class _Builder:

@@ -15,7 +15,7 @@ Fits = Callable[[Any], bool]
 
 
 def fitting(schema: Mapping[str, Any]) -> Fits:
-    """Return a function that tells whether data fits a schema of draft 7, with the keywords that our schemas use.
+    """Return a function that returns whether data fits a schema of draft 7, with the keywords that our schemas use.
 
     References lead to the schema's own `definitions`. It treats 1 and true as equal items of a list.
     """

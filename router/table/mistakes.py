@@ -159,7 +159,7 @@ _NO_EXCLAMATION = "a value cannot start with '!'"
 
 
 def exclamation(source: Source, line: int) -> Diagnostic | None:
-    """Return a finding for `!(a > b)`, which is `not` in other languages; None without."""
+    """Return a finding for `!(a > b)`, which means `not` in other languages, or None."""
     for number in (line, *_line_before(source, line)):
         text = source.lines[number] if number < len(source.lines) else ""
         if match := _EXCLAMATION.search(text):
@@ -181,7 +181,7 @@ def _closing(text: str, start: int) -> int:
 
 
 def _slip(source: Source, line: int) -> Diagnostic | None:
-    """Return a finding for text in the line, or in the one before it, that YAML does not allow; None without."""
+    """Return a finding for text in the line, or in the one before it, that YAML does not allow, or None."""
     for number in (*_line_before(source, line), line):
         text = _text(source, number)
         for pattern, advice in _SLIPS:
@@ -311,7 +311,7 @@ def _spaced(text: str) -> str:
 
 
 def _neighbours(source: Source, line: int) -> list[int]:
-    """Return the indentations at which this line could continue the keys and items above; empty if it has one."""
+    """Return the indentations at which this line could continue the keys and items above; empty if it already does."""
     if line >= len(source.lines):
         return []
     own, open_at = _indent(source.lines[line]), list[int]()
@@ -336,7 +336,7 @@ _KEY = re.compile(r"[ -]*([\w.]+):(?: |$)")
 
 
 def _too_shallow(source: Source, line: int) -> Diagnostic | None:
-    """Return a finding for a key above that is indented too little, so that this line is misplaced; None without.
+    """Return a finding for a key above that is indented too little, so that this line is misplaced, or None.
 
     If a mapping of that depth can have such a key, this line is indented too far instead.
     """
@@ -368,7 +368,7 @@ def _indented(source: Source, line: int, what: str) -> Diagnostic:
 
 
 def _odd_line_above(source: Source, line: int) -> int | None:
-    """Return the only line above that is indented one space more or less than this line and the next; None without."""
+    """Return the only line above that is indented one space more or less than this line and the next, or None."""
     own = _indent(source.lines[line])
     written = [(number, _indent(text)) for number, text in enumerate(source.lines) if _text(source, number)]
     if own != next((indent for number, indent in written if number > line and indent <= own), None):

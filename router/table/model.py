@@ -78,7 +78,7 @@ class OnLimit(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
-    """The envelope: `message` and `oneof` in `protos`, an absolute path, by default that of the router's own protos.
+    """The envelope: `message` and `oneof`, declared in `protos`, an absolute path (by default the router's own protos).
 
     `lock` is the absolute path of the lock file, None if it is beside the protos. `exclude` are files and folders
     relative to `protos`.

@@ -59,7 +59,7 @@ def read_source(path: Path) -> Source:
 
 
 def unusable_character(text: str) -> tuple[int, str] | None:
-    """Return offset and name of a control character, foreign line end or half surrogate pair; None without."""
+    """Return offset and name of a control character, foreign line end or half surrogate pair; None if there is none."""
     match = _UNUSABLE.search(text)
     return (match.start(), f"U+{ord(match[0]):04X}") if match else None
 

@@ -1,1 +1,1 @@
-"""What an operator runs beside the router."""
+"""Tools that an operator runs beside the router."""

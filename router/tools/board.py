@@ -53,7 +53,7 @@ class Change:
 
 
 def command_cases(table: RouteTable, board: str) -> frozenset[str]:
-    """The payload cases that the table sends to a board with the priority of commands."""
+    """Return the payload cases that the table sends to a board with the priority of commands."""
     return frozenset(
         route.case.value
         for route in table.routes
@@ -63,7 +63,7 @@ def command_cases(table: RouteTable, board: str) -> frozenset[str]:
 
 
 def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[Stop]:
-    """The payloads that the deadmen of a program send to this board."""
+    """Return the payloads that the deadmen of a program send to this board."""
     return [
         Stop(decoded.case.name, decoded.message, MISSED_REPEATS * plan.repeat / 1e9)
         for plan in deadmen
@@ -112,7 +112,7 @@ class Board:
             self._become(now, State.STOPPED)
 
     def status(self, now: float) -> str:
-        """The state as text for people."""
+        """Return the state as text for people."""
         if self.state is State.WAITING:
             return "no commands yet"
         if self.state is State.STOPPED:
@@ -138,7 +138,7 @@ class Board:
 def boards(
     wire: Wire, table: RouteTable, deadmen: Iterable[DeadmanPlan], changed: Callable[[Change], None]
 ) -> dict[str, Board]:
-    """The boards that the table sends commands to, by endpoint."""
+    """Return the boards that the table sends commands to, by endpoint."""
     plans = tuple(deadmen)
     found = {}
     for name, endpoint in table.endpoints.items():
@@ -163,7 +163,7 @@ def is_part(kind: MessageType) -> bool:
 
 
 class Frames:
-    """Counts the frames that a simulated basestation assembles of one payload case. `astray`: parts of no frame."""
+    """Counts the frames of one payload case that a simulated basestation assembles. `astray`: parts of no frame."""
 
     def __init__(self) -> None:
         self.complete = 0

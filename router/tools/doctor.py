@@ -1,4 +1,4 @@
-"""Find what keeps a router from working on this computer, with remedies.
+"""Finds what keeps a router from working on this computer, with remedies.
 
 `examine` checks the table first, then this computer, then the running router if there is one.
 """
@@ -104,7 +104,7 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
 
 
 def _told(program: Program, running: Health) -> Iterator[CheckResult]:
-    """What a running router reports; it may be running another version of the table."""
+    """Yield what a running router reports; it may be running another version of the table."""
     if running.table_sha256 != program.table.sha256:
         yield warning("router", "its table differs from this file", "router reload, or systemctl restart")
     for each in running.problems:
@@ -118,13 +118,13 @@ def _told(program: Program, running: Health) -> Iterator[CheckResult]:
 
 
 def _in_place_of(running: Health | None) -> Mapping[str, str]:
-    """By endpoint, the other host that sends its payloads, as the running router reports."""
+    """Return, by endpoint, the other host that sends its payloads, as the running router reports."""
     labels = [each.labels for each in running.problems] if running is not None else []
     return {each["endpoint"]: each["sender"] for each in labels if "sender" in each}
 
 
 def _health(program: Program) -> Health | None:
-    """The health of the running router; None if no router answers, or the table has no `http.address`."""
+    """Return the health of the running router; None if no router answers, or the table has no `http.address`."""
     try:
         return None if program.table.http is None else health(url_of(program.table))
     except TransportError:  # no answer, or another program's

@@ -48,12 +48,12 @@ def fine(about: str, text: str) -> CheckResult:
 
 
 def warning(about: str, text: str, remedy: str) -> CheckResult:
-    """Something works less well than it could, or not for everybody."""
+    """Return a warning: something works less well than it could, or not for everybody."""
     return CheckResult(Grade.WARNING, about, text, remedy)
 
 
 def problem(about: str, text: str, remedy: str) -> CheckResult:
-    """The router does not start, or does not do what the table says."""
+    """Return a problem: the router does not start, or does not do what the table says."""
     return CheckResult(Grade.PROBLEM, about, text, remedy)
 
 
@@ -141,7 +141,7 @@ def clock(now: datetime | None = None, status: int | None = None) -> Iterator[Ch
 
 
 def _clock_status() -> int | None:
-    """The status bits of adjtimex; None if not permitted."""
+    """Return the status bits of adjtimex; None if not permitted."""
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)
     if ctypes.CDLL(None).adjtimex(timex) < 0:
         return None
@@ -227,7 +227,7 @@ def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
 
 
 def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
-    """What gateways bind: (protocol, address, owner). Of Zenoh's locators, only those of TCP with an IPv4 address."""
+    """Yield what gateways bind: (protocol, address, owner). Of Zenoh's locators, only TCP ones with an IPv4 address."""
     for gateway in program.table.gateways.values():
         what = f"gateway '{gateway.name}'"
         if gateway.receive is not None:
@@ -241,7 +241,7 @@ def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
 
 
 def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[CheckResult]:
-    """`waits`: whether the router waits for an address that no interface has yet."""
+    """Check that an address can be bound. `waits`: the router waits for an address that no interface has yet."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
         if protocol == "tcp":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
@@ -319,7 +319,7 @@ def _has_way(endpoint: Endpoint) -> bool:
 
 
 def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
-    """The `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
+    """Return the `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
     answered: set[str] = set()
     with _open_ping() as pinging:
         request = _request(os.getpid() & 0xFFFF)
@@ -341,7 +341,7 @@ def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
 
 
 def _open_ping() -> socket.socket:
-    """An unprivileged ICMP socket if the system allows it, else a raw one."""
+    """Open an unprivileged ICMP socket if the system allows it, else a raw one."""
     try:
         return socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_ICMP)
     except PermissionError:
@@ -349,7 +349,7 @@ def _open_ping() -> socket.socket:
 
 
 def _request(identity: int) -> bytes:
-    """An echo request with its checksum, which raw sockets need."""
+    """Return an echo request with its checksum, which raw sockets need."""
     total = (_ECHO << 8) + identity + 1
     return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
 

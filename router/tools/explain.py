@@ -85,7 +85,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
 
 
 def tried_route(checked: CheckedRoute, everything: Checked, program: Program, words: Sequence[str]) -> Iterator[str]:
-    """What happens to one payload with these `field=value` words, sent by the first source to a newly started router.
+    """Yield what happens to a payload of `field=value` words, sent by the first source to a newly started router.
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
     """
@@ -104,7 +104,7 @@ def tried_route(checked: CheckedRoute, everything: Checked, program: Program, wo
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
-    """Settings of the whole route."""
+    """Yield settings of the whole route."""
     route, deadman = checked.route, checked.deadman
     if route.for_each is not None:
         yield f"  one datagram for each of {route.for_each.text}"
@@ -137,7 +137,7 @@ def _source(name: str, table: RouteTable) -> str:
 
 
 def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Checked, how: str) -> Iterator[str]:
-    """What happens to a message for an endpoint, in this order."""
+    """Yield what happens to a message for an endpoint, in this order."""
     endpoint = served.endpoint
     assert endpoint is not None  # noqa: S101 - that of a destination
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
@@ -154,7 +154,7 @@ def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Check
 
 
 def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
-    """What happens to a message that is published, in this order."""
+    """Yield what happens to a message that is published, in this order."""
     yield f"  topic {served.label}: {topic.type_name}  ({served.span})"
     yield _quality(topic)
     if not qos_of(topic).serves_late_joiners:
@@ -168,7 +168,7 @@ def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
 
 
 def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
-    """What decides whether a target gets a message."""
+    """Yield what decides whether a target gets a message."""
     words = phrases(served.declared)
     if when := words.get("when"):
         yield f"    {when}"
@@ -179,7 +179,7 @@ def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
 
 
 def _waiting(served: CheckedTarget) -> Iterator[str]:
-    """What decides when a message that is ready is sent."""
+    """Yield what decides when a message that is ready is sent."""
     words = phrases(served.declared)
     if "max_rate" in words and served.declared.on_limit is OnLimit.LATEST:
         yield f"    {words['max_rate']}, {words['on_limit']}"
@@ -188,7 +188,7 @@ def _waiting(served: CheckedTarget) -> Iterator[str]:
 
 
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
-    """The limits of a board's firmware."""
+    """Yield the limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
     payload = board.fields.get(case.number)
     fields = list(_bounded(payload.message)) if payload is not None and payload.message is not None else []
@@ -207,7 +207,7 @@ def _sizes(field: BoardField) -> Iterator[str]:
 
 
 def _bounded(message: BoardMessage) -> Iterator[BoardField]:
-    """Its fields and those of messages in it."""
+    """Yield the fields of a message and of the messages in it."""
     for field in message.values():
         yield field
         if field.message is not None:
@@ -219,14 +219,14 @@ def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
 
 
 def _mapping(served: CheckedTarget) -> Iterator[str]:
-    """One line for each mapped field, in columns, and the fields that nothing fills."""
+    """Yield one line for each mapped field, in columns, and the fields that nothing fills."""
     yield from _rows(served.rows)
     if served.plan is not None and (unset := list(_unset(served.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"
 
 
 def _rows(rows: Sequence[Row]) -> Iterator[str]:
-    """Lines in columns; a long expression shifts only the rest of its line."""
+    """Yield lines in columns; a long expression shifts only the rest of its line."""
     cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
     widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
     for target, type_, expression, kind, automatic in (
@@ -236,7 +236,7 @@ def _rows(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _unset(plan: Plan, prefix: str) -> Iterator[str]:
-    """The fields that nothing fills; a message without any filled field counts as one."""
+    """Yield the fields that nothing fills; a message without any filled field counts as one."""
     match plan:
         case Unset():
             yield prefix
@@ -251,13 +251,13 @@ def _unset(plan: Plan, prefix: str) -> Iterator[str]:
 
 
 def _quality(topic: Topic) -> str:
-    """A line with the whole QoS of a topic."""
+    """Return a line with the whole QoS of a topic."""
     qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
     return f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
 
 
 def _at_start(sends: bool) -> str:
-    """What a deadman does when the router starts."""
+    """Return what a deadman does when the router starts."""
     return "and once when the router starts" if sends else "but not when the router starts"
 
 
@@ -296,7 +296,7 @@ def _transport(gateway: Gateway) -> str:
 
 
 def _configured(zenoh: ZenohSettings) -> list[str]:
-    """The file or the keys that configure it; values may be secret."""
+    """Return the file or the keys that configure Zenoh; values may be secret."""
     if zenoh.config is None:
         return []
     if zenoh.config.path is not None:
@@ -367,14 +367,14 @@ Topics = Mapping[str, str]
 
 
 def known_topics(table: RouteTable) -> Topics:
-    """The topics that routes and gateways of the table publish or subscribe to."""
+    """Return the topics that routes and gateways of the table publish or subscribe to."""
     topics = [topic for route in table.routes for topic in route.all_topics]
     topics += [inbound.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
     return {resolved(topic.topic.value, table.node): topic.type_name for topic in topics}
 
 
 def seen_topics(table: RouteTable, seconds: float) -> Topics:
-    """The same, and all topics that a node discovers in `seconds`. Raises StartError."""
+    """Return the known topics, and all topics that a node discovers in `seconds`. Raises StartError."""
     check_environment(os.environ)
     try:
         from router.ros.node import close_node, open_node
@@ -393,7 +393,7 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
 
 
 def _publishers(types: Iterable[str]) -> str:
-    """Types with their number of publishers, first the type that gateways choose."""
+    """Return types with their number of publishers, first the type that gateways choose."""
     return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
 
 
@@ -401,7 +401,7 @@ def _publishers(types: Iterable[str]) -> str:
 
 
 def diff(old: Checked, new: Checked) -> Iterator[str]:
-    """A unified diff of the explanations of two tables without errors, a hunk for each part that differs.
+    """Yield a unified diff of the explanations of two tables without errors, a hunk for each part that differs.
 
     Places and the width of columns are not compared; addresses are compared only for endpoints.
     """
@@ -419,7 +419,7 @@ _GAP = re.compile(r"(?<=\S)(?: {2,}|\s*\n\s*)")
 
 
 def _parts(checked: Checked) -> dict[str, list[str]]:
-    """The lines that are compared, of each route, gateway, listener and endpoint, and of the rest of the table."""
+    """Return the lines to compare, of each route, gateway, listener and endpoint, and of the rest of the table."""
     table = checked.table
     assert table is not None  # noqa: S101 - a table without errors is one
     settings = {
@@ -454,7 +454,7 @@ def _comparable(lines: Iterable[str]) -> list[str]:
 
 
 def _zenoh_config(gateway: Gateway) -> Iterator[str]:
-    """A checksum of the configuration, as its contents may be secret."""
+    """Yield a checksum of the configuration, as its contents may be secret."""
     if gateway.zenoh is not None and gateway.zenoh.config is not None:
         config = gateway.zenoh.config
         yield f"  zenoh.config: {config.path or 'here'} ({hash(config.text) & 0xFFFFFF:06x})"

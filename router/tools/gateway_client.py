@@ -39,7 +39,7 @@ class Tally:
 
 
 class GatewayClient:
-    """Decodes arrivals. `wants` selects topics; `wants("")` is whether all topics are wanted.
+    """Decodes arrivals. `wants` selects topics; `wants("")` says whether all topics are wanted.
 
     A schema without a topic is shown before the first wanted message of its type.
     """
@@ -55,7 +55,7 @@ class GatewayClient:
         return self._tally
 
     def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
-        """Decode what the source delivers within `seconds`, and yield what is wanted."""
+        """Decode what the source delivers within `seconds`, and yield the wanted part."""
         ends, asks = time.monotonic() + seconds, 0.0
         while (now := time.monotonic()) < ends:
             if not self._tally.schemas and now >= asks:
@@ -65,7 +65,7 @@ class GatewayClient:
                 yield from self.take(arrival)
 
     def take(self, arrival: Arrival) -> Iterator[Heard]:
-        """Decode one arrival, and yield what is wanted."""
+        """Decode one arrival, and yield the wanted part."""
         try:
             packets = unbatched(arrival.data)
         except PacketError as error:
@@ -80,7 +80,7 @@ class GatewayClient:
                 yield from self._counted(heard, arrival.sender)
 
     def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Iterator[Heard]:
-        """Count a message or schema, and yield what is wanted."""
+        """Count a message or schema, and yield it if it is wanted, after its schema."""
         if isinstance(heard, Remark):
             yield heard
         elif isinstance(heard, Schema):

@@ -1,4 +1,4 @@
-"""Decode packets and documents of a gateway, and print them as a line of values or as JSON."""
+"""Decodes packets and documents of a gateway, and prints them as a line of values or as JSON."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _packet(packet: Packet) -> Message | Schema:
 
 
 def _is_schema(content: Mapping[str, Any]) -> bool:
-    """Whether it is a schema; in a message all three values would be lists."""
+    """Return whether it is a schema; in a message all three values would be lists."""
     return content.keys() >= {"name", "namespace", "fields"} and isinstance(content["name"], str)
 
 
@@ -125,7 +125,7 @@ def _check_depth(value: Mapping[str, Any]) -> None:
 
 
 def shape(schema: object) -> Mapping[str, Shape]:
-    """The fields of `{"fields": [{"name", "is_array", "type", "subtype"}]}`. Raises PacketError."""
+    """Return the fields of `{"fields": [{"name", "is_array", "type", "subtype"}]}`. Raises PacketError."""
     try:
         return {field["name"]: _field(field) for field in schema["fields"]}  # type: ignore[index]
     except (KeyError, TypeError) as error:
@@ -152,7 +152,7 @@ _NO_SHAPE: Mapping[str, Shape] = {}
 
 
 def json_line(heard: Heard) -> str:
-    """One JSON object with the data as received."""
+    """Return one JSON object with the data as received."""
     return json.dumps(_as_json(heard), separators=(",", ":"))
 
 
@@ -182,7 +182,7 @@ def pieces(heard: Heard) -> list[Piece]:
 
 
 def _remark(document: Mapping[str, Any]) -> Iterable[str]:
-    """A document as words; a list of topics as their names only."""
+    """Return a document as words; a list of topics as their names only."""
     if not isinstance(rows := document.get("topics"), list):
         return words(_tree(document, _NO_SHAPE, is_wrapped=False))
     names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
@@ -190,7 +190,7 @@ def _remark(document: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _clock(seconds: float) -> str:
-    """Local time of day; the number if it is outside the calendar's range."""
+    """Return local time of day; the number if it is outside the calendar's range."""
     try:
         return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
     except (OverflowError, OSError, ValueError):
@@ -215,7 +215,7 @@ def _type_text(shape: Shape) -> str:
 
 
 def _tree(values: Mapping[str, Any], shapes: Mapping[str, Shape], is_wrapped: bool) -> Mapping[str, Tree]:
-    """The members as text. `is_wrapped`: a single value is in a list of one."""
+    """Return the members as text. `is_wrapped`: a single value is in a list of one."""
     tree: dict[str, Tree] = {}
     for name, value in values.items():
         shape = shapes.get(name)

@@ -55,11 +55,11 @@ class Source(Protocol):
 _LENGTH = struct.Struct("<I")
 
 LONGEST = MOST_TEXT + (1 << 20)
-"""Most bytes of a packet or document. Text that begins with `{`, read as a packet, would be longer."""
+"""Maximum bytes of a packet or document. Read as the length of a packet, the beginning of a document exceeds it."""
 
 
 class Splitter:
-    """Splits a TCP stream into packets or documents. `form` None: detected from the first bytes.
+    """Splits a TCP stream into packets or documents. If `form` is None, it is detected from the first bytes.
 
     `gateway_v1`: each packet after its length, u32 little-endian. `json_lines`: a document and a newline.
     """
@@ -132,7 +132,7 @@ class ConnectedSource(ABC):
         self._next_attempt = 0.0
 
     def ask(self) -> None:  # noqa: B027 - there is nothing to request
-        """A new client gets all schemas unasked."""
+        """Do nothing: a new client gets all schemas unasked."""
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
         if not self._is_connected and not self._connect(timeout):
@@ -144,7 +144,7 @@ class ConnectedSource(ABC):
 
     @abstractmethod
     def _open(self, opened: socket.socket, connected: ExitStack) -> None:
-        """Start to receive; `connected` closes what is entered into it. Raises OSError."""
+        """Start to receive. Resources entered into `connected` are closed with the connection. Raises OSError."""
 
     @abstractmethod
     def _receive(self, timeout: float) -> Sequence[bytes]:
@@ -180,7 +180,7 @@ _READ_SIZE = 1 << 18
 
 
 class TcpSource(ConnectedSource):
-    """`form` is gateway_v1 or json_lines; None: detected."""
+    """`form` is gateway_v1 or json_lines; if None, it is detected."""
 
     def __init__(self, address: Address, form: GatewayFormat | None, say: Say) -> None:
         super().__init__("tcp", address, say)
@@ -250,7 +250,7 @@ _MOST_AT_ONCE = 1000
 
 
 class UdpSource:
-    """Bound to `address`. `gateway` is the address to request schemas from, or None. Raises UsageError."""
+    """A socket bound to `address`. `gateway` is the address to request schemas from, or None. Raises UsageError."""
 
     def __init__(self, address: Address, gateway: Address | None, say: Say) -> None:
         self._socket = udp.open_udp(address, "listen")

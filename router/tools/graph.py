@@ -67,13 +67,13 @@ def dot(table: RouteTable, title: str) -> str:
 
 
 def svg(table: RouteTable, title: str) -> str:
-    """The picture, light or dark as its viewer prefers. Raises UsageError if Graphviz is not installed."""
+    """Return the picture, light or dark as its viewer prefers. Raises UsageError if Graphviz is not installed."""
     program = shutil.which("dot")
     if program is None:
         raise UsageError("an .svg needs Graphviz, which is not installed", "apt install graphviz")
     command = [program, "-Tsvg"]
     drawn = subprocess.run(command, input=dot(table, title), capture_output=True, encoding="utf-8", check=True)
-    without_doctype = drawn.stdout[drawn.stdout.index("<svg") :]  # it names another host
+    without_doctype = drawn.stdout[drawn.stdout.index("<svg") :]  # the doctype names another host
     head, body = without_doctype.split(">", 1)
     return f"{head}>\n{_SVG_STYLE}{body.lstrip()}"
 
@@ -142,16 +142,16 @@ def _numbered(nodes: Sequence[Node]) -> dict[str, str]:
 
 
 def _yaml_text(text: str) -> str:
-    """Quoted for Mermaid's front matter, which is YAML."""
+    """Quote for Mermaid's front matter, which is YAML."""
     return "'" + text.replace("'", "''") + "'"
 
 
 def _mermaid_text(text: str) -> str:
-    """Escaped for Mermaid's quoted labels, which are HTML; `#` begins Mermaid's own entities."""
+    """Escape for Mermaid's quoted labels, which are HTML; `#` begins Mermaid's own entities."""
     return escape(text, {'"': "&quot;", "#": "&num;"})
 
 
 def _dot_text(text: str) -> str:
-    """Escaped for Graphviz, which would read `&lt;` as one character."""
+    """Escape for Graphviz, which would read `&lt;` as one character."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("&", "&amp;")
     return f'"{escaped}"'

@@ -25,7 +25,7 @@ _MOST_SHOWN = 16
 
 
 def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
-    """All routines of a route."""
+    """Yield all routines of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name
     for kind, routes in (("destination", lowered.to_destinations), ("topic", lowered.to_topics)):
@@ -66,7 +66,7 @@ def _layout(layout: Layout) -> Iterator[str]:
 
 
 def _fields(fields: list[WantedField], layout: Layout) -> Iterator[str]:
-    """The fields of a protobuf message that are read, and the slots that say which member of a oneof is set."""
+    """Yield the fields of a protobuf message that are read, and the slots that say which member of a oneof is set."""
     for field in fields:
         places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
         places += [f"section {field.section}"] if field.section != NONE else []
@@ -78,7 +78,7 @@ def _fields(fields: list[WantedField], layout: Layout) -> Iterator[str]:
 
 
 def _step(step: ReadOperation, layout: Layout) -> str:
-    """One step through a ROS message."""
+    """Return one step through a ROS message."""
     to = f" -> {_slot(step.slot, layout)}" if step.slot != NONE else ""
     match step.kind:
         case ReadKind.SCALAR:
@@ -133,7 +133,7 @@ def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> 
 
 
 def _listed(routine: Routine, places: list[str], layout: Layout) -> Iterator[str]:
-    """One numbered operation per line, below its place where that changes. Loops are indented."""
+    """Yield one numbered operation per line, below its place where that changes. Loops are indented."""
     depth = 0
     before = ""
     for number, (operation, place) in enumerate(zip(routine, places, strict=True)):
@@ -208,7 +208,7 @@ def _element(line: _Line) -> str:
 
 
 def _tag(line: _Line) -> str:
-    """The field of a protobuf message; packed elements have none."""
+    """Return the field of a protobuf message; packed elements have none."""
     return f"field {line.operation.size >> 3}" if line.operation.size else "no tag"
 
 

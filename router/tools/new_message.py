@@ -73,17 +73,17 @@ class Site:
     messages: Path
 
     def file(self, name: str) -> str:
-        """The `.proto` file of a message or an enum, relative to the folder of the protos."""
+        """Return the `.proto` file of a message or an enum, relative to the folder of the protos."""
         return self.schema.sources.file(name)
 
     def new_file(self, message: NewMessage) -> str:
-        """Where its `.proto` file goes: the folder of its board, beside that of the envelope."""
+        """Return where its `.proto` file goes: the folder of its board, beside that of the envelope."""
         common = PurePosixPath(self.file(self.envelope.name)).parent
         return (common.parent / message.board / f"{message.stem}.proto").as_posix()
 
 
 def site_of(checked: Checked, messages: Path) -> Site:
-    """`checked` is a table without errors. Raises UsageError if it has no envelope."""
+    """Return the site of a table without errors. Raises UsageError if it has no envelope."""
     if checked.table is None or checked.envelope is None:
         raise ValueError(f"{checked.path} has errors")
     settings = checked.table.envelope
@@ -133,7 +133,7 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
 
 
 def _parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
-    """Fields from `dose_rate:float state:SensorState`, or one from `dose_rate:float # uSv/h`."""
+    """Return fields from `dose_rate:float state:SensorState`, or one from `dose_rate:float # uSv/h`."""
     fields: list[NewField] = []
     for text in texts:
         declared, _, comment = text.partition("#")
@@ -150,7 +150,7 @@ def _parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
 
 
 def _usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
-    """The fields of a message without `--fields`: a number, and the enums and messages that most siblings have."""
+    """Return the fields of a message without `--fields`: a number, and enums and messages that most siblings have."""
     siblings = [case.type for case in site.envelope.cases.values() if case.type.short_name.startswith(prefix)]
     shared = Counter(
         NewField(field.name, field.type.name)
@@ -195,7 +195,7 @@ def _check_word(name: str, remedy: str) -> None:
 
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
-    """The endpoint of this name, with or without `_board`."""
+    """Return the endpoint of this name, with or without `_board`."""
     senders = {name: each for name, each in table.endpoints.items() if each.kind is not EndpointKind.TOOL}
     found = senders.get(board) or senders.get(f"{board}_board")
     if found is None:
@@ -206,7 +206,7 @@ def _endpoint(board: str, table: RouteTable) -> Endpoint:
 
 
 def _case(name: str, board: str) -> str:
-    """The payload case: `radiation_info` of `SensorBoardRadiationInfo`."""
+    """Return the payload case: `radiation_info` of `SensorBoardRadiationInfo`."""
     prefix = prefix_of(board)
     rest = name.removeprefix(prefix)
     if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):
@@ -234,7 +234,7 @@ def _check_names(name: str, case: str, site: Site) -> None:
 
 
 def _check_number(number: int, case: str, site: Site) -> None:
-    """Raises UsageError, with the next free number, for a number that was ever used, reserved or promised."""
+    """Raise UsageError, with the next free number, for a number that was ever used, reserved or promised."""
     lock, envelope = read_lock(site.schema.lock), site.envelope.name
     entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
     holders = {entry.number: entry.name for entry in entries}
@@ -262,7 +262,7 @@ def _is_free(number: int, site: Site) -> bool:
 
 
 def _promise(number: int, site: Site) -> str:
-    """The comment in the envelope's file that promises the number, such as `Number 30 is promised to ...`."""
+    """Return the comment in the envelope's file that promises the number, such as `Number 30 is promised to ...`."""
     text = (site.schema.root / site.file(site.envelope.name)).read_text(encoding="utf-8")
     found = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
     return found[1] if found else ""

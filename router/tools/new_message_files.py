@@ -35,7 +35,7 @@ class Changes:
 
 
 def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Changes:
-    """All changes except to the lock. `others` are the tables beside the site's. Raises UsageError."""
+    """Return all changes except to the lock. `others` are the tables beside the site's. Raises UsageError."""
     root, table = site.schema.root, site.table
     envelope = root / site.file(site.envelope.name)
     texts = {
@@ -60,9 +60,9 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
 
 
 class Written:
-    """Files that are written with their line ends preserved, and can all be undone.
+    """Writes files with their line ends preserved, and can undo all of them.
 
-    Raises UsageError if one cannot be written, and then undoes the others.
+    If one cannot be written, undoes the others and raises UsageError.
     """
 
     def __init__(self, texts: Mapping[Path, str]) -> None:
@@ -106,7 +106,7 @@ class Written:
 
 
 def locked(site: Site) -> str:
-    """The lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
+    """Return the lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
     schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
     errors = [each for each in lock.findings() if each.severity is Severity.ERROR]
@@ -141,7 +141,7 @@ _HEAD = re.compile(r"\s*(syntax|package)\b")
 
 
 def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
-    """The envelope's file with the import, in its order, and the payload case after the last one."""
+    """Return the envelope's file with the import, in its order, and the payload case after the last one."""
     lines = text.split("\n")
     places = {
         field: site.schema.span(site.envelope.name, field.name).line
@@ -164,7 +164,7 @@ def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
 
 
 def _msg(message: NewMessage, site: Site) -> str:
-    """The ROS message whose fields `fields: auto` fills by their names.
+    """Return the ROS message whose fields `fields: auto` fills by their names.
 
     An enum is a message of its own where there is one, else a uint8 with its values as constants. Raises UsageError
     for a field whose type has no ROS message.
@@ -212,7 +212,7 @@ def _short(name: str) -> str:
 
 
 def _aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
-    """Declarations with their comments aligned."""
+    """Yield declarations with their comments aligned."""
     rows = list(rows)
     width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
     for code, comment in rows:
@@ -232,7 +232,7 @@ class _Entry(NamedTuple):
 
 
 def _entries(text: str, section: str) -> list[_Entry]:
-    """The entries of a top-level mapping."""
+    """Return the entries of a top-level mapping."""
     root = yaml.compose(text, yaml.SafeLoader)
     top = root.value if isinstance(root, yaml.MappingNode) else []
     found = next((value for key, value in top if key.value == section), None)
@@ -247,7 +247,7 @@ def _entries(text: str, section: str) -> list[_Entry]:
 
 
 def _last_line(node: yaml.Node) -> int:
-    """The index of a node's last line, or of a blank one after it. The end mark of a block is after comments."""
+    """Return the index of a node's last line, or of a blank one after it. The end mark of a block is after comments."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _last_line(last[1] if isinstance(last, tuple) else last)
@@ -256,7 +256,7 @@ def _last_line(node: yaml.Node) -> int:
 
 
 def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str = "") -> str:
-    """The text with a stanza after an entry, under a heading if there is a `section`."""
+    """Return the text with a stanza after an entry, under a heading if there is a `section`."""
     lines = text.split("\n")
     indent = " " * after.indent
     stanza = list(stanza)
@@ -266,7 +266,7 @@ def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str =
 
 
 def _in_table(text: str, message: NewMessage, site: Site) -> str:
-    """The table with a route from the board to ROS and the basestation, after the last route of that board."""
+    """Return the table with a route from the board to ROS and the basestation, after the last route of that board."""
     own = _own_routes(site.table)
     if not own and len(site.table.files) > 1:
         extended = shown_path(site.table.files[1])
@@ -295,7 +295,7 @@ _ONE_LINE = re.compile(r" *\w+: +(\{.*\}) *$")
 
 
 def _in_forwarding_table(text: str, message: NewMessage, table: RouteTable) -> str | None:
-    """A table that sends everything to the same endpoints, with the new case added. None for any other table."""
+    """Return a table that sends everything to the same endpoints, with the new case added. None for any other table."""
     own = _own_routes(table)
     if not own or len({_forwarding(route) for route in table.routes}) != 1 or _forwarding(own[0])[0] != (ANY,):
         return None
@@ -315,7 +315,7 @@ def _forwarding(route: Route) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _own_routes(table: RouteTable) -> list[Route]:
-    """The routes of the file itself, without those of the tables that it extends."""
+    """Return the routes of the file itself, without those of the tables that it extends."""
     return [route for route in table.routes if route.span.file == shown_path(table.path)]
 
 
@@ -328,13 +328,13 @@ def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
 
 
 def _basestations(message: NewMessage, table: RouteTable) -> list[str]:
-    """The endpoints that get every message of a board."""
+    """Return the endpoints that get every message of a board."""
     endpoints = table.endpoints.items()
     return [name for name, each in endpoints if each.kind is EndpointKind.BASESTATION and name != message.board]
 
 
 def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
-    """The test file with one more test, below the last one of that board: the message passes unchanged."""
+    """Return the test file with one more test, below the last one of that board: the message passes unchanged."""
     text = _read(path)
     try:
         entries = _entries(text, "tests")
@@ -347,7 +347,7 @@ def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
 
 
 def _senders(node: yaml.Node) -> Iterator[str]:
-    """Everything that a test names as `from`."""
+    """Yield everything that a test names as `from`."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             yield from _senders(item)
@@ -374,14 +374,14 @@ def _test(message: NewMessage, site: Site) -> Iterator[str]:
 
 
 def _flow(key: str, values: object) -> list[str]:
-    """A key and its value in braces, on several lines if they are long."""
+    """Return a key and its value in braces, on several lines if they are long."""
     text = yaml.safe_dump(values, default_flow_style=True, sort_keys=False, width=_WIDEST - _LONGEST_FIELD)
     first, *others = text.splitlines()
     return [key + first, *(" " * (len(key) + 1) + other.strip() for other in others)]
 
 
 def _sample(type_name: str, place: int, site: Site) -> object:
-    """A value that is never a default, and mostly differs from field to field."""
+    """Return a value that is never a default, and mostly differs from field to field."""
     if type_name in SCALARS:
         return _scalar(type_name == "bool", type_name in ("float", "double"), place)
     return _value(site.schema.enums.get(type_name) or site.schema.messages[type_name], place)

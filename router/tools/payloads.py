@@ -38,7 +38,7 @@ class Pose:
 
 
 def pose(t: float, epoch: float) -> Pose:
-    """The pose `t` seconds after the start."""
+    """Return the pose `t` seconds after the start."""
     rate = math.tau / 120
     phase = rate * t
     east, north = 10 * math.sin(phase), 5 * math.sin(2 * phase)
@@ -216,7 +216,7 @@ class PayloadModel:
             member.extend(self._value(element, now, f"{path}[{index}]") for index in range(_length(field.type)))
 
     def _value(self, kind: Type, now: Pose, path: str) -> object:
-        """A value of a scalar type: waves of half a minute, each path with a phase of its own."""
+        """Return a value of a scalar type: waves of half a minute, each path with a phase of its own."""
         wave = math.sin(now.t * math.tau / 30 + self._phase(path))
         if isinstance(kind, Float):
             return 10 * wave + self._noise(0.05)
@@ -245,7 +245,7 @@ def _length(kind: List) -> int:
 
 
 def _enum_value(kind: Enum, wave: float) -> int:
-    """The value that means health if the enum has one, else each value in turn."""
+    """Return the value that means health if the enum has one, else each value in turn."""
     for name, number in kind.values:
         if name.endswith(HEALTHY):
             return number

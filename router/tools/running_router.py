@@ -55,7 +55,7 @@ def url_of(table: RouteTable) -> str:
 
 
 def url_at(address: Address) -> str:
-    """The URL of a router with this `http.address`."""
+    """Return the URL of a router with this `http.address`."""
     from router.tools.udp import reachable
 
     return f"http://{reachable(address)}"
@@ -102,7 +102,7 @@ def health(url: str) -> Health:
 
 
 def down(url: str, error: TransportError) -> Problem:
-    """The problem that no router answers."""
+    """Return the problem that no router answers."""
     problem = Problem(Kind.ROUTER_DOWN, {"instance": url})
     text = str(error)
     return problem._replace(more=text.removeprefix(problem.words) if text.startswith(problem.words) else f": {text}")

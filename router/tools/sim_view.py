@@ -61,7 +61,7 @@ class SimView:
         return [change for change in self._statistics.changes if change.at > since]
 
     def headline(self) -> str:
-        """What went out and what was received, in one line."""
+        """Return what went out and what was received, in one line."""
         statistics = self._statistics
         sent = sum(cases.total() for cases in statistics.sent.values())
         received = sum(arrivals.count for _, arrivals in self._arrivals())
@@ -75,7 +75,7 @@ class SimView:
         return line
 
     def line(self) -> str:
-        """The headline, and what each endpoint received."""
+        """Return the headline, and what each endpoint received."""
         counts: dict[str, int] = defaultdict(int)
         rates: dict[str, float] = defaultdict(float)
         for (endpoint, case), count in self._history[-1][1].items():
@@ -99,7 +99,7 @@ class SimView:
                 yield endpoint, f"{inbox.undecodable} undecodable datagrams", "bold red"
 
     def statuses(self) -> Table:
-        """The boards' states and the basestation's frames, one line each."""
+        """Return the boards' states and the basestation's frames, one line each."""
         table = Table(box=None, pad_edge=False, show_header=False, expand=True)
         table.add_column(no_wrap=True)
         table.add_column(no_wrap=True, ratio=1, overflow="ellipsis")
@@ -108,7 +108,7 @@ class SimView:
         return table
 
     def table(self, height: int) -> Table:
-        """One line for each endpoint and payload case, at most `height` with the header; boards first."""
+        """Return one line for each endpoint and payload case, at most `height` with the header; boards first."""
         table = Table(box=None, pad_edge=False, expand=True, header_style="bold")
         table.add_column("endpoint", no_wrap=True)
         table.add_column("received", no_wrap=True)
@@ -128,7 +128,7 @@ class SimView:
         return table
 
     def as_json(self, seconds: float, final: bool) -> dict[str, Any]:
-        """All statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files.
+        """Return all statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files.
 
         Times and ages in seconds. `boards` are the states, `changes` their history, the newest last.
         """

@@ -67,7 +67,7 @@ def parse_silence(text: str) -> Silence:
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
-    """Raises UsageError for a name that is neither a sender nor a payload case that is sent."""
+    """Raise UsageError for a name that is neither a sender nor a payload case that is sent."""
     known = {name for stream in streams for name in (stream.endpoint, stream.case.name)} - {STRANGER}
     for silence in silences:
         if silence.name not in known:
@@ -76,11 +76,11 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
 
 
 FEEDS = 5
-"""Least number of commands within the timeout of their deadman."""
+"""Minimum number of commands within the timeout of their deadman."""
 
 
 def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
-    """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
+    """Yield the streams of the table's UDP sources, in the order of the table. Raises UsageError for unknown names."""
     for route in table.routes:
         if not route.sources:
             continue
@@ -217,7 +217,7 @@ class Simulator:
     def run(self, duration: float | None, every: float, report: Callable[[float], None]) -> float:
         """Send and receive for `duration` seconds, or until stopped. Returns the elapsed seconds.
 
-        `report` is called with them about once in `every` seconds.
+        `report` is called with the elapsed seconds, about once every `every` seconds.
         """
         start, epoch = time.monotonic(), time.time()
         due = [(stream.offset, index) for index, stream in enumerate(self._streams)]
@@ -242,7 +242,7 @@ class Simulator:
         return now
 
     def _next(self, at: float, rate: float, now: float) -> float:
-        """The time after `at` at which the stream is due; after a suspend, missed messages are skipped."""
+        """Return the time after `at` at which the stream is due; after a suspend, missed messages are skipped."""
         missed = int((now - at) * rate) if now - at > LATE else 0
         return at + (1 + missed) / rate
 

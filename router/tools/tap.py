@@ -86,7 +86,7 @@ def _checked(text: str, message: MessageType) -> Node:
 
 
 def _enums(message: MessageType) -> Iterator[Enum]:
-    """The enum types of all fields of a message and of the messages in it, each once."""
+    """Return the enum types of all fields of a message and of the messages in it, each once."""
     waiting: list[Type] = [message]
     found: dict[str, Type] = {}
     while waiting:
@@ -132,7 +132,7 @@ class TappedDatagram:
         return f"trimmed: {zeros} zeros restored" if zeros > 0 else f"padded: {-zeros} zeros removed"
 
     def json(self, with_hex: bool) -> str:
-        """One JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
+        """Return one JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
         document: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
         if self.rejected:
             document["rejected"] = self.rejected
@@ -162,7 +162,7 @@ class TappedMessage:
         return f"{line} [{self.cdr.hex()}]" if with_hex else line
 
     def json(self, with_hex: bool) -> str:
-        """One JSON object."""
+        """Return one JSON object."""
         document = {
             "time": self.at.isoformat(),
             "type": self.type_name,
@@ -245,7 +245,7 @@ def listen(
 
 
 def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> TappedDatagram:
-    """A datagram that was received at `at`, ns since 1970."""
+    """Return a datagram that was received at `at`, ns since 1970."""
     try:
         return TappedDatagram(_local_time(at), peer, data, wire.decode(data), rejected=rejected)
     except DecodeError as error:

@@ -127,7 +127,7 @@ class Window:
 
 
 def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
-    """Whether the router was restarted: only then do counters decrease."""
+    """Return whether the router was restarted: only then do counters decrease."""
     return any(
         after.counts(metric).get(labels, 0.0) < count
         for metric in ("datagrams_received", "messages_received")
@@ -136,9 +136,9 @@ def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
 
 
 def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), now: float | None = None) -> View:
-    """Totals as of `after`, rates per second and latencies since `before`, routes in the order of the metrics.
+    """Return totals as of `after`, rates per second and latencies since `before`, routes in the order of the metrics.
 
-    `now` for ages, seconds since 1970; without it that of `after`.
+    `now` is the time for ages, in seconds since 1970; by default that of `after`.
     """
     now = after.at if now is None else now
     routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
@@ -162,7 +162,7 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), no
 
 
 def ordered(rows: Sequence[RouteRow], order: Order) -> tuple[RouteRow, ...]:
-    """The largest first, rows without a value last; equal rows stay in the order of the table."""
+    """Return the rows, the largest first, those without a value last; equal rows stay in the order of the table."""
     if order is Order.TABLE:
         return tuple(rows)
     return tuple(sorted(rows, key=lambda row: -_weight(row, order)))
@@ -183,7 +183,7 @@ def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
 
 
 def _has(problems: Sequence[Problem], kind: Kind, route: str = "", **labels: str) -> bool:
-    """Whether a problem of this kind has these labels and concerns the route."""
+    """Return whether a problem of this kind has these labels and concerns the route."""
     return any(
         each.kind is kind and labels.items() <= each.labels.items() and (not route or route in each.routes)
         for each in problems
@@ -207,7 +207,7 @@ def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence
 
 
 def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, str]]:
-    """Targets, after the metric that counts their messages. For a gateway it counts messages, not packets."""
+    """Yield each target, after the metric that counts its messages. For a gateway it counts messages, not packets."""
     is_gateway = bool(after.of("messages_sent", route))
     for metric in DELIVERED:
         if not (is_gateway and metric == "datagrams_sent"):
@@ -235,7 +235,7 @@ def _dropped(route: str, target: str, snapshot: Snapshot) -> dict[str, int]:
 
 
 def _rate(before: Snapshot, after: Snapshot, metric: str, *labels: str) -> float:
-    """Per second; a restarted router counts from zero."""
+    """Return the increase per second; a restarted router counts from zero."""
     then, now, seconds = before.total(metric, *labels), after.total(metric, *labels), after.at - before.at
     return (now - then if now >= then else now) / seconds if seconds > 0 else 0.0
 
@@ -250,13 +250,13 @@ def _latencies(route: str, snapshot: Snapshot) -> dict[float, float]:
 
 
 def _new_latencies(before: Mapping[float, float], after: Mapping[float, float]) -> Mapping[float, float]:
-    """Latencies between the snapshots; all of `after` if there are none, or if the router was restarted."""
+    """Return latencies between the snapshots; all of `after` if there are none, or if the router was restarted."""
     between = {bound: count - before.get(bound, 0.0) for bound, count in after.items()}
     return between if between.get(math.inf, 0.0) > 0 and min(between.values()) >= 0 else after
 
 
 def quantile(counts: Mapping[float, float], part: float) -> float | None:
-    """The quantile `part` of a histogram, interpolated in its bucket. `counts`: values up to each bound.
+    """Return the quantile `part` of a histogram, interpolated in its bucket. `counts`: values up to each bound.
 
     `inf` if it is beyond the last bound, None if there are no values.
     """

@@ -21,11 +21,11 @@ from router.values import age_text, rate_text, shortened
 Cell = Callable[[RouteRow], Text]
 
 LATENCIES_FROM = 100
-"""Least width of a terminal, in columns, for latencies to be shown."""
+"""Minimum width of a terminal, in columns, at which latencies are shown."""
 
 _SHORT = 9
 _SHORTEST = 4
-"""Fewest letters shown of a target's name: with several targets, and with only one."""
+"""Minimum letters shown of a target's name: with several targets, and with only one."""
 
 
 _LATENCIES: dict[str, Cell] = {
@@ -88,13 +88,13 @@ class _Fitted:
 
 
 def _name(row: RouteRow, width: int) -> Text:
-    """The name, with a `!` while its deadman sends."""
+    """Return the name, with a `!` while its deadman sends."""
     name = f"!{row.route}" if row.is_tripped else row.route
     return Text(shortened(name, width), style="bold red" if row.is_tripped else "")
 
 
 def targets_text(targets: Sequence[TargetRow], width: int) -> Text:
-    """Each target with its rate; those that lose messages now come first, with a `!`.
+    """Return each target with its rate; those that lose messages now come first, with a `!`.
 
     If that is too wide, names are shortened, and then the last targets are only counted.
     """
@@ -131,7 +131,7 @@ def _rate(rate: float) -> Text:
 
 
 def _drops(row: RouteRow) -> Text:
-    """Red and with a `!` while messages are lost; yellow if some were lost before."""
+    """Return the drops: red and with a `!` while messages are lost; yellow if some were lost before."""
     text, style = reasons_text(row.dropped) or "-", "yellow" if row.lost else "dim"
     if row.is_losing:
         text, style = f"!{text}", "bold red"

@@ -99,7 +99,7 @@ class Screen:
         return _summary(self.view, width, min(_ENDPOINT_LINES, max(self.height // 6, 1)))
 
     def moved(self, key: str, width: int) -> int:
-        """The number of the first route after a key was pressed."""
+        """Return the number of the first route after a key was pressed."""
         shown, last = self.table(width).shown, len(self.view.routes)
         steps = {"up": -1, "down": 1, "page up": -len(shown), "page down": len(shown), "home": -last, "end": last}
         return max(shown.start + steps.get(key, 0), 0)
@@ -131,7 +131,7 @@ def _foot(table: RouteTable) -> Text:
 
 
 def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
-    """The whole router in a line or two, what is wrong with it, and when its endpoints were last heard."""
+    """Return the whole router in a line or two, what is wrong with it, and when its endpoints were last heard."""
     flow, losses = _summary_parts(view)
     whole = f"{flow}, {losses}"
     totals = [whole] if len(whole) <= width else [flow, losses]
@@ -144,7 +144,7 @@ def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:
-    """The endpoints below each other, in as many lines as they need; those that do not fit are counted."""
+    """Return the endpoints below each other, in as many lines as they need; those that do not fit are counted."""
     title, gap = "last heard  ", "  "
     items = [_heard(name, age, name in view.silent) for name, age in view.silence.items()]
     longest = max(map(len, items), default=0)
@@ -159,7 +159,7 @@ def _last_heard(view: View, width: int, most: int) -> list[Text]:
 
 
 def _heard(name: str, age: float | None, is_silent: bool) -> Text:
-    """Text of constant width, so that nothing moves while ages change."""
+    """Return text of constant width, so that nothing moves while ages change."""
     text = Text(f"{shortened(name, _LETTERS)} ")
     if is_silent:
         text = Text(f"!{text.plain}", style="bold red")
@@ -167,12 +167,12 @@ def _heard(name: str, age: float | None, is_silent: bool) -> Text:
 
 
 def summary_line(view: View) -> str:
-    """The whole router in one line."""
+    """Return the whole router in one line."""
     return ", ".join(_summary_parts(view))
 
 
 def _summary_parts(view: View) -> tuple[str, str]:
-    """The messages received and delivered, and those lost."""
+    """Return the messages received and delivered, and those lost."""
     delivered = sum(target.delivered for row in view.routes for target in row.targets)
     rate = sum(target.rate for row in view.routes for target in row.targets)
     gone = Counter(view.rejected)

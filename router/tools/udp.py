@@ -57,7 +57,7 @@ def origin(text: str, table: RouteTable | None) -> Address:
 
 
 def reachable(address: Address, interface: str | None = None) -> Address:
-    """The address that reaches a socket bound to `address` and `interface`, from this computer.
+    """Return the address that reaches a socket bound to `address` and `interface`, from this computer.
 
     Raises UsageError if the interface has no IPv4 address.
     """
@@ -74,12 +74,12 @@ def reachable(address: Address, interface: str | None = None) -> Address:
 
 
 def listener_address(listener: Listener) -> Address:
-    """The address that reaches a listener of the table from this computer. Raises UsageError."""
+    """Return the address that reaches a listener of the table from this computer. Raises UsageError."""
     return reachable(listener.address.value, listener.interface)
 
 
 def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
-    """A function from a peer's address to its endpoint's name, else to the address as text."""
+    """Return a function from a peer's address to its endpoint's name, else to the address as text."""
     from router.compiler.network import recognisers
 
     by_host, by_address = recognisers(table.endpoints if table is not None else {}, None)
@@ -91,7 +91,7 @@ def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
 
 
 def open_udp(address: Address, purpose: str) -> socket.socket:
-    """A non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
+    """Open a non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
     from router.net.kernel import why_not_bound
 
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,4 +1,4 @@
-"""What gateways publish in a Zenoh network under one key expression."""
+"""Data that gateways publish in a Zenoh network under one key expression."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ZenohSource:
             raise UsageError(f"zenoh: {error}") from error
 
     def ask(self) -> None:
-        """Query; Zenoh's threads call `append` for each reply, and the function at the end."""
+        """Query the latest data. Zenoh's threads call `append` for each reply, then the function."""
         replies: list[zenoh.Reply] = []
         handler = zenoh.handlers.Callback(replies.append, lambda: self._answers.put(replies))
         self._session.get(f"{self._key}/**", handler, timeout=_ANSWER_TIMEOUT)
@@ -59,7 +59,7 @@ class ZenohSource:
             return ()
 
     def _in_order(self, replies: Sequence[zenoh.Reply]) -> Sequence[zenoh.Sample]:
-        """Schemas first."""
+        """Return the samples in the replies, schemas first."""
         for reply in replies:
             if reply.err is not None:
                 self._say(f"a gateway could not answer: {reply.err.payload.to_string()}")
@@ -72,7 +72,7 @@ class ZenohSource:
 
 
 def _arrival(sample: zenoh.Sample) -> Arrival:
-    """Everything under the key has one sender: the schema in an answer is that of live data."""
+    """Return a sample as an arrival. All have one sender, because a schema in an answer also describes live data."""
     return Arrival(sample.payload.to_bytes(), None)
 
 

@@ -74,7 +74,7 @@ static inline bool modulo(struct value *a, const struct value *b, unsigned flags
     return divisor && narrow(a, remainder_of(dividend, divisor), flags);
 }
 
-/* These are for operations whose result is one of the operands, so its bits need no conversion. */
+/* These functions serve operations whose result is one of the operands, so its bits need no conversion. */
 static inline bool is_less(const struct value *a, const struct value *b, unsigned flags) {
     if (!flags) return a->integer < b->integer;
     return widened(a, flags, FIRST_UNSIGNED) < widened(b, flags, SECOND_UNSIGNED);
@@ -134,7 +134,7 @@ static inline double length(double x, double y) {
     return isnan(result) ? (double)NAN : result;
 }
 
-/* A whole number as an integer. */
+/* Convert a whole number to an integer. */
 static inline bool to_integer(struct value *whole) {
     static const double END = 0x1p63; /* int64 goes from -2^63 to just below it */
     if (!(whole->real >= -END && whole->real < END)) return false;
@@ -151,7 +151,7 @@ static inline enum order order_of_mixed(int64_t a, uint64_t b) {
     return (uint64_t)a == b ? SAME : AFTER;
 }
 
-/* An integer and a real number whose whole part is `whole`. */
+/* Compare an integer and a real number. `wholes` compares the integer and `whole`, the whole part of the real number. */
 static inline enum order order_of_rest(enum order wholes, double real, double whole) {
     if (wholes != SAME || real == whole) return wholes;
     return real > whole ? BEFORE : AFTER;

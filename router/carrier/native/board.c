@@ -122,7 +122,8 @@ static bool takes_len(struct check *check, const struct board_field *field, stru
 static bool takes_field(struct check *check) {
     uint32_t tag;
     struct bytes value;
-    if (!read_tag(&check->rest, &tag) || !read_value(&check->rest, tag & 7, &value)) return true; /* it is well formed */
+    /* Neither fails, as the envelope is well formed. */
+    if (!read_tag(&check->rest, &tag) || !read_value(&check->rest, tag & 7, &value)) return true;
     const struct board_field *field = find_field(check->levels[check->depth].message, tag >> 3);
     if (!field) return true;
     switch (tag & 7) {

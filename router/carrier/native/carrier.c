@@ -83,7 +83,7 @@ static int64_t arrival(int fd, struct msghdr *message) {
     return ioctl(fd, SIOCGSTAMPNS, &stamp) ? 0 : nanoseconds(stamp);
 }
 
-/* As recvmsg, but errors about datagrams sent from the listener's port go to their senders, and do not delay received
+/* Like recvmsg, but errors about datagrams sent from the listener's port go to their senders, and do not delay received
  * datagrams. While more errors arrive, each attempt may fail. */
 static ssize_t receive(int fd, struct msghdr *message, int flags) {
     enum { ATTEMPTS = 3 };
@@ -195,7 +195,7 @@ static void receive_from_one(struct carrier *carrier) {
     } while (goes_on(carrier));
 }
 
-/* Receive one datagram per turn of each listener that has some, so that no listener starves the others. */
+/* In each turn receive one datagram from each listener that has any, so that no listener starves the others. */
 static void receive_from_many(struct carrier *carrier, int waiting) {
     const struct program *program = carrier->routing.program;
     for (uint32_t index = 0; index < program->listener_count; index++) {
@@ -235,7 +235,7 @@ static void *receive_thread(void *of) {
 
 /* ---- the timer thread ---- */
 
-/* Feed the service manager's watchdog while receiving makes progress and Python gives signs of life. */
+/* Feed the service manager's watchdog while receiving makes progress and Python is alive. */
 static void feed_watchdog(struct carrier *carrier) {
     uint64_t turns = carrier_turns(carrier);
     if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;

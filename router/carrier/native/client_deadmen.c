@@ -25,8 +25,8 @@ struct client_deadmen {
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
     struct publishing publishing;
     /* For the thread: */
-    bool has_message;              /* a served deadman sends the machine's output to: */
-    struct deadman_destination to; /* its `datagram` is not used, as the deadman may be closed */
+    bool has_message;              /* the machine's output is the message of a served deadman */
+    struct deadman_destination to; /* its destination; `datagram` is not used, as the deadman may be closed */
 };
 
 /* ---- with the lock held ---- */

@@ -144,7 +144,7 @@ static void note_closed(struct collector *collector, const struct name *name, in
 
 /* ---- the store ---- */
 
-/* The length of the record of a payload, a multiple of its alignment. */
+/* The length of the record of a payload, a multiple of the alignment of records. */
 static uint32_t length_of(uint32_t size) {
     return ((uint32_t)sizeof(struct record) + size + MOST_PADDING) & ~(uint32_t)MOST_PADDING;
 }
@@ -218,7 +218,7 @@ static struct frame *open_frame(struct collector *collector, const struct part *
     return frame;
 }
 
-/* The contents of the frame can be read until another part is kept. */
+/* Its contents can be read until another part is kept. */
 static void remove_frame(struct collector *collector, struct frame *frame) {
     uint32_t at = 0;
     while (collector->order[at] != frame) at++;
@@ -327,7 +327,7 @@ void collector_close(struct collector *collector) {
 
 /* ---- datagrams ---- */
 
-/* `collect` refuses a datagram. Returns false. */
+/* Report that `collect` refuses a datagram. Returns false. */
 static bool refuse(struct stage *stage, const struct targets *to, const struct message *message, int reason,
                    const char *detail) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
@@ -335,7 +335,7 @@ static bool refuse(struct stage *stage, const struct targets *to, const struct m
     return false;
 }
 
-/* The machine refuses it. Returns false. */
+/* Report that the machine refuses it. Returns false. */
 static bool refuse_value(struct stage *stage, const struct targets *to, const struct message *message, int reason) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
     for (uint32_t index = 0; index < to->count; index++)
@@ -343,7 +343,7 @@ static bool refuse_value(struct stage *stage, const struct targets *to, const st
     return false;
 }
 
-/* Print an integer, signed unless `signs` says otherwise. */
+/* Print an integer. */
 static const char *printed(char *text, size_t size, int64_t number, uint32_t is_unsigned) {
     if (is_unsigned) snprintf(text, size, "%" PRIu64, (uint64_t)number);
     else snprintf(text, size, "%" PRId64, number);

@@ -3,8 +3,8 @@
  *
  * An incomplete frame is dropped `timeout` after its first datagram, when it is the oldest and there is no room, or when a
  * datagram gives another size for it, which opens a new frame. The counters count a frame as its first datagram, and its
- * other datagrams as collected. Duplicates are filtered. For another `timeout` so are datagrams of a frame that has ended:
- * they are duplicates, or their frame was counted as lost. */
+ * other datagrams as collected. Duplicates are filtered. So are, for another `timeout`, datagrams of a frame that has
+ * ended: they are duplicates, or their frame was counted as lost. */
 #ifndef COLLECT_H
 #define COLLECT_H
 

@@ -8,8 +8,9 @@
 
 enum { MOST_REACHED = 64 };
 
-/* In ns: the delay before a failed payload of the start is sent again; how long after the start a new subscriber may have
- * existed before, as discovery takes less; and the time within which a discovered subscriber discovers the publisher. */
+/* In ns: the delay before a failed datagram of the start is sent again; how long after the start a newly discovered
+ * subscriber may be one that already existed, as discovery takes less; and the time in which it also discovers the
+ * publisher. */
 static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 500000000;
 
 struct deadman {

@@ -72,14 +72,14 @@ enum { COMMAND_STALE = -1 };
 int command_send(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count);
 
-/* As `command_send` at the time `now`, for callers that hold the lock if there are feeds. */
+/* Like `command_send` at the time `now`, for callers that hold the lock if there are feeds. */
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now);
 
 /* A command of the deadman's route was sent at `now`. Takes the lock. */
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now);
 
-/* As `timer_end`, but done by the thread that serves the group: an armed or tripped deadman becomes due at once. */
+/* Like `timer_end`, but done by the thread that serves the group: an armed or tripped deadman becomes due at once. */
 void deadman_end_by_thread(struct timers *timers, struct deadman *deadman);
 void deadman_schedule_end(struct timers *timers, struct timer *timer); /* with the lock held */
 

@@ -10,8 +10,8 @@
 #include "deliver.h"
 #include "pace.h"
 
-/* Open the deferral of a target, a timer; `pacer` is NULL without a bandwidth. It delivers to the target that it adopts.
- * Returns NULL if memory runs out. */
+/* Open the deferral of a target. Its first member is a struct timer; `pacer` is NULL without a bandwidth. It delivers to
+ * the target that it adopts. Returns NULL if memory runs out. */
 struct deferral *deferral_open(struct pacer *pacer);
 void deferral_close(struct deferral *deferral);
 

@@ -175,7 +175,7 @@ static bool publish_it(struct stage *stage, const struct targets *to, const stru
     }
 }
 
-/* As `deliver_now`; part of `deliver`, where each instruction counts. */
+/* Like `deliver_now`; part of `deliver`, where each instruction counts. */
 static inline bool leave(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
                          size_t size, int64_t expires, int64_t now) {
     if (target->topic) return publish_it(stage, to, target, now);

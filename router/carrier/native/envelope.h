@@ -43,7 +43,7 @@ struct envelope {
     uint32_t size;          /* with restored trailing zeros, without padding */
     uint32_t start, length; /* of the payload, or from the tag of its first piece to the end of its last one */
     bool is_single;         /* the payload is in one piece */
-    bool is_repaired;       /* `size` differs from that of the datagram; counted as padded, also without a payload */
+    bool is_repaired;       /* `size` differs from that of the datagram; counted as padded, even without a payload */
 };
 
 /* Return the size of the envelope when it was encoded. The protocol allows a sender to omit zeros at the end, and boards may

@@ -8,8 +8,8 @@
  * with ours, the following holds for an event of the last FRESHNESS_MEMORY, within FRESHNESS_TOLERANCE:
  *
  * - The oldest reading is never younger than the event: a message that is stale by it remains stale however the clock is
- *   set. For a while after the clock was set back by `d`, it makes fresh messages appear older by `d`, unless that is
- *   excluded by `not_before`, or because the past was forgotten.
+ *   set. For a while after the clock was set back by `d`, it makes fresh messages appear older by `d`, unless
+ *   `not_before` excludes that, or the past was forgotten.
  * - The youngest reading is never older than the event: no jump makes a fresh message stale by it. It is younger only if
  *   the clock was set since, or since the last look before the event, by some `d` no greater than its age.
  *

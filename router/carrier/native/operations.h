@@ -251,7 +251,7 @@ enum read_kind {
                            place where each element begins, or NONE */
     READ_EACH_SEQUENCE, /* likewise, but the number of elements comes first */
     READ_AGAIN,
-    READ_TEXTS /* as READ_TEXT, but adds the text to the list in cells in `slot`, which is never NONE */
+    READ_TEXTS /* like READ_TEXT, but adds the text to the list in cells in `slot`, which is never NONE */
 };
 
 /* A step in reading a CDR message. */

@@ -3,9 +3,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const int64_t SECOND = 1000000000;      /* in ns, like: */
+static const int64_t SECOND = 1000000000;      /* ns, as are the next two: */
 static const int64_t BURST = 20000000;         /* the budget that a pause accumulates */
-static const int64_t OVERDRAFT = 100000000;    /* the overdraft of commands */
+static const int64_t OVERDRAFT = 100000000;    /* how far commands may overdraw the budget */
 enum { LEAST_OVERDRAFT = 2048 };               /* bytes, if that is more than OVERDRAFT */
 
 /* The header of a waiting datagram, which follows, padded to a multiple of 8 bytes. */
@@ -74,7 +74,8 @@ static const struct waiting_datagram *take(struct lane *lane) {
     return taken;
 }
 
-/* Room for all datagrams that may wait, one more, and so much that a free piece is long enough for another one. */
+/* Allocate room for all datagrams that may wait, for one more, and for gaps, so that one of the free pieces can hold
+ * another one. */
 static bool lane_open(struct lane *lane, int64_t bytes, int64_t datagrams) {
     lane->capacity = (size_t)bytes + (size_t)datagrams * (sizeof(struct waiting_datagram) + 8) + 4 * LONGEST_WAITING;
     lane->bytes = malloc(lane->capacity);

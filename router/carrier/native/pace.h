@@ -31,12 +31,12 @@ struct route_target {
 
 struct pacer;
 
-/* Open a pacer, a timer, for a bandwidth in bytes per second. Returns NULL if memory runs out. */
+/* Open a pacer for a bandwidth in bytes per second. Its first member is a struct timer. Returns NULL if memory runs out. */
 struct pacer *pacer_open(int64_t bandwidth);
 void pacer_close(struct pacer *pacer);
 
-/* Both with the lock of the group held. Send a datagram of up to LONGEST_SENT bytes now or later, or drop it; and send all
- * waiting datagrams of `of` at once, whatever the budget. */
+/* Call both with the lock of the group held. `pacer_queue` sends a datagram of up to LONGEST_SENT bytes now or later, or
+ * drops it; `pacer_release` sends all waiting datagrams of `of` at once, whatever the budget. */
 void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
                  int64_t expires, int64_t now);
 void pacer_release(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);

@@ -23,7 +23,7 @@ void run_soon(void);
 void run_in_turn(void);
 
 /* After a turn of 100 ms of which the calling thread used three quarters, remove its priority for one turn: in a flood, it
- * would leave other threads almost nothing of its processor core. `now` is of the boot clock. */
+ * would leave other threads almost nothing of its processor core. `now` is on the boot clock. */
 void share_processor(struct share *share, int64_t now);
 
 #endif

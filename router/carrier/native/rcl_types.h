@@ -29,7 +29,7 @@ struct serialized_message {
 enum { GID_SIZE = 16 };
 #define NO_NUMBER UINT64_MAX /* RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED */
 
-/* The beginning of rmw_message_info_t. Times of the wall clock, 0 if unknown to the middleware. */
+/* The beginning of rmw_message_info_t. Times are on the wall clock, 0 if unknown to the middleware. */
 struct message_info {
     int64_t source_timestamp, received_timestamp;
     uint64_t publication_sequence_number, reception_sequence_number;

@@ -16,12 +16,12 @@ struct ring {
     _Atomic uint64_t taken;   /* bytes taken or dropped */
     _Atomic uint32_t is_waited_for; /* futex: 1 while a reader sleeps */
     _Atomic bool is_woken, is_watched;
-    int wake; /* eventfd, for one that watches */
+    int wake; /* eventfd, for a reader that watches */
     size_t capacity;
     _Atomic uint64_t *words;
 };
 
-/* The size of a record with that many bytes. */
+/* The size in the ring of a record of `size` bytes. */
 static inline uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(size_t)7); }
 
 /* Open a ring for `capacity` bytes, a power of two. Returns NULL if memory or descriptors run out. */

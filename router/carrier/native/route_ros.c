@@ -15,8 +15,8 @@ static struct born earlier_of(struct born one, struct born other) {
     return one;
 }
 
-/* The time of sending by the sender's clock, or of arrival if that is earlier because the sender's clock is ahead. Messages
- * may arrive out of order, so the youngest reading of the arrival counts. */
+/* The time of sending on the sender's clock, or of arrival if that is earlier because the sender's clock is ahead. Messages
+ * may arrive out of order, so no reading of the arrival is excluded and the youngest one counts. */
 static struct born sent(struct ros_routing *routing, const struct taken *taken) {
     int64_t stamp = taken->published_at ? taken->published_at : taken->arrived_at;
     if (!stamp) stamp = taken->received_at;

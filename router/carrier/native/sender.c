@@ -104,7 +104,7 @@ bool sender_note_errors(int listener) {
     return read;
 }
 
-/* As `sender_note_errors`, for errors of the sender's own socket. */
+/* Like `sender_note_errors`, for errors of the sender's own socket. */
 static bool note_own_errors(struct sender *sender) {
     struct sockaddr_in address;
     int fd = atomic_load(&sender->fd), refused, read = 0;

@@ -39,9 +39,9 @@ int sender_send(struct sender *sender, const void *data, size_t size);
 int sender_send_only(struct sender *sender, const void *data, size_t size);
 int sender_take_refused(struct sender *sender);
 
-/* As `sender_send`, for deadmen. It sends even if commands have filled the send buffer. It also returns immediate errors of
- * this datagram: no process listens on a local port. `sender_send` would return these for a later datagram. Only one thread
- * at a time may call it. */
+/* Like `sender_send`, for deadmen. It sends even if commands have filled the send buffer. It also returns immediate errors
+ * of this datagram: no process listens on a local port. `sender_send` would return these for a later datagram. Only one
+ * thread at a time may call it. */
 int sender_send_checked(struct sender *sender, const void *data, size_t size);
 
 /* Read the ICMP errors of a listener, and assign them to the senders of the datagrams. Return whether there were any. Stops

@@ -63,7 +63,7 @@ struct timers *timers_open(counter *counters, struct ring *events);
 struct timers *timers_open_on(struct stage *stage, bool has_timer);
 void timers_close(struct timers *timers); /* when no thread uses it and it has no timer left */
 
-/* Serve the timers that are due, and determine when the next one is. `now` is of the boot clock. */
+/* Serve the timers that are due, and determine when the next one is. `now` is on the boot clock. */
 void timers_serve(struct timers *timers, int64_t now);
 
 /* ---- with the lock held ---- */

@@ -14,7 +14,7 @@
 #include "output.h"
 #include "wire.h"
 
-/* Write a varint, for which there is room of LONGEST_VARINT bytes. Returns its end. */
+/* Write a varint; there is room for LONGEST_VARINT bytes. Returns its end. */
 static inline uint8_t *store_varint(uint8_t *to, uint64_t value) {
     for (; value > 0x7F; value >>= 7) *to++ = (uint8_t)(value | 0x80);
     *to++ = (uint8_t)value;
@@ -26,7 +26,7 @@ static inline uint64_t to_zigzag(uint64_t bits) { return bits << 1 ^ (bits >> 63
 /* Write the tag of a field. Elements of packed fields have none. */
 static inline uint8_t *store_tag(uint8_t *to, uint32_t tag) { return tag ? store_varint(to, tag) : to; }
 
-/* A field without presence is omitted if it is zero or empty: `is_kept` is false. */
+/* A field that is zero or empty is omitted unless `is_kept`, which is false for fields without presence. */
 static inline bool write_varint(struct output *output, uint32_t tag, uint64_t value, bool is_kept) {
     if (!value && !is_kept) return true;
     if (!has_room(output, LONGEST_TAG + LONGEST_VARINT)) return false;
@@ -55,7 +55,7 @@ static inline bool write_bytes(struct output *output, uint32_t tag, const struct
 
 /* An inner message or packed elements being written. */
 struct opened {
-    size_t tag, content; /* their beginnings in the output */
+    size_t tag, content; /* offsets in the output */
     bool is_kept;        /* written even if it is empty */
 };
 

@@ -14,10 +14,10 @@ from router.clock import boottime_ns, wall_ns
 TICK_SECONDS = 0.02
 
 AWAY_NS = 50_000_000
-"""A gap between two ticks that counts as a pause of the loop."""
+"""A longer gap between two ticks counts as a pause of the loop."""
 
 CATCH_UP_NS = 100_000_000
-"""How long after a pause the messages read may have arrived during it."""
+"""For this long after a pause, messages that are read may have arrived during the pause."""
 
 
 class LoopClock:

@@ -71,7 +71,7 @@ class Binding:
 
 
 def listen_at(address: Address) -> socket.socket:
-    """Return a non-blocking TCP socket that listens at `address`. Raises OSError."""
+    """Return a non-blocking TCP socket that listens on `address`. Raises OSError."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         # Lets a restarted router bind while old connections end; a port with another listener is still refused.

@@ -30,7 +30,7 @@ MESSAGE_SECONDS = 10.0
 """Timeout for one message of a client, from its first byte to its last, and for the websocket handshake."""
 
 WATCH_SECONDS = 1.0
-"""Between two checks of that deadline."""
+"""The interval of checks of that timeout."""
 
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before the loop continues with other work."""
@@ -134,7 +134,7 @@ class StreamClient:
 
 
 class StreamTransport(ABC):
-    """Listens, and enforces `limits` and the deadline for a message. `address` is known once it is bound."""
+    """Listens, and enforces `limits` and the timeout for a message. `address` is known once it is bound."""
 
     def __init__(self, address: Address, events: Events, limits: Limits) -> None:
         self.address: Address | None = None

@@ -52,7 +52,7 @@ class TcpTransport(StreamTransport):
             self._server.close()
         for client in self._clients:
             client.close()
-        while self._clients:  # each leaves in a turn of the loop of its own
+        while self._clients:  # each leaves in its own turn of the loop
             await asyncio.sleep(0)
 
     async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -48,7 +48,7 @@ STRANGERS, STRANGERS_PER_HOST = 64, 8
 
 
 class WebsocketTransport(StreamTransport):
-    """Websocket. `text`: the frames of one `write` are joined to one text message; otherwise each is a binary message.
+    """Websocket. `text`: the frames of one `write` make up one text message; otherwise each is a binary message.
 
     A client whose message exceeds the limit is disconnected. `page` is HTML.
     """
@@ -131,7 +131,7 @@ class WebsocketTransport(StreamTransport):
         while True:
             for _ in range(PER_TURN):
                 data = await connection.recv(decode=False)
-                if client.unfinished_since is not None:  # by the next message
+                if client.unfinished_since is not None:  # the next message has begun
                     client.unfinished_since = monotonic()
                 self.events.received(client, data, self.clock.stamp())
             await asyncio.sleep(0)
@@ -219,7 +219,7 @@ def _is_from_elsewhere(headers: Headers) -> bool:
 
 
 def _serialized(opcode: Opcode, message: bytes) -> list[bytes]:
-    """Return a message as websocket frames; a large one as several, so that pings can pass between them."""
+    """Return a message as websocket frames; split a large one into several, so that pings can pass between them."""
     if len(message) <= PIECE:
         return [WebsocketFrame(opcode, message).serialize(mask=False)]
     whole = memoryview(message)

@@ -58,13 +58,13 @@ MOST_QUERIES = 100
 """The most pending queries; each answer may be large."""
 
 LARGE = 64 * 1024
-"""Bytes from which a put can take long."""
+"""Bytes above which a put can take long."""
 
 Declared = Union[zenoh.LivelinessToken, "zenoh.Subscriber[None]", "zenoh.Queryable[None]"]
 
 
 class ZenohTransport:
-    """Zenoh. The one client is the network, as soon as the session is open and the key is free.
+    """Zenoh. The whole network is one client, which joins once the session is open and the key is free.
 
     `most` limits the bytes of a received sample. If the table names locators, only they are used; otherwise others are
     found by multicast.
@@ -310,7 +310,7 @@ class Inbox:
         self._clock = LoopClock()
 
     def start(self, client: Client) -> None:
-        """Start to deliver samples, as sent by `client`."""
+        """Start to deliver samples, as if `client` sent them."""
         self._client = client
         self._clock.start()
         self._hand_on()
@@ -328,7 +328,7 @@ class Inbox:
         if size > self._most:
             self._loop.call_soon_threadsafe(self._events.refused, "too_large")
         elif len(self._waiting) >= MOST_RECEIVED or waiting_bytes + size > MOST_RECEIVED_BYTES:
-            self._lost += 1  # reported with those that wait
+            self._lost += 1  # reported by `_hand_on`
         else:
             self._received_bytes += size
             self._waiting.append((sample.payload.to_bytes(), self._clock.stamp()))
@@ -375,7 +375,7 @@ class Queries:
 
 
 class ZenohClient:
-    """The whole network as a client. Its backlog has small frames; the newest large one of each key waits apart."""
+    """The network as a client. Its backlog has small frames; the newest large one of each key waits separately."""
 
     def __init__(self, key: str, putter: Putter, events: Events) -> None:
         self.label = f"zenoh {key}"
@@ -427,8 +427,8 @@ class ZenohClient:
 class Putter:
     """Puts frames under KEY/data/TOPIC and KEY/schema/TYPE, in threads: a put may wait for a slow network.
 
-    Large values have a thread of their own with less priority, only the newest of each key, so that small ones
-    need not wait. A key that once had a large value counts as large from then on.
+    Large values have their own thread and a lower priority, and only the newest of each key waits there, so that small
+    ones are not delayed. A key that once had a large value counts as large from then on.
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
