@@ -140,17 +140,19 @@ def _configure(structlog: Any, level: str, *, coloured: bool) -> None:
 class _NonBlockingStream:
     """A stream that drops lines if its reader is gone or slow, or its disk is full; it never blocks or raises.
 
-    The events of dropped lines are also counted. `flush` writes whole lines and bypasses the stream's buffer, which
-    would keep a line that cannot be written, and make Python exit with code 120.
+    The events of dropped lines are also counted. `flush` bypasses the stream's buffer, which would keep a line that
+    cannot be written, and make Python exit with code 120. It writes the rest of an incomplete line before the next one.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._line = ""
+        self._rest = b""
         self._room = select.poll()
         self._is_file = _is_file(stream)
         if self._is_file:
-            self._room.register(stream, select.POLLOUT)
+            self._descriptor = _non_blocking(stream)
+            self._room.register(self._descriptor, select.POLLOUT)
 
     def write(self, text: str) -> None:
         self._line += text
@@ -161,8 +163,25 @@ class _NonBlockingStream:
             self._stream.write(line)
             return
         with suppress(OSError):
-            if self._room.poll(0):
-                os.write(self._stream.fileno(), line.encode(self._stream.encoding, "backslashreplace"))
+            self._write_rest()
+            if not self._rest:
+                self._rest = line.encode(self._stream.encoding, "backslashreplace")
+                self._write_rest()
+
+    def _write_rest(self) -> None:
+        while self._rest and self._room.poll(0):  # then a pipe has room for PIPE_BUF bytes, but perhaps not for more
+            self._rest = self._rest[os.write(self._descriptor, self._rest[: select.PIPE_BUF]) :]
+
+
+def _non_blocking(stream: TextIO) -> int:
+    """The stream's descriptor, or for a terminal a new one, as writing to a stopped terminal blocks despite `poll`.
+
+    The descriptor itself is not changed: other processes use the same open file.
+    """
+    if stream.isatty():
+        with suppress(OSError):  # it belongs to another user
+            return os.open(f"/proc/self/fd/{stream.fileno()}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    return stream.fileno()
 
 
 def _is_file(stream: TextIO) -> bool:
