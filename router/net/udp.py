@@ -101,16 +101,11 @@ class Listener:
             self._check_receive_buffer()
 
     def kernel_drops(self) -> int:
-<<<<<<< HEAD
-        """Datagrams that the kernel dropped before they were received, since the socket was opened. Thread-safe."""
+        """Return the number of datagrams that the kernel has dropped since the socket was opened. Thread-safe."""
         try:
             return drops(self.socket)
         except OSError:  # it is closed
             return self._drops_at_close
-=======
-        """Return datagrams that the kernel dropped before they were received, since the socket was opened."""
-        return self._drops_at_close if self.socket.fileno() < 0 else drops(self.socket)
->>>>>>> e-py2
 
     def end_input(self) -> None:
         """See `ListeningSocket.end_input`."""

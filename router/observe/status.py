@@ -143,17 +143,11 @@ def _steps(metric: str, path: str) -> tuple[str | int, ...]:
 _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
-<<<<<<< HEAD
 def _map_json(program: Program) -> Json:
-    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen at. `deadmen`: links of
-    what deadmen send."""
-    table = program.table
-=======
-def _map_json(table: RouteTable) -> Json:
-    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: the
-    payload case that each route's deadman sends, and its endpoints.
+    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: links of
+    what deadmen send.
     """
->>>>>>> e-py2
+    table = program.table
     nodes, edges = nodes_and_edges(table)
     deadmen = [*deadman_edges(program)]
     halted = [endpoint_node(table.endpoints[each.label], "to", 2) for each in deadmen if each.label in table.endpoints]

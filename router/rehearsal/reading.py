@@ -57,11 +57,10 @@ class TestFile:
 
 
 def find_test_files(paths: Sequence[Path]) -> list[Path]:
-<<<<<<< HEAD
-    """The files that the paths stand for, each once: a folder stands for the test files in it. Raises UsageError."""
-=======
-    """Return the files that the paths stand for, each once: a folder stands for the test files in it."""
->>>>>>> e-py2
+    """Return the files that the paths stand for, each once: a folder stands for the test files in it.
+
+    Raises UsageError.
+    """
     files: dict[Path, None] = {}
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
