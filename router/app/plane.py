@@ -158,16 +158,13 @@ class Plane:
     def build(self, program: Program, opened: Opened) -> Built:
         """Make the arrays of a program. Raises StartError."""
         counters, state = program.counters, opened.state
-        deadmen = {plan.route: self._deadmen.kept(plan, counters, opened.senders, state) for plan in program.deadmen}
-        outlets = Outlets(
-            library=self.library,
-            state=state,
-            names=self._names,
+        outlets = Outlets.of(
+            program,
+            self._deadmen,
+            state,
             listeners=opened.listeners,
             senders=opened.senders,
             publications=opened.publications,
-            deadmen=deadmen,
-            bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=NativeBoards(program.boards),
         )
         generation = next(self._generations)
@@ -184,7 +181,7 @@ class Plane:
             for topic, publication in opened.publications.items():
                 self._head_start.bind_topic(topic, publication.address)
         self._start_threads(program, from_ros, clients)
-        return Built(program, state, native, from_ros, adopted, deadmen, clients)
+        return Built(program, state, native, from_ros, adopted, outlets.deadmen, clients)
 
     def _start_threads(self, program: Program, from_ros: NativeFromRos, clients: Mapping[str, ClientDeadman]) -> None:
         """Start the threads that the program needs. Raises StartError.

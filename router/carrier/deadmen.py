@@ -56,8 +56,8 @@ class DeadmanGroup:
     """Deadmen of routes, served by one thread. `address` is that of their `struct timers`."""
 
     def __init__(self, library: ctypes.CDLL, address: int, names: Names) -> None:
-        self._library = library
-        self._names = names
+        self.library = library
+        self.names = names
         self.address = address
 
     def kept(
@@ -69,11 +69,11 @@ class DeadmanGroup:
         return state.open(
             ("deadman", plan.route),
             (plan, *used),
-            lambda address: NativeDeadman(self._library, self.address, address, endpoints, used),
+            lambda address: NativeDeadman(self.library, self.address, address, endpoints, used),
             "deadman_open",
             self.address,
-            *settings(plan, counters, self._names),
-            *destinations_of(plan, counters, self._names, used),
+            *settings(plan, counters, self.names),
+            *destinations_of(plan, counters, self.names, used),
         )
 
 
@@ -89,7 +89,7 @@ class Deadmen(NativeThread, DeadmanGroup):
 
     def end(self) -> None:
         """Send what is held back, then have deadmen send a last time. Nothing is held back afterwards."""
-        self._library.timers_end(self.address)
+        self.library.timers_end(self.address)
 
 
 def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:

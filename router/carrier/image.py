@@ -44,16 +44,13 @@ def image_of(library: ctypes.CDLL, program: Program) -> tuple[Parts, bytes]:
     state = _Recorder(library, symbols)
     group = DeadmanGroup(library, symbols.address("deadmen"), state.names)
     senders = {each.name: symbols.of("sender", each.name) for each in program.senders}
-    deadmen = {plan.route: group.kept(plan, program.counters, senders, state) for plan in program.deadmen}
-    outlets = Outlets(
-        library=library,
-        state=state,
-        names=state.names,
+    outlets = Outlets.of(
+        program,
+        group,
+        state,
         listeners={each.name: _LISTENER for each in program.listeners},  # type: ignore[misc]
         senders=senders,
         publications={each.label: _Publication(symbols, each.label) for each in program.publishers},
-        deadmen=deadmen,
-        bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
         boards=NativeBoards(program.boards),
     )
     native = native_program(program, KEPT_GENERATION, outlets)

@@ -9,11 +9,12 @@ from typing import Any, Protocol
 
 from router import declared as c
 from router.carrier.boards import NativeBoards
+from router.carrier.deadmen import DeadmanGroup, NativeDeadman
 from router.carrier.deferrals import Adoption
 from router.carrier.limits import period
 from router.carrier.names import Names
 from router.carrier.state import Native, State
-from router.compiler.program import RoutePlan, TargetPlan
+from router.compiler.program import Program, RoutePlan, TargetPlan
 from router.net.udp import Listener
 
 
@@ -47,9 +48,34 @@ class Outlets:
     listeners: Mapping[str, Listener]
     senders: Mapping[str, Addressed]
     publications: Mapping[str, Publication]
-    deadmen: Mapping[str, Addressed]
+    deadmen: Mapping[str, NativeDeadman]
     bandwidths: Mapping[str, int]
     boards: NativeBoards | None = None
+
+    @classmethod
+    def of(
+        cls,
+        program: Program,
+        group: DeadmanGroup,
+        state: State,
+        *,
+        listeners: Mapping[str, Listener],
+        senders: Mapping[str, Addressed],
+        publications: Mapping[str, Publication],
+        boards: NativeBoards | None,
+    ) -> Outlets:
+        """Return the outlets of a program, with its deadmen in `group`. Raises MemoryError."""
+        return cls(
+            library=group.library,
+            state=state,
+            names=group.names,
+            listeners=listeners,
+            senders=senders,
+            publications=publications,
+            deadmen={plan.route: group.kept(plan, program.counters, senders, state) for plan in program.deadmen},
+            bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
+            boards=boards,
+        )
 
     def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
         """Return the deadmen that commands of the route feed (its own) or disarm."""

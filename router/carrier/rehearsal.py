@@ -183,19 +183,16 @@ class Stage:
     def _bound(self, program: Program, state: State, fixed: _Fixed) -> _Bound:
         """Open mutable objects, unless `state` has them."""
         group = DeadmanGroup(self._library, self._opened.timers, self._names)
-        deadmen = {plan.route: group.kept(plan, program.counters, fixed.senders, state) for plan in program.deadmen}
-        outlets = Outlets(
-            library=self._library,
-            state=state,
-            names=self._names,
+        outlets = Outlets.of(
+            program,
+            group,
+            state,
             listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
             senders=fixed.senders,
             publications=fixed.publications,
-            deadmen=deadmen,
-            bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=fixed.boards,
         )
-        return _Bound(outlets, deadmen, outlets.pacers())
+        return _Bound(outlets, outlets.pacers())
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
         return state.keep(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
@@ -272,10 +269,9 @@ class _Fixed(NamedTuple):
 
 
 class _Bound(NamedTuple):
-    """The open objects of a program that messages change; `deadmen` are by route."""
+    """The open objects of a program that messages change."""
 
     outlets: Outlets
-    deadmen: Mapping[str, NativeDeadman]
     pacers: Sequence[Adoption]
 
 
@@ -295,7 +291,7 @@ class _Running:
 
     @property
     def deadmen(self) -> Mapping[str, NativeDeadman]:
-        return self._bound.deadmen if self._bound else {}
+        return self._bound.outlets.deadmen if self._bound else {}
 
     @property
     def adopted(self) -> Sequence[Adoption]:

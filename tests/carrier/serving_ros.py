@@ -15,7 +15,7 @@ from typing import Any
 
 from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deadmen import Deadmen
 from router.carrier.deferrals import timer_change
 from router.carrier.from_ros import FromRosThread
 from router.carrier.names import Names
@@ -138,20 +138,11 @@ class ServingRos:
             stack.callback(board.close)
         self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self.names)
         state = State(library)
-        self.by_route: dict[str, NativeDeadman] = {
-            plan.route: self.deadmen.kept(plan, program.counters, self.boards, state) for plan in program.deadmen
-        }
-        outlets = Outlets(
-            library=library,
-            state=state,
-            names=self.names,
-            listeners={},
-            senders=self.boards,
-            publications={},
-            deadmen=self.by_route,
-            bandwidths={plan.name: plan.bandwidth for plan in program.senders if plan.bandwidth is not None},
-            boards=NativeBoards(program.boards),
+        boards = NativeBoards(program.boards)
+        outlets = Outlets.of(
+            program, self.deadmen, state, listeners={}, senders=self.boards, publications={}, boards=boards
         )
+        self.by_route = outlets.deadmen
         self.messages = native_from_ros(program, 1, outlets)
         self.messages.arrays.keep(outlets)
         timers = timer_change([*outlets.pacers(), *self.messages.states.adopted])
