@@ -229,7 +229,7 @@ class DecodeError(RouterError):
 
 
 class MappingError(RouterError):
-    """A mapping has no representable result for this one value."""
+    """The result of a mapping for one message does not exist, or does not fit the target."""
 
 
 class NonFiniteError(MappingError):

@@ -31,7 +31,7 @@ class Keeper:
         self._has_failed = False
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
-        """Start to save the running program, compiled from the inputs `read`; `program` gets it with fresh counters."""
+        """Start to save the running program, compiled from `read`. `program` returns it with counters of its own."""
         if read.plain() != self._kept:
             self._thread.submit(self._keep, program, read.plain())
         else:

@@ -194,7 +194,7 @@ RELOAD_RESULTS: Mapping[str, str] = {
     "invalid": "the table has errors, or changes something that needs a restart",
     "failed": "something that it names cannot be opened",
 }
-"""Results of a reload, with their meaning. Unless it is ok, the old table keeps running."""
+"""Results of a reload, with their meaning. Unless the result is ok, the old table keeps running."""
 
 STARTS: Mapping[str, str] = {
     "kept": "it forwarded with a kept program while the table was compiled",
@@ -265,9 +265,7 @@ class Counters:
     _current: set[tuple[str, ...]] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
-    _commanded: dict[tuple[str, str], bool] = field(
-        default_factory=dict
-    )  # by route and target, also of earlier programs
+    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, earlier ones included
 
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
