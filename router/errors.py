@@ -241,7 +241,7 @@ class TransportError(OperatorError):
 
 
 def shown_path(path: Path) -> str:
-    """Return a path as findings show it: relative to the working directory if it is inside it."""
+    """Return a path as findings show it: relative to the working directory if the path is inside it."""
     absolute = path.absolute()
     try:
         return str(absolute.relative_to(Path.cwd()))

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Keeper:
     """Saves compiled programs, in a thread of its own.
 
-    `asked` are the inputs that selected the table, `read` those of the first program, and `kept` those of the program
-    that is already on disk, if any.
+    `asked` are the inputs that selected the table, `read` the inputs of the first program, and `kept` the inputs of the
+    program on disk, or None.
     """
 
     def __init__(self, library: ctypes.CDLL, asked: Inputs, read: Inputs, kept: Plain | None) -> None:

@@ -349,7 +349,7 @@ class Plane:
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
-    """Return the addresses of rcl's functions that publish, and that return and reset its error. Raises StartError."""
+    """Return the addresses of rcl's functions to publish, to get its error, and to reset that. Raises StartError."""
     from router.ros.rcl import publish_functions  # rclpy is loaded: the topics are open
 
     functions = None if library.rcl_types_differ() else publish_functions()

@@ -129,7 +129,7 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that select a running router: that of a table, or the one at a URL."""
+    """Add the options that select a running router, by its table or by its URL."""
     add_table(parser)
     add_url_option(parser)
 

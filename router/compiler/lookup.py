@@ -65,7 +65,7 @@ NO_NAMES: Mapping[str, Node] = {}
 
 @dataclass
 class Lookup:
-    """The names that one table can use, and the findings about those that do not exist.
+    """Looks up the names of one table and collects findings.
 
     `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint.
     """

@@ -265,7 +265,7 @@ class Counters:
     _current: set[tuple[str, ...]] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
-    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, earlier ones included
+    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
 
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
@@ -315,7 +315,7 @@ class Counters:
             yield Series(metric, tuple(labels)), index
 
     def new_runs(self, earlier: Counters) -> Iterator[slice]:
-        """Yield the indexes of each series that `earlier`, which these counters continue, does not have."""
+        """Yield the indexes of each series that `earlier` lacks. These counters must continue `earlier`."""
         for series in self._indexes.keys() - earlier._indexes.keys():
             yield self._run(series)
 

@@ -76,7 +76,7 @@ class HeadStart:
         self._close_sockets()
 
     def is_of(self, parts: object, image: bytes) -> bool:
-        """Return whether it runs the program with these parts and this image. Call it only once."""
+        """Return whether the kept program has these parts and this image. Call it only once."""
         kept, self._kept = self._kept, None
         return kept == (parts, image)
 

@@ -1,7 +1,7 @@
 """Lists: loops over them, computation element by element, and functions of a whole list.
 
-A list on the stack is stored as contiguous scalars, as in the message, or in cells. A loop copies its lists to its own
-slots, and removes the elements from the copies one by one.
+A list on the stack is stored as contiguous scalars, as in the message, or in cells. A loop copies its lists to slots
+of its own, and removes the elements from the copies one by one.
 """
 
 from __future__ import annotations
