@@ -70,7 +70,7 @@ class Slip(NamedTuple):
 
 
 def slip(text: str, names: Collection[str]) -> Slip | None:
-    """Find a unit, or an operator without an operand, in invalid text. None if there is none; `names` are no units."""
+    """Find a unit that is not in `names`, or an operator without an operand, in invalid text. Return None without."""
     bare = _QUOTED.sub(lambda quoted: "_" * len(quoted[0]), text)
     for found in _UNIT.finditer(bare):
         unit = found["unit"]
