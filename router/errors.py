@@ -229,7 +229,7 @@ class DecodeError(RouterError):
 
 
 class MappingError(RouterError):
-    """A mapping has no representable result for this one value."""
+    """The result of a mapping for one message does not exist, or does not fit the target."""
 
 
 class NonFiniteError(MappingError):
@@ -241,7 +241,7 @@ class TransportError(OperatorError):
 
 
 def shown_path(path: Path) -> str:
-    """Return a path as findings show it: relative to the working directory if it is inside it."""
+    """Return a path as findings show it: relative to the working directory if the path is inside it."""
     absolute = path.absolute()
     try:
         return str(absolute.relative_to(Path.cwd()))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class _Postponed(ModuleType):
-    """A stand-in for a module, which imports it when one of its attributes is first read."""
+    """A stand-in for a module that is imported when one of its attributes is first read."""
 
     def __getattr__(self, attribute: str) -> Any:
         if sys.modules.get(self.__name__) is self:
@@ -26,7 +26,7 @@ class _Postponed(ModuleType):
 
 @contextmanager
 def postponed(*names: str) -> Iterator[None]:
-    """Delay the import of these top-level modules, by modules imported inside, until their first use.
+    """Delay the import of these top-level modules, by modules imported in this context, until their first use.
 
     Modules that are already imported are not affected.
     """
@@ -42,7 +42,7 @@ def postponed(*names: str) -> Iterator[None]:
 
 @contextmanager
 def left_out(*names: str) -> Iterator[None]:
-    """Make imports of these modules fail inside, for libraries that work without them.
+    """Make imports of these modules fail in this context, for libraries that work without them.
 
     Modules that are already imported are not affected.
     """

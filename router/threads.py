@@ -211,7 +211,7 @@ class StopStack(ExitStack):
 
 
 STEP_S, STEPS_S, LEAST_S = 3.0, 6.0, 0.2
-"""Timeouts in seconds: of a step, of all steps, of a step once those are over; systemd kills the router after 10 s."""
+"""Timeouts in seconds of a step, of all steps, and of a step after that. systemd kills the router after 10 s."""
 
 
 class _Steps:

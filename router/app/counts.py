@@ -35,7 +35,7 @@ class ThreadCounts:
         self._copies.append(copy or (lambda size: counts[:size]))
 
     def copies(self, size: int) -> list[list[int]]:
-        """Return the first `size` counts of each list; those of a thread are a snapshot, if it supports that."""
+        """Return the first `size` counts of each list, as a snapshot if the thread provides one."""
         return [copy(size) for copy in self._copies]
 
     def total(self, metric: str) -> int:

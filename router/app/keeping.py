@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Keeper:
     """Saves compiled programs, in a thread of its own.
 
-    `asked` are the inputs that selected the table, `read` those of the first program, and `kept` those of the program
-    that is already on disk, if any.
+    `asked` are the inputs that selected the table, `read` the inputs of the first program, and `kept` the inputs of the
+    program on disk, or None.
     """
 
     def __init__(self, library: ctypes.CDLL, asked: Inputs, read: Inputs, kept: Plain | None) -> None:
@@ -31,7 +31,7 @@ class Keeper:
         self._has_failed = False
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
-        """Start to save the running program, compiled from the inputs `read`; `program` gets it with fresh counters."""
+        """Start to save the running program, compiled from `read`. `program` returns it with counters of its own."""
         if read.plain() != self._kept:
             self._thread.submit(self._keep, program, read.plain())
         else:

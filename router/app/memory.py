@@ -1,4 +1,4 @@
-"""Drops code that a running router does not use from its memory."""
+"""Drops unused code from the memory of a running router."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ class Plane:
     def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
         """Have deadmen send at the start of the router, unless they did so in a head start.
 
-        This needs only sockets, so it does not wait for ROS, which takes seconds to open.
+        This needs only sockets, so it does not wait for ROS, which takes longer to open.
         """
         for plan in program.deadmen:
             deadman = self._deadmen.kept(plan, program.counters, senders, state)
@@ -346,7 +346,7 @@ class Plane:
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
-    """Addresses of rcl's functions that publish, and that return and reset its error. Raises StartError."""
+    """Return the addresses of rcl's functions to publish, to get its error, and to reset that. Raises StartError."""
     from router.ros.rcl import publish_functions  # rclpy is loaded: the topics are open
 
     functions = None if library.rcl_types_differ() else publish_functions()

@@ -25,7 +25,7 @@ from router.table.model import NodeSettings, RouteTable
 from router.threads import StuckError, background_threads
 
 _MOST_NAMED = 12
-"""Most changes that the summary of a reload lists."""
+"""Maximum number of changes that the summary of a reload lists."""
 
 
 class Reloader:
@@ -86,7 +86,7 @@ class Reloader:
                 return
             try:
                 self._runtime.take_over(self._runtime.prepare(program))
-            except (StartError, StuckError, OSError) as error:  # the watcher calls again
+            except (StartError, StuckError, OSError) as error:  # the watcher tries again
                 logger.warning("a listener cannot be reopened", why=str(error))
             else:
                 names = [each.name for each in replaceable]

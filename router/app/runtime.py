@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from router.ros.router_node import RouterNode
 
 _STALLED_S = 0.01
-"""Publish calls that have taken less, in seconds, are reported as 0."""
+"""Threshold in seconds: publish calls that have taken less are reported as 0."""
 
 
 @dataclass(frozen=True, slots=True)

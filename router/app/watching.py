@@ -113,7 +113,7 @@ def watched_files(table: RouteTable) -> list[Path]:
 
 
 def wait_until_unchanged(files: Iterable[Path], until: int) -> bool:
-    """Wait until no file was written within the last PERIOD. Return whether there was such a file.
+    """Wait until no file was written within the last PERIOD. Return whether the wait was necessary.
 
     `until` is in ns of the monotonic clock; raises StartError if files are still written then.
     """
@@ -134,7 +134,7 @@ def wait_until_unchanged(files: Iterable[Path], until: int) -> bool:
 
 
 def _snapshot(files: Iterable[Path]) -> _Snapshot:
-    """Time, size and inode of the files that exist."""
+    """Return time, size and inode of the files that exist."""
     found = {}
     for path in files:
         try:

@@ -55,7 +55,7 @@ def sources() -> list[Path]:
 
 
 def rcl_headers() -> list[str]:
-    """Compiler options for the headers of rcl, from the wheels in this environment or from ROS packages of apt.
+    """Return compiler options for the headers of rcl, from the wheels in this environment or from ROS packages of apt.
 
     Empty without rcl.
     """

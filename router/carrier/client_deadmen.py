@@ -85,7 +85,7 @@ class ClientDeadmen(NativeThread):
         )
 
     def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
-        """Replace the deadmen of one program with those of the next, of that generation; both are by name.
+        """Replace the deadmen of one program with those of the next, which has this generation. Both are by name.
 
         A deadman with changed settings inherits the state of the earlier one.
         """

@@ -41,7 +41,7 @@ class NativeDeadman:
         return [endpoint for bit, endpoint in enumerate(self._endpoints) if reached >> bit & 1]
 
     def succeeds(self, earlier: NativeDeadman) -> None:
-        """Keep `earlier` alive: once the carrier has replaced it, feeding it feeds this one."""
+        """Live as long as `earlier`: once the carrier has replaced that, feeding it feeds this deadman."""
         earlier._successor = self
 
     def end(self) -> None:
@@ -93,7 +93,10 @@ class Deadmen(NativeThread, DeadmanGroup):
 
 
 def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
-    """Return pairs of a deadman and the one of an earlier program that it replaces, matched by route."""
+    """Return pairs of a deadman and the earlier one that it replaces, matched by route.
+
+    The deadman now lives as long as the earlier one.
+    """
     pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
     for each, earlier in pairs:
         each.succeeds(earlier)

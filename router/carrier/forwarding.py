@@ -40,7 +40,7 @@ class Forwarding:
         self.carrier = Carrier(library, self.deadmen.address, *counts_and_events(library, counters), self.published)
 
     def mirror(self, lost: int | None) -> None:
-        """Mirror received datagrams from now on; `lost` counts those that the full ring drops. None: stop."""
+        """Mirror received datagrams from now on; `lost` counts those that the full ring drops. None stops that."""
         self.carrier.mirror(None if lost is None else self.mirrored, lost or 0)
 
 

@@ -31,8 +31,8 @@ class Freshness:
     def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
         """Return the possible times of an event with the wall-clock stamp `stamp`, never after `now`.
 
-        `now` and `received_at` are boot and wall clock in ns, read now in this order. The event did not happen before
-        `not_before` (boot clock), if that is known; else None.
+        `now` (boot clock) and `received_at` (wall clock) are the present time in ns, read in this order. The event did
+        not happen before `not_before` (boot clock); None if that is not known.
         """
         found = self._born(self._at, stamp, received_at, now, _UNKNOWN if not_before is None else not_before)
         return Born(found.oldest, found.youngest)

@@ -72,7 +72,7 @@ def _native_read(read: WantedField | ReadOperation) -> c.WantedField | c.ReadOpe
 
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) -> Any:
-    """Return the contents of slots; None is an empty list."""
+    """Make the contents of slots; None stands for an empty list."""
     made = arrays.add((c.Value * len(values))())
     for to, value in zip(made, values, strict=True):
         if isinstance(value, bytes):

@@ -102,7 +102,7 @@ class Outlets:
         return lambda address: Native(getattr(self.library, f"{kind}_close"), address, keep)
 
     def deferral(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
-        """Return the deferral that holds back one source's messages for a target, and for one sender or publisher."""
+        """Return the deferral that holds back messages of a source for a target, as long as the outlet is the same."""
         pacer = self._pacer(target.label) if not target.is_topic and target.label in self.bandwidths else None
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
         place = "deferral", plan.route, plan.topic, source, target.label

@@ -146,7 +146,7 @@ def with_help(what: str, hint: str = "") -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb. Return the exit code: the verb's own, or for an error one of those above."""
+    """Run one verb. Return the exit code: the verb's own, or for an error one of the constants above."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -250,7 +250,7 @@ def _mistake(arguments: Sequence[str]) -> str:
 
 
 def _add_verbs(subparsers: Subparsers, chosen: str | None) -> ModuleType | None:
-    """Add every verb, the chosen one with its arguments. Return its module."""
+    """Add every verb, the chosen one with its arguments. Return the module of the chosen one."""
     module = None
     for verb, summary in VERBS.items():
         if verb == chosen:

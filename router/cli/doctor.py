@@ -24,7 +24,7 @@ Exit code: {OK} no problems, {SICK} problems, {BAD_TABLE} the table cannot be re
 code."""
 
 _STYLES = {"ok": GREEN, "warning": YELLOW, "problem": RED}
-"""By value of a grade."""
+"""Styles by the value of a grade."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

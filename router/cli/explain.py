@@ -100,7 +100,7 @@ def _explain(args: argparse.Namespace) -> int:
 
 
 def _kept(table: Path) -> Iterator[str]:
-    """Lines about the kept programs that were compiled from this table, or from a table that extends it."""
+    """Yield lines about the kept programs that were compiled from this table, or from a table that extends it."""
     from router.kept import store
 
     try:

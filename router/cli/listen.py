@@ -196,7 +196,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
 
 
 def _printer(as_json: bool) -> Callable[[Heard], None]:
-    """Return a function that prints a line; on a terminal in colour, and cut to the width."""
+    """Return a function that prints one line: on a terminal, in colour and cut to its width."""
     from router.tools.gateway_messages import json_line, pieces
 
     if as_json:

@@ -51,7 +51,7 @@ def table_path(args: argparse.Namespace) -> Path:
 
 
 def named_table(args: argparse.Namespace) -> Path | None:
-    """Return the table that the command line, which may name only one, or the environment names. Raises UsageError."""
+    """Return the table named on the command line or in the environment. Raises UsageError if two are on the former."""
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and inputs.real_path(subject) != inputs.real_path(option):
@@ -109,7 +109,7 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
 def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
     """Return the messages, and the table if one is used. A `place` that is a name requires a table.
 
-    Raises TableError and UsageError.
+    Raises TableError or UsageError.
     """
     from router.datagrams import wire_of_protos, wire_of_table
     from router.table import read_table
@@ -129,7 +129,7 @@ def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTab
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that select a running router: that of a table, or the one at a URL."""
+    """Add the options that select a running router, by its table or by its URL."""
     add_table(parser)
     add_url_option(parser)
 

@@ -83,7 +83,7 @@ def _look(url: str, interval: float) -> View:
 
 
 _PLAIN_WIDTH = 160
-"""Columns without a terminal."""
+"""Width in columns without a terminal."""
 
 
 def _show(url: str, order: Order, interval: float) -> None:

@@ -1,4 +1,4 @@
-"""Compilation of a route table: from a RouteTable and the types to findings or a Program."""
+"""Compiles a route table: from a RouteTable and the types to findings or a Program."""
 
 from __future__ import annotations
 

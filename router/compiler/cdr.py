@@ -39,7 +39,7 @@ def scalar_format(declared: Type) -> str:
 
 
 def put_text(data: bytearray, text: str) -> None:
-    """Append a string: its length with the final NUL, its bytes, the NUL."""
+    """Append a string: its length including the final NUL, its bytes, and the NUL."""
     encoded = text.encode()
     if b"\0" in encoded:
         raise MappingError("a ROS string cannot hold a NUL")

@@ -39,7 +39,7 @@ class CheckedTarget:
 
     @property
     def priority(self) -> Priority:
-        """The priority of the route; by default commands come first."""
+        """The priority that the route declares; otherwise commands come first."""
         return self.declared_priority or (Priority.COMMAND if self.is_command else Priority.TELEMETRY)
 
     @property

@@ -196,7 +196,7 @@ def _of_size(value: str | bytes, most: int) -> str | bytes:
 
 
 def _of_enum(value: str | int, kind: Kind) -> int:
-    """Return the number of an enum's value, given by name or number."""
+    """Return the number of an enum's value, given by name or number. Raises MappingError if it does not exist."""
     assert isinstance(kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     for name, number in kind.enum.values:
         if value in (name, number):

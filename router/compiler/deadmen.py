@@ -260,7 +260,7 @@ def deadman_plan(
 def constant_plan(
     lookup: Lookup, fields: FieldMap, target: MessageType, span: SourceSpan, ros_type: MessageType | None = None
 ) -> Record | None:
-    """Return the plan of a message of constants, None if there are findings. It may be empty.
+    """Return the plan of a message of constants, None if there are findings. The plan may be empty.
 
     Expressions can name the constants of `ros_type`.
     """

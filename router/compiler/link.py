@@ -75,7 +75,7 @@ def _published_by_clients(gateways: Iterable[GatewayPlan]) -> Iterator[TopicPlan
 
 
 def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:
-    """Return one plan per topic, however many routes name it: they agree on its type and QoS."""
+    """Return one plan per topic. Routes that name the same topic agree on its type and QoS."""
     plans: dict[str, TopicPlan] = {}
     for plan in (*(_topic(topic, declared, topic.topic.value) for topic, declared in used), *more):
         plans.setdefault(plan.label, plan)

@@ -65,7 +65,7 @@ NO_NAMES: Mapping[str, Node] = {}
 
 @dataclass
 class Lookup:
-    """The names that one table can use, and the findings about those that do not exist.
+    """Looks up the names of one table and collects findings.
 
     `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint.
     """
@@ -99,7 +99,10 @@ class Lookup:
         return found
 
     def endpoint(self, name: Located[str], also: Iterable[str] = ()) -> Endpoint | None:
-        """Return the endpoint, or None with a finding, unless its declaration has one. `also` are other valid names."""
+        """Return the endpoint. If there is none, return None and report that, unless its declaration has a finding.
+
+        `also` are other valid names.
+        """
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]

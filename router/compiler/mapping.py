@@ -185,7 +185,7 @@ class _Builder:
         return holders
 
     def _unknown(self, entry: FieldEntry, depth: int, holder: MessageType) -> None:
-        """Report that `holder` has no field of the name at `depth`, once for a key with several others below it."""
+        """Report that `holder` has no field with the name at `depth`. A key above several keys is reported once."""
         name, span = entry.path[depth], entry.path_spans[depth]
         if (entry.path[: depth + 1], span) in self._reported:
             return

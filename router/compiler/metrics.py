@@ -194,7 +194,7 @@ RELOAD_RESULTS: Mapping[str, str] = {
     "invalid": "the table has errors, or changes something that needs a restart",
     "failed": "something that it names cannot be opened",
 }
-"""Results of a reload, with their meaning. Unless it is ok, the old table keeps running."""
+"""Results of a reload, with their meaning. Unless the result is ok, the old table keeps running."""
 
 STARTS: Mapping[str, str] = {
     "kept": "it forwarded with a kept program while the table was compiled",
@@ -265,9 +265,7 @@ class Counters:
     _current: set[tuple[str, ...]] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
-    _commanded: dict[tuple[str, str], bool] = field(
-        default_factory=dict
-    )  # by route and target, also of earlier programs
+    _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
 
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
@@ -317,7 +315,7 @@ class Counters:
             yield Series(metric, tuple(labels)), index
 
     def new_runs(self, earlier: Counters) -> Iterator[slice]:
-        """Yield the indexes of each series that `earlier`, which these counters continue, does not have."""
+        """Yield the indexes of each series that `earlier` lacks. These counters must continue `earlier`."""
         for series in self._indexes.keys() - earlier._indexes.keys():
             yield self._run(series)
 

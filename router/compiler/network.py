@@ -90,7 +90,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
 
 
 def _overlap(one: _Held, other: _Held) -> bool:
-    """Return whether two addresses overlap, so that the kernel cannot bind both. Different interfaces never do."""
+    """Return whether two addresses overlap, so that the kernel cannot bind both. On two interfaces, they never do."""
     if one.interface and other.interface and one.interface != other.interface:
         return False
     hosts = one.address.value.host, other.address.value.host
@@ -178,7 +178,7 @@ def recognisers(
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
-    Endpoints of other listeners are omitted; for None, which is no listener of the table, none is omitted. An IP
+    Endpoints of other listeners are omitted. If `listener` is None, no endpoint is omitted. An IP
     address that several endpoints share without source ports identifies none of them; this is only valid if none is a
     source.
     """

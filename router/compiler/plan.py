@@ -62,7 +62,7 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Unset:
-    """A field that is not filled: it keeps its default, or stays absent in protobuf."""
+    """An unfilled field: it keeps its default, or stays absent in protobuf."""
 
     type: Type
     default: object

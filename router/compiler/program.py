@@ -96,7 +96,7 @@ class DeadmanPlan:
 
 @dataclass(frozen=True, slots=True)
 class InboundPlan:
-    """A topic that a gateway's clients may publish on; `label` is its absolute name, which they use.
+    """A topic that a gateway's clients may publish on; `label` is its absolute name, which clients use.
 
     The datagrams of its deadman are CDR bytes, with the topic in place of an endpoint.
     """

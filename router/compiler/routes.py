@@ -70,7 +70,7 @@ _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
 
 
 def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
-    """Yield the findings, but a missing `for_each` or `collect` only once, not for each name that needs it."""
+    """Yield the findings. A missing `for_each` or `collect` is reported once, not for each name that needs it."""
     said = set()
     for finding in findings:
         if finding.message not in said:

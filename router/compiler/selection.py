@@ -1,4 +1,4 @@
-"""Selection of the topics that a gateway sends, and of their rates, by patterns over absolute topic names.
+"""Selects the topics that a gateway sends, and their rates, by patterns over absolute topic names.
 
 Only `pattern_problem` accepts invalid patterns.
 """

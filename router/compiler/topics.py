@@ -140,9 +140,8 @@ class _Use:
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
     """Check topics that several routes or gateways name.
 
-    They must have one type, one QoS per direction, compatible QoS of publisher and subscription, no way back to a
-    sender, and no deadman that competes with other publishers. Topics of a gateway are those that its clients publish
-    on.
+    A topic must have one type, one QoS per direction, compatible QoS of publisher and subscription, no way back to a
+    sender, and no deadman that competes with other publishers. A gateway counts with the topics of its `inbound`.
     """
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]

@@ -1,8 +1,8 @@
 """A head start: executes a kept program before most of the router is imported.
 
 `begin` finds the kept program of this command line, opens its sockets, has its deadmen send, and starts the threads
-that forward and brake. The router adopts them (`app/router.py`) if the program that it has compiled meanwhile comes
-from the same inputs. This module imports only small ones.
+that forward and brake. The router adopts them (`app/router.py`) if the program that it has compiled meanwhile is the
+same. This module imports only small ones.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class HeadStart:
         self._close_sockets()
 
     def is_of(self, parts: object, image: bytes) -> bool:
-        """Return whether it runs the program with these parts and this image. Call it only once."""
+        """Return whether the kept program has these parts and this image. Call it only once."""
         kept, self._kept = self._kept, None
         return kept == (parts, image)
 

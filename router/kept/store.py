@@ -167,7 +167,7 @@ def _path(identity: Identity) -> str:
 
 
 def folder() -> str:
-    """Return the folder of the files: the service's state directory, or in the user's cache. Raises OSError."""
+    """Return the folder of the files, in the service's state directory or the user's cache. Raises OSError."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if os.path.isabs(state):
         return os.path.join(state, "kept")

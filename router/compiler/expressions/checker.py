@@ -61,7 +61,7 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
 
 
 def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | None) -> Node:
-    """Return a chain of comparisons with the value of the subject.
+    """Return a chain of choices, which compare the subject with each key.
 
     Without `else`, values that are not in the map are rejected at run time.
     """

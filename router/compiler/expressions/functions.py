@@ -96,7 +96,7 @@ def hypot(x: float, y: float) -> float:
 
 
 def _with_one_nan(x: float) -> float:
-    """Replace any NaN by one NaN: in Python 3.10, its sign depends on the processor."""
+    """Replace every NaN by the same one: in Python 3.10, the sign depends on the processor."""
     return math.nan if x != x else x  # noqa: PLR0124 - NaN alone differs from itself
 
 

@@ -49,13 +49,13 @@ class IntKind:
 
 
 OCTET, UINT32 = IntKind(0, 0xFF), IntKind(0, 0xFFFF_FFFF)
-"""An element of bytes; and a number of elements, or an index."""
+"""The kinds of an element of bytes, and of a count or an index."""
 
 INT32 = IntKind(-(1 << 31), (1 << 31) - 1)
-"""The values of an enum."""
+"""The range of an enum's values."""
 
 INT64, UINT64 = IntKind(-(1 << 63), (1 << 63) - 1), IntKind(0, (1 << 64) - 1)
-"""The largest ranges of a value: the signed one if its range begins below zero."""
+"""The largest ranges of an integer: INT64 if it may be negative, else UINT64."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,5 +147,5 @@ def fitted(value: Node, kind: IntKind) -> Call:
 
 
 def limited(function: str, value: Node, kind: Kind, *limits: int) -> Call:
-    """Return a value with limits, which the function checks at run time."""
+    """Return a call of `function`, which checks at run time whether a value is within limits."""
     return Call(kind, value.span, function, (value, *(whole(limit, value.span) for limit in limits)))

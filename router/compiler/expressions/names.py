@@ -1,4 +1,4 @@
-"""Resolution of names: variables, fields, constants of enums and ROS types; and has()."""
+"""Resolves names: variables, fields, constants of enums and ROS types; and has()."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ _MISSPELT = 0.9
 
 
 def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
-    """Return the paths to `names`, if they are not a path from the message itself."""
+    """Return the paths that `names` may mean: from a variable, or else nested in the message or a variable."""
     own = [prefix + ".".join(names) for prefix, message in scope.messages() if prefix and leads(message, names)]
     return own or [
         prefix + way for prefix, message in scope.messages() for way in ways(message, names, with_lists=True)
@@ -97,7 +97,7 @@ def _ways(scope: Scope, names: Sequence[str]) -> list[str]:
 
 
 def _presence(text: str, scope: Scope) -> str:
-    """Return a hint for `has_air`, the name in protobuf for C and C++."""
+    """Return a hint for `has_air`, as protobuf spells has(air) in C and C++."""
     member = scope.message.field(text.removeprefix("has_"))
     return f"did you mean 'has({member.name})'?" if member and member.has_presence else ""
 

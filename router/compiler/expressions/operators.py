@@ -319,7 +319,7 @@ def choice(test: Node, body: Node, orelse: Node, span: SourceSpan, scope: Scope)
 
 
 def presence_hint(operand: Node) -> str:
-    """Return a hint for a message in place of a bool; empty for anything else, or if it is always present."""
+    """Return a hint for a message used as a bool; empty if it is always present, and for anything else."""
     if not isinstance(operand, Read) or not isinstance(operand.kind, MessageKind) or not operand.field.has_presence:
         return ""
     names, holder = [operand.field.name], operand.holder

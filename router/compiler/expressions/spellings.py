@@ -70,7 +70,7 @@ class Slip(NamedTuple):
 
 
 def slip(text: str, names: Collection[str]) -> Slip | None:
-    """Return a unit, or an operator without an operand, in invalid text; else None. `names` do not count as units."""
+    """Find a unit that is not in `names`, or an operator without an operand, in invalid text. Return None without."""
     bare = _QUOTED.sub(lambda quoted: "_" * len(quoted[0]), text)
     for found in _UNIT.finditer(bare):
         unit = found["unit"]
@@ -103,7 +103,7 @@ NAMES = {
     "static_cast": FLOAT,
     "header": ARRIVAL,
 }
-"""Names, in lower case, that are neither fields nor constants."""
+"""Hints for names, in lower case, that expressions do not have."""
 
 FUNCTIONS = {
     **dict.fromkeys(("pow", "square", "sqr"), POWER),
@@ -130,7 +130,7 @@ FUNCTIONS = {
     "now": ARRIVAL,
     "time": ARRIVAL,
 }
-"""Functions by their names in other languages, in lower case, without a module's name."""
+"""Hints for functions by their names in other languages, in lower case, without a module's name."""
 
 
 def of_syntax(text: str) -> str:

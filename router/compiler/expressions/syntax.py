@@ -1,4 +1,4 @@
-"""Parsing of an expression to Python's syntax tree, with positions in the table.
+"""Parses expressions to Python's syntax tree, with positions in the table.
 
 Accepts anything that Python can parse; `forbidden` makes the finding for syntax that the language does not have.
 """
@@ -58,7 +58,7 @@ class Parsed:
             ) from None
 
     def _of_word(self, text: str) -> str:
-        """Return a hint if the name of a field that is also a keyword of expressions is used alone."""
+        """Return a hint if a field whose name is a keyword of expressions is used without `message.`."""
         words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"] and not found["dot"]}
         named = sorted(_MEANINGFUL & words & {*self._names})
         return f"write message.{named[0]} for the field '{named[0]}'" if named else ""
@@ -80,7 +80,7 @@ class Parsed:
         return self._expression.place.part(end - len(node.attr), end)
 
     def outermost(self, node: ast.Attribute) -> ast.Attribute:
-        """Return `a.b.c.d` for the `a.b` in it."""
+        """Return the whole `a.b.c.d` that contains `a.b`."""
         holders = {id(each.value): each for each in ast.walk(self.tree) if isinstance(each, ast.Attribute)}
         while outer := holders.get(id(node)):
             node = outer

@@ -97,7 +97,7 @@ def _fit(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def _time(lowering: Lowering, node: tree.Node, factor: int) -> Routine:
-    """Lower a time in nanoseconds, which is rejected if it does not fit 64 bits."""
+    """Lower a number times `factor` as a time in ns. A time that does not fit 64 bits is rejected."""
     if isinstance(node.kind, FloatKind):
         return routine(lowering.value(node), real(factor), Operation(Op.REAL_MULTIPLY), Operation(Op.ROUND))
     flag = signs(TimeKind(), node.kind)

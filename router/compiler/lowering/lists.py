@@ -1,7 +1,7 @@
 """Lists: loops over them, computation element by element, and functions of a whole list.
 
-A list on the stack is stored as contiguous scalars, as in the message, or in cells. A loop copies its lists to its own
-slots, and removes the elements from the copies one by one.
+A list on the stack is stored as contiguous scalars, as in the message, or in cells. A loop copies its lists to slots
+of its own, and removes the elements from the copies one by one.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _computed(lowering: Lowering, node: tree.Each) -> Stored:
 
 
 def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
-    """Choose between two lists, after converting both to the same storage and kind of elements."""
+    """Lower a choice between two lists. Both are converted to the same storage and kind of elements."""
     body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
@@ -188,7 +188,7 @@ def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
 def looped(
     lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Routine], *, keeps: bool = False
 ) -> Routine:
-    """Repeat `body`, which uses the variables of `lists`, for each index of these parallel lists.
+    """Return a loop that repeats `body`, which uses the variables of `lists`, for each index of these parallel lists.
 
     `body` may change the top of the stack, but nothing below.
     """
@@ -202,7 +202,7 @@ Taken = tuple[str, Stored, Slot]
 
 
 def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[Taken]]:
-    """Copy lists to slots, and push their number of elements. Lists of different length are rejected."""
+    """Lower the lists of a loop: copy them to slots, and push their length, which must be the same."""
     made: Routine = ()
     taken: list[Taken] = []
     for variable, values in lists:
@@ -231,7 +231,7 @@ def routine_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[
 
 
 def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section | None]:
-    """Remove an element from a list. It is pushed, or read into a section if it is a message."""
+    """Lower the removal of an element from a list. It is pushed, or read into a section if it is a message."""
     taken = Operation(Op.NEXT, slot, flag=of.scalar)
     if of.message is not None:
         section = lowering.names.element(of.message)
@@ -262,7 +262,7 @@ def element(lowering: Lowering, node: tree.Element) -> Routine:
 
 
 def entered(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
-    """Read a message in a list into a section."""
+    """Lower a message in a list. Return the operations that read it into a section, and the section."""
     of = stored(lowering, node.values)
     assert of.message is not None  # noqa: S101 - the caller ensures it
     made = lowering.names.element(of.message)
@@ -322,7 +322,7 @@ def total(lowering: Lowering, node: tree.Call) -> Routine:
 
 
 def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Routine:
-    """Lower min() or max() of a list. It begins with the first element; an empty list is rejected."""
+    """Lower min() or max() of a list: the loop begins with the first element. An empty list is rejected."""
     of = stored(lowering, node.arguments[0])
     kind = of.element
     assert kind is not None  # noqa: S101 - a number
@@ -335,7 +335,7 @@ def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) 
 
 
 def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Routine, Kind], Routine]) -> Routine:
-    """Combine each element with the top of the stack, without storing a computed list."""
+    """Return a loop that combines each element with the top of the stack. A computed list is not stored."""
     if isinstance(values, tree.Each):
         each = values
     else:

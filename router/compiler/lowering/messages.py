@@ -52,7 +52,7 @@ def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
 
 
 def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
-    """Copy the lists to slots, and push their number of elements, which is rejected if the field cannot hold it."""
+    """Lower the lists that fill a field, as `gone_through`. A length that the field cannot hold is rejected."""
     count, taken = lists.gone_through(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
@@ -64,7 +64,7 @@ def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
 
 
 def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
-    """Repeat `body`; the number of iterations is on the stack. `place` is that of the loop itself."""
+    """Return a loop over `body`; the number of iterations is on the stack. `place` is that of the loop itself."""
     placed: list[Placed] = []
 
     def lowered() -> Routine:

@@ -57,7 +57,7 @@ class Names:
         return made
 
     def element(self, like: Section) -> Section:
-        """Return a new section for an element of a list, like a given one."""
+        """Return a new section for an element of a list, with the type and path of `like`."""
         self.elements.append(replace(like, wanted={}))
         return self.elements[-1]
 

@@ -100,7 +100,7 @@ def chained(op: Op, routines: Sequence[Routine]) -> Routine:
 
 
 def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
-    """Return one of two values; the other one is not evaluated."""
+    """Return operations that push one of two values; the other one is not evaluated."""
     return routine(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
 
 

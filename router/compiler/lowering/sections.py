@@ -18,7 +18,7 @@ from router.types.model import Field as Member
 
 @dataclass(slots=True)
 class Wanted:
-    """A field that is used: its value or list, its presence, or fields of the message in it.
+    """A field that routines use: its value or list, its presence, or fields of its message.
 
     The value of a ROS message is a list with the message as its only element.
     """
