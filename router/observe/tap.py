@@ -138,7 +138,7 @@ class Tap:
             self._changed.notify()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Called by the mirror's thread."""
+        """Queue the wanted datagrams. Called by the mirror's thread."""
         chosen = batch if self._is_wanted is None else list(filter(self._is_wanted, batch))
         piece = encode(chosen)
         unseen, self._lost_before = self._mirror.lost - self._lost_before, self._mirror.lost

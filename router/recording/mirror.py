@@ -130,7 +130,7 @@ class Mirror:
             self._deliver()
 
     def _deliver(self) -> None:
-        """Called by the thread, and after its end by the thread that joined it; never concurrently."""
+        """Call the consumers. Runs in the thread, and after its end in the one that joined it; never concurrently."""
         batch = self._source.take()
         if not batch:
             return

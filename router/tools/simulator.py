@@ -56,7 +56,7 @@ class Silence:
 
 
 def parse_silence(text: str) -> Silence:
-    """`basestation:5-8`, `manual_drive:5-` (without end). Raises UsageError."""
+    """Parse `basestation:5-8`, or `manual_drive:5-` without an end. Raises UsageError for other text."""
     found = _SILENCE.fullmatch(text)
     if found is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")

@@ -96,7 +96,7 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     return length;
 }
 
-/* The queues were empty, so no later datagram was stamped under a past setting of the clock. */
+/* Record that the queues were empty: no later datagram was stamped under a past setting of the clock. */
 static void found_empty(struct carrier *carrier) {
     freshness_forget_past(&carrier->routing.freshness);
     int64_t now = boottime_ns();

@@ -80,7 +80,7 @@ enum place {
     PLACE_MESSAGE,
     PLACE_CONDITION,
     PLACE_ROUTE,     /* `for_each` or `collect` */
-    PLACE_OPERATIONS /* and the index of one */
+    PLACE_OPERATIONS /* plus the index of an operation */
 };
 
 /* Why a target did not get a message: DROP_REASONS in compiler/metrics.py. */

@@ -34,7 +34,9 @@ class Binding:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Raises StartError, except if no network interface has the address yet: then retries in the background."""
+        """Attempt now, or in the background if no network interface has the address yet. Raises StartError for other
+        errors.
+        """
         try:
             await self._attempt()
         except OSError as error:
