@@ -23,8 +23,9 @@ from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
 
 MOST_TURNS = 20
-"""The most parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's
-default buffer lose some of a burst of two hundred."""
+"""Maximum parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's
+default buffer lose some of a burst of two hundred.
+"""
 
 SHORTEST_PAUSE_S = 0.1
 """The minimum time between two discoveries, even if many clients join."""

@@ -30,7 +30,7 @@ CONTENT_TYPE = "application/x-router-tap"
 SEEN, LOST, ALIVE = 1, 2, 3
 
 MAX_WAITING = 4 << 20
-"""The most bytes in the queue of a slow reader."""
+"""Maximum bytes in the queue of a slow reader."""
 
 ALIVE_SECONDS = 1.0
 

@@ -28,7 +28,7 @@ PERIOD = 500_000_000
 """ns from chunk to chunk. A kill loses this much plus the mirror's PERIOD, or more if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""The most bytes of chunks in the queue to the disk."""
+"""Maximum bytes of chunks in the queue to the disk."""
 
 STOP_SECONDS = 2.5
 """How long shutting down waits for the disk. A service manager kills the router after 10 s, and more must be closed."""

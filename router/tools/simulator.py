@@ -128,10 +128,10 @@ class Statistics:
 
 
 class Simulator:
-    """Simulates the endpoints of a table. Binds all addresses at once. Raises UsageError if one cannot be bound, and
-    for a table without listeners.
+    """Simulates the endpoints of a table, and binds the addresses of all at once.
 
-    `deadmen` are those of the compiled program; boards halt on what they send.
+    Raises UsageError if one cannot be bound, and for a table without listeners. `deadmen` are those of the compiled
+    program; boards halt on what they send.
     """
 
     def __init__(

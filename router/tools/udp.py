@@ -46,9 +46,7 @@ def listening(text: str, table: RouteTable | None) -> Address:
 
 
 def origin(text: str, table: RouteTable | None) -> Address:
-    """Parse `HOST[:PORT]`, or the name of an endpoint: its host, and its `source_port` if it has one. Raises
-    UsageError.
-    """
+    """Parse `HOST[:PORT]`, or an endpoint's name: its host, and its `source_port` if it has one. Raises UsageError."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
         return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)

@@ -34,9 +34,7 @@ class Binding:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Attempt now, or in the background if no network interface has the address yet. Raises StartError for other
-        errors.
-        """
+        """Attempt now; if no network interface has the address yet, in the background. Otherwise raises StartError."""
         try:
             await self._attempt()
         except OSError as error:

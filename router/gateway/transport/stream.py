@@ -21,7 +21,7 @@ PIECE = 64 * 1024
 """Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""
 
 UNSENT = 128 * 1024
-"""Bytes that the kernel keeps unsent for a client. Values that wait in the router can still be replaced by newer ones.
+"""Bytes that the kernel keeps unsent for a client. Newer values can still replace those that wait in the router.
 """
 
 STALLED_SECONDS = 60.0

@@ -48,14 +48,14 @@ CONNECTIONS_SECONDS = 1.0
 """The interval of checks of connections."""
 
 MOST_OTHERS = 100
-"""The most other owners of its key that a gateway remembers."""
+"""Maximum other owners of its key that a gateway remembers."""
 
 MOST_RECEIVED = 1000
 MOST_RECEIVED_BYTES = 64 << 20
-"""The most samples, and bytes, in the queue to the loop; others are rejected."""
+"""Maximum samples, and their bytes, in the queue to the loop; others are rejected."""
 
 MOST_QUERIES = 100
-"""The most pending queries; each answer may be large."""
+"""Maximum pending queries; each answer may be large."""
 
 LARGE = 64 * 1024
 """Bytes above which a put can take long."""
