@@ -86,7 +86,7 @@ class Comparison:
     def _delivered(
         self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
-        """Yield the differences. `explained`: an already reported rejection explains why targets got nothing."""
+        """Yield the failures. `explained`: an already reported rejection explains why targets got nothing."""
         for target in dict.fromkeys((*expected, *came)):
             deliveries, events = expected.get(target, ()), came.get(target, [])
             if deliveries and not events:

@@ -1,5 +1,5 @@
-/* Events of native threads for Python's log, as records of a ring. Ids stand for names that Python knows. Their rate is
- * limited: the counter that an event names has the full number. */
+/* Events of native threads for Python's log, as records of a ring. Ids stand for names, which Python looks up. The rate of
+ * events is limited: the counter that an event names has the full number. */
 #ifndef EVENTS_H
 #define EVENTS_H
 
