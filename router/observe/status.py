@@ -148,7 +148,7 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 def _map_json(program: Program) -> Json:
     """Return the map.
 
-    `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: the links along which deadmen
+    `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: edges with what deadmen
     send.
     """
     table = program.table
