@@ -59,7 +59,7 @@ class Published(Event):
 
 @dataclass(frozen=True, slots=True)
 class Dropped(Event):
-    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` has more about it, if there is more."""
+    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` may say more."""
 
     route: str
     target: str

@@ -39,7 +39,7 @@ _AGE: dict[str, Cell] = {"age": lambda row: Text(age_text(row.age), style="dim" 
 class RouteTable:
     """At most `height` lines with the routes in this order, from number `first` (counted from 0) on.
 
-    `columns` are further ones; without any, latencies where there is room, and ages.
+    `columns` are additional ones. Without any, the table shows ages, and latencies if there is room.
     """
 
     view: View

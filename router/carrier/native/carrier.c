@@ -50,7 +50,7 @@ struct carrier {
 
 /* ---- the mirror ---- */
 
-/* `reason` is ROUTED, or the reason for rejecting the datagram. */
+/* Copy a datagram to the mirror. `reason` is ROUTED, or the reason for rejecting the datagram. */
 static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
     struct mirror_record *record = (struct mirror_record *)carrier->routing.record;
     size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
