@@ -52,7 +52,7 @@ class ClientQueue:
         return bool(self._held)
 
     def lack(self, topic: str) -> None:
-        """Record that the client missed a message of the topic, unless its kept messages, on their way, include it."""
+        """Record that the client missed a message of the topic, unless kept messages on their way include it."""
         (self._held_incomplete if topic in self._held else self.lacking).add(topic)
 
     @property
@@ -89,7 +89,7 @@ class ClientQueue:
         return frames
 
     def unheld(self, frames: Sequence[Frame]) -> list[Frame]:
-        """Return the frames that can be sent now, and hold the others. If they are too large together, release all."""
+        """Return the frames that can be sent now, and hold the others. If these get too large, release all."""
         passed: list[Frame] = []
         for frame in frames:
             if frame.is_schema or frame.topic not in self._held:

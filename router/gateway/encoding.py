@@ -30,7 +30,7 @@ class ReadyType:
         self._encoders: dict[Style, Encode] = {}
 
     def text(self, style: Style, cdr: bytes) -> bytes:
-        """Raises UnreadableError."""
+        """Convert CDR to JSON. Raises UnreadableError if that is impossible."""
         if (encode := self._encoders.get(style)) is None:
             encode = self._encoders[style] = encoder(self.message, style)
         return encode(cdr)
@@ -95,7 +95,7 @@ class Encoding(ABC):
 
     @abstractmethod
     def data(self, sample: Sample, time: float) -> bytes:
-        """Raises UnreadableError."""
+        """Encode a message. Raises UnreadableError if it cannot be converted."""
 
     @abstractmethod
     def request(self, data: bytes) -> Request:

@@ -228,7 +228,7 @@ class TopicSender:
         return data
 
     def _frame(self, sample: Sample) -> Frame:
-        """Raises UnreadableError."""
+        """Encode a message as a frame. Raises UnreadableError if it cannot be converted."""
         data = self._encoding.data(sample, self._context.wall_s())
         return Frame(data, sample.topic, sample.type_name, is_schema=False, sent_ns=sample.sent_ns)
 

@@ -57,7 +57,7 @@ class GatewayService:
         return GatewayService(self.plan, self._context, self._counters, self._inbound, self._new_transport)
 
     async def open(self) -> None:
-        """Raises StartError."""
+        """Open the transport. Raises StartError if it cannot be opened."""
         await self._transport.open()
 
     def start(self) -> None:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # which imports rclpy
 T = TypeVar("T")
 
 MOST_REQUEST = 4096
-"""The most bytes of a message from a client that may not publish: it can only request schemas."""
+"""Maximum bytes of a message from a client that may not publish: it can only request schemas."""
 
 _PATIENCE_S = 5.0
 """Seconds that a change of gateways may take in the event loop; opening a Zenoh session takes some."""

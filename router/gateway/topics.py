@@ -23,8 +23,9 @@ from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
 
 MOST_TURNS = 20
-"""The most parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's
-default buffer lose some of a burst of two hundred."""
+"""Maximum parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's
+default buffer lose some of a burst of two hundred.
+"""
 
 SHORTEST_PAUSE_S = 0.1
 """The minimum time between two discoveries, even if many clients join."""
@@ -214,7 +215,8 @@ class Topics:
     def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, is_repetition: bool = False) -> None:
         """Send a client the kept messages of these topics, a little later.
 
-        Newer messages follow them, except in a repetition and on topics that some publishers do not keep messages of.
+        Newer messages are held until then, except in a repetition, and on topics of which some publishers keep no
+        messages.
         """
         for served in topics:
             topic = served.subscription.topic
@@ -256,7 +258,7 @@ class Topics:
             self._show_kept(queue, [served])
 
     async def _mend(self) -> None:
-        """Send clients the messages that they lack of a topic, once it is quiet and they keep up."""
+        """Send clients the messages of a topic that they lack, once it is quiet and they keep up."""
         lacking = [queue for queue in self._clients.queues.values() if queue.lacking and queue.keeps_up]
         for topic in {topic for queue in lacking for topic in queue.lacking}:
             served = self._served.get(topic)

@@ -67,7 +67,7 @@ _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
 """Reasons of intended losses, and the one that UNHANDLED_CASE reports."""
 
 _NAMED = 3
-"""The most routes that a text names."""
+"""Maximum routes that a text names."""
 
 _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
@@ -124,8 +124,9 @@ class Look:
 
     @cached_property
     def halted(self) -> frozenset[str]:
-        """The routes that nobody drives: the deadman has been sending for a long time, reaches its endpoints, and no
-        command is dropped.
+        """The routes that nobody drives.
+
+        Their deadman has been sending for a long time, reaches its endpoints, and no command is dropped.
         """
         failing = {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
         for labels, _ in self.grown(Kind.MESSAGES_DROPPED.metric):

@@ -253,7 +253,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_IN_KERNEL)
 
     def finish(self) -> None:
-        """There is nothing to flush."""
+        """Do nothing: there is nothing to flush."""
 
     def handle(self) -> None:
         self.close_connection = False
@@ -379,7 +379,7 @@ class _Handler(BaseHTTPRequestHandler):
         return "router"
 
     def log_message(self, *_: object) -> None:
-        """Requests are not logged: each open page sends one per second."""
+        """Do not log requests: each open page sends one per second."""
 
 
 def refusal(peer: str, own: str, headers: Message) -> str | None:

@@ -64,7 +64,7 @@ class LastValues:
             self._end()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Called by the mirror's thread."""
+        """Remember the newest datagrams. Called by the mirror's thread."""
         with self._newest_lock:
             for datagram in batch:
                 *_, reason, data = datagram

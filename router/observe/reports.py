@@ -14,7 +14,7 @@ from router.table.addresses import Address
 from router.threads import Thread, join_or_leave
 
 MOST_MISMATCHES = 64
-"""The most mismatches remembered, the latest ones: any stranger can cause them."""
+"""Maximum mismatches remembered, the latest ones: any stranger can cause them."""
 
 
 class Reporter:

@@ -81,7 +81,9 @@ def nodes_and_edges(table: RouteTable) -> tuple[list[Node], list[Edge]]:
 
 
 def deadman_edges(program: Program) -> Iterator[Edge]:
-    """Yield what deadmen send in place of commands, counted by `deadman_datagrams_sent{route, destination=label}`."""
+    """Yield edges for what deadmen send in place of commands, counted by `deadman_datagrams_sent{route,
+    destination=label}`.
+    """
     for route in program.table.routes:
         if route.deadman is not None:
             about = f"{route.deadman.case.value}, sent by the deadman"

@@ -69,7 +69,7 @@ class Snapshot:
 
 
 def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | None = None) -> Snapshot:
-    """Make a snapshot from the output of a collector, or of the text format's parser. `metrics`: only these."""
+    """Make a snapshot of the output of a collector or of the text format's parser. `metrics`: only these, if given."""
     values: dict[str, dict[Labels, float]] = defaultdict(dict)
     for family in families:
         if metrics is not None and family.name.removeprefix(PREFIX) not in metrics:

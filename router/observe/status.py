@@ -93,8 +93,10 @@ class Status:
         }
 
     def map(self) -> Json:
-        """Return everything that is fixed while a table runs. `keeps`: seconds that can be saved, or None. `intended`:
-        reasons of intended losses."""
+        """Return everything that is fixed while a table runs.
+
+        `keeps`: seconds that can be saved, or None. `intended`: reasons of intended losses.
+        """
         program = self._running.program
         table = program.table
         kept = table.record.last if self._can_save and table.record is not None else None
@@ -144,8 +146,10 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
 def _map_json(program: Program) -> Json:
-    """Return the map. `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: links of
-    what deadmen send.
+    """Return the map.
+
+    `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: edges with what deadmen
+    send.
     """
     table = program.table
     nodes, edges = nodes_and_edges(table)

@@ -30,7 +30,7 @@ CONTENT_TYPE = "application/x-router-tap"
 SEEN, LOST, ALIVE = 1, 2, 3
 
 MAX_WAITING = 4 << 20
-"""The most bytes in the queue of a slow reader."""
+"""Maximum bytes in the queue of a slow reader."""
 
 ALIVE_SECONDS = 1.0
 
@@ -138,7 +138,7 @@ class Tap:
             self._changed.notify()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Called by the mirror's thread."""
+        """Queue the wanted datagrams. Called by the mirror's thread."""
         chosen = batch if self._is_wanted is None else list(filter(self._is_wanted, batch))
         piece = encode(chosen)
         unseen, self._lost_before = self._mirror.lost - self._lost_before, self._mirror.lost

@@ -253,7 +253,9 @@ class Encoder:
         ]
 
     def _shape(self, listener: str, peer: Peer, endpoint: str, reason: str, data: bytes) -> _Shape | None:
-        """Return None for a datagram that is not one field of a payload case, encoded as protobuf encodes it."""
+        """Return the shape of a datagram; None unless it is one field of a payload case, encoded as protobuf encodes
+        it.
+        """
         key = listener, peer, endpoint, reason, len(data), data[:2]
         if (known := self._shapes.get(key)) is not None:
             return known

@@ -28,9 +28,9 @@ PERIOD = 0.05
 class MirroredDatagram(NamedTuple):
     """A datagram. `at`: when the router received it (wall clock, ns). `data`: the bytes as received.
 
-    `endpoint` is the sender's name in the table, "" for a stranger. `reason` is the one of REJECT_REASONS for which no
-    route accepted the datagram, "" for an accepted one. A datagram longer than MAX_DATAGRAM is cut to one byte more
-    than that.
+    `endpoint` is the sender's name in the table, "" for a stranger. `reason` says why no route accepted the datagram
+    (one of REJECT_REASONS), "" for an accepted one. A datagram longer than MAX_DATAGRAM is cut to one byte more than
+    that.
     """
 
     at: int
@@ -130,7 +130,7 @@ class Mirror:
             self._deliver()
 
     def _deliver(self) -> None:
-        """Called by the thread, and after its end by the thread that joined it; never concurrently."""
+        """Call the consumers. Runs in the thread, and after its end in the one that joined it; never concurrently."""
         batch = self._source.take()
         if not batch:
             return
@@ -175,7 +175,9 @@ class Classifier:
         return case, payload.SerializeToString()
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
-        """Return None if anything but zeros follows the first field, or its length has more than two bytes."""
+        """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two
+        bytes.
+        """
         try:
             tag_size = 1 if data[0] < 0x80 else 2
             case, size, start = self.cases_by_tag[data[:tag_size]], data[tag_size], tag_size + 1

@@ -104,8 +104,10 @@ class Recording:
 
 
 def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]:
-    """Return a function that turns the messages of the channel with this metadata into the fields of Recorded from
-    `listener` on."""
+    """Return a function that decodes the messages of the channel with this metadata.
+
+    It returns the fields of Recorded from `listener` on, or None if the datagram is elsewhere in the recording.
+    """
     holds, reason = metadata.get("holds"), metadata.get("reason", "")
     if holds == Holds.DATAGRAM.value:
         return partial(_raw, reason)

@@ -28,7 +28,7 @@ PERIOD = 500_000_000
 """ns from chunk to chunk. A kill loses this much plus the mirror's PERIOD, or more if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""The most bytes of chunks in the queue to the disk."""
+"""Maximum bytes of chunks in the queue to the disk."""
 
 STOP_SECONDS = 2.5
 """How long shutting down waits for the disk. A service manager kills the router after 10 s, and more must be closed."""
@@ -147,7 +147,7 @@ class Recorder:
             self._wake_up.set()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Called by the mirror's thread."""
+        """Encode a batch. Called by the mirror's thread."""
         program = self._running_program()
         if program is not self._program:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
@@ -250,7 +250,7 @@ class Recorder:
             self._save(f"deadman-{routes[0]}")
 
     def _save(self, reason: str) -> Path:
-        """Raises RecordError, which has been logged."""
+        """Write the ring to a file, and return its path. Raises RecordError, which has been logged."""
         try:
             path = self._write_ring(reason)
         except OSError as error:

@@ -86,7 +86,7 @@ class Comparison:
     def _delivered(
         self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
-        """`explained`: a rejection that was already reported explains why targets got nothing."""
+        """Yield the failures. `explained`: an already reported rejection explains why targets got nothing."""
         for target in dict.fromkeys((*expected, *came)):
             deliveries, events = expected.get(target, ()), came.get(target, [])
             if deliveries and not events:
@@ -209,6 +209,6 @@ def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
 
 
 def _listed(counts: Counts) -> str:
-    """`stale, 3 rate_limited`."""
+    """Return counts as text: `stale, 3 rate_limited`."""
     listed = (f"{count} {name}" if count > 1 else name for name, count in sorted(counts.items()))
     return ", ".join(listed) or "nothing"

@@ -228,7 +228,7 @@ class FieldReader:
 
 
 def _near(text: str, span: SourceSpan) -> Scalar | None:
-    """`~1.571` is any number that rounds to it, `1.57 +- 0.01` any number within that tolerance."""
+    """Parse `~1.571`, any number that rounds to it, or `1.57 +- 0.01`, any number within that tolerance."""
     if found := _ROUGHLY.fullmatch(text):
         value = _finite(found[1], "number to be near", span)
         digits = len(found[2] or "") - int(found[3] or 0)
@@ -400,7 +400,7 @@ def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]
 
 
 def path_text(path: Path) -> str:
-    """`linear_acceleration.x`, `points[1].x`."""
+    """Return a path as text: `linear_acceleration.x`, `points[1].x`."""
     return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
 
 

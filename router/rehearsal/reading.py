@@ -49,7 +49,7 @@ class TableTest:
 class TestFile:
     """The tests of a file, and their table with its program."""
 
-    __test__ = False  # for pytest, which takes the name for a class of tests
+    __test__ = False  # for pytest, which would take this for a class of tests
 
     checked: Checked
     program: Program

@@ -59,7 +59,7 @@ class Published(Event):
 
 @dataclass(frozen=True, slots=True)
 class Dropped(Event):
-    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` has more about it, if there is more."""
+    """A target did not get a message, for one of metrics.DROP_REASONS; `detail` may say more."""
 
     route: str
     target: str
@@ -124,7 +124,7 @@ class Rehearsal:
     """
 
     def __init__(self, program: Program, start_ns: int = START) -> None:
-        """Raises StartError without a library."""
+        """Start the program. Raises StartError if the carrier's library is missing."""
         self.events: list[Event] = []
         self._stage = Stage(library(), start_ns)
         self._start = self._at = start_ns

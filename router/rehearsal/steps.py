@@ -212,7 +212,7 @@ class GivenReader:
         self._fields = FieldReader(names.constants, exact=True)
 
     def given(self, node: Node) -> Given:
-        """Raises InvalidValueError."""
+        """Read the given message of a step. Raises InvalidValueError."""
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
         span = next(iter(node.entries.values())).key.span if node.entries else node.span
         topic = optional_text(node, "topic")
@@ -268,7 +268,7 @@ def _refuse(node: MappingNode, names: tuple[str, ...], what: str, known: tuple[s
 
 
 def _repetition(node: MappingNode) -> tuple[int, int, int]:
-    """`times`, `every` and `age`, the latter two in ns."""
+    """Return `times`, `every` and `age`, the latter two in ns."""
     times, every, age = integer(node, "times"), optional_text(node, "every"), optional_text(node, "age")
     if every is not None and times is None:
         raise invalid(every.span, Code.MISSING_KEY, "'every' without 'times'", "add 'times', the number of messages")

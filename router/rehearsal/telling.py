@@ -138,7 +138,7 @@ class Teller:
         return self.described(events[0]) + more
 
     def described(self, event: Event) -> str:
-        """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
+        """Describe an event: `at 500 ms manual_brake {brake: true} is sent to driving_board`."""
         at = when(event)
         match event:
             case Sent():
@@ -181,5 +181,5 @@ def in_brackets(detail: str) -> str:
 
 
 def when(event: Event) -> str:
-    """`at 500 ms `; empty at the beginning of the test."""
+    """Return `at 500 ms `; empty at the beginning of the test."""
     return f"at {offset(event.at - START)} " if event.at != START else ""

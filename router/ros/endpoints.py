@@ -58,7 +58,7 @@ class Publication:
     """
 
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
-        """Raises StartError."""
+        """Open the publisher. Raises StartError if the middleware refuses it."""
         self.plan = plan
         self.wanted: WantedFlag = (ctypes.c_uint8 * 1)(plan.qos.serves_late_joiners)
         with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
@@ -133,7 +133,7 @@ class Subscription:
     """A subscription. Messages are taken through `raw`."""
 
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
-        """Raises StartError."""
+        """Open the subscription. Raises StartError if the middleware refuses it."""
         self.plan = plan
         with _refusing(f"{span}: topic '{plan.label}' cannot be subscribed to"):
             self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))

@@ -43,7 +43,7 @@ class RawSubscription:
         qos: QoSProfile,
         event_callbacks: SubscriptionEventCallbacks | None = None,
     ) -> None:
-        """Raises one of `RCL_ERRORS`."""
+        """Open the subscription. Raises one of `RCL_ERRORS`."""
         subscription = node.create_subscription(
             message_class,
             topic,
@@ -109,7 +109,7 @@ class Arrivals:
     """
 
     def __init__(self, subscriptions: Sequence[RawSubscription]) -> None:
-        """Raises one of `RCL_ERRORS`."""
+        """Wait for messages on these subscriptions. Raises one of `RCL_ERRORS`."""
         self._subscriptions: dict[int, RawSubscription] = {}
         self._eventfds: dict[RawSubscription, int] = {}
         with ExitStack() as opening:

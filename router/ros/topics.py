@@ -124,7 +124,7 @@ class TopicTap:
     """
 
     def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
-        """Raises one of `RCL_ERRORS`, or OSError if too many files are open."""
+        """Subscribe to a topic. Raises one of `RCL_ERRORS`, or OSError if too many files are open."""
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         with ExitStack() as opening:
             self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -209,6 +209,6 @@ def _publishers(node: Node, topic: str, patience: float) -> Sequence[DiscoveredP
 
 
 def _qos(publishers: Sequence[DiscoveredPublisher]) -> QoSProfile:
-    """Best effort matches every publisher and delays none; kept messages need a reliable subscription."""
+    """Return a QoS: best effort matches every publisher and delays none; kept messages need a reliable subscription."""
     keeps = bool(publishers) and all(publisher.is_reliable and publisher.keeps for publisher in publishers)
     return tap_qos(is_reliable=keeps, keeps=keeps, depth=DEPTH)

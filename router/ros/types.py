@@ -108,7 +108,7 @@ def installed_class(name: str) -> Any:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """Package, kind and short name. Raises StartError."""
+    """Return package, kind and short name. Raises StartError for any other name."""
     parts = _NAME.fullmatch(name)
     if parts is None:
         raise StartError(f"{name} is not installed (it is not the name of a ROS message)")

@@ -339,7 +339,7 @@ class Route:
     """What happens to one payload case, or to its messages from certain sources.
 
     `span` is the payload case in the table, or the first key of a route in a list. `name` is unique, for metrics and
-    log: the payload case, or for one of several routes of a case for example `imu_info_from_ros`. `ignore` is the
+    log: the payload case, or, for one of several routes of a case, a name such as `imu_info_from_ros`. `ignore` is the
     reason for ignoring the case. Messages come from `sources`, which are names of endpoints or only `any`, or from
     `source_topics`. `topics` (published) and `collect` are for the former, `fields` and `for_each` for the latter.
     `ttl` is in ns. `no_deadman` is the reason why a route with commands has no deadman.

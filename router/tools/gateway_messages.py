@@ -168,7 +168,7 @@ def _as_json(heard: Heard) -> Mapping[str, object]:
 
 
 def pieces(heard: Heard) -> list[Piece]:
-    """`12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
+    """Return one line in styled pieces: `12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
     if isinstance(heard, Message):
         values = _line(words(_tree(heard.data, heard.shape or _NO_SHAPE, heard.is_wrapped)))
         return [(_clock(heard.time), "dim"), _name(heard.topic, "green"), _name(heard.type_name, "dim"), (values, "")]

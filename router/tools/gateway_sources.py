@@ -314,7 +314,11 @@ def open_source(text: str, form: GatewayFormat | None, gateway: Address | None, 
 
 
 def _zenoh(text: str) -> ZenohSettings:
-    """`rovers/loki_1?mode=client&connect=tcp/10.0.0.1:7447`, with several `connect` and `listen`; or `?config=FILE`."""
+    """Parse a source in a Zenoh network.
+
+    `rovers/loki_1?mode=client&connect=tcp/10.0.0.1:7447`, also with several `connect` and `listen`; or
+    `rovers/loki_1?config=FILE`.
+    """
     key, _, query = text.partition("?")
     options = parse_qs(query, keep_blank_values=True)
     known = ("mode", "connect", "listen", "config")

@@ -143,7 +143,7 @@ MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "BasestationManualDrive": _manual_drive,
     "BasestationManualBrake": _manual_brake,
 }
-"""By protobuf message; all other fields vary as their types allow."""
+"""Functions that return the modelled fields, by protobuf message; all other fields vary as their types allow."""
 
 
 RATES: Mapping[str, float] = {

@@ -125,7 +125,7 @@ class Replayer:
         self._sockets: dict[tuple[str, tuple[str, int], str], socket.socket] = {}
 
     def send(self, found: Recorded) -> None:
-        """Raises UsageError for a listener that has no address, TransportError if the network cannot send."""
+        """Send a datagram. Raises UsageError if its listener has no address, TransportError if sending fails."""
         key = (found.listener, found.peer, found.endpoint)
         if key not in self._sockets:
             if len(self._sockets) >= MOST_SOCKETS:

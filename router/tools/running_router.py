@@ -112,12 +112,12 @@ def down(url: str, error: TransportError) -> Problem:
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = (), only: str | None = None
 ) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
-    """Yield the datagrams that a running router receives, with these payload cases, from these endpoints (empty: all).
-    `only` is one of DECISIONS.
+    """Open a tap of the datagrams that a running router receives.
 
-    They arrive in batches; while nothing is received, an empty batch arrives each second. Datagrams without a known
-    payload case are always included. Raises UsageError if the router rejects the request, TransportError if none
-    answers, or later if the router stops.
+    Only those with these payload cases, from these endpoints (empty: all) and with this decision (`only`: one of
+    DECISIONS; None: both). They arrive in batches; while nothing is received, an empty batch arrives each second.
+    Datagrams without a known payload case are always included. Raises UsageError if the router rejects the request,
+    TransportError if none answers, or later if the router stops.
     """
     asked = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(asked + ([("only", only)] if only else []))

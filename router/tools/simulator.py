@@ -56,7 +56,7 @@ class Silence:
 
 
 def parse_silence(text: str) -> Silence:
-    """`basestation:5-8`, `manual_drive:5-` (without end). Raises UsageError."""
+    """Parse `basestation:5-8`, or `manual_drive:5-` without an end. Raises UsageError for other text."""
     found = _SILENCE.fullmatch(text)
     if found is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
@@ -128,10 +128,10 @@ class Statistics:
 
 
 class Simulator:
-    """Simulates the endpoints of a table. Binds all addresses at once. Raises UsageError if one cannot be bound, and
-    for a table without listeners.
+    """Simulates the endpoints of a table, and binds the addresses of all at once.
 
-    `deadmen` are those of the compiled program; boards halt on what they send.
+    Raises UsageError if one cannot be bound, and for a table without listeners. `deadmen` are those of the compiled
+    program; boards halt on what they send.
     """
 
     def __init__(

@@ -44,7 +44,7 @@ class Condition:
     """
 
     def __init__(self, text: str, envelope: Envelope, cases: Sequence[PayloadCase]) -> None:
-        """Raises UsageError if it fits none of the cases, StartError without a library."""
+        """Parse the expression. Raises UsageError if it fits none of the cases, StartError without a library."""
         self.failure = ""
         self._conditions: dict[str, NativeCondition] = {}
         findings: dict[str, Diagnostic] = {}
@@ -74,7 +74,7 @@ class Condition:
 
 
 def _checked(text: str, message: MessageType) -> Node:
-    """Raises ExpressionError."""
+    """Parse a condition on a message. Raises ExpressionError if it is not a valid one."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
     place = TextPlace(span, ((0, span),))
     node = check(Expression(text, place), Scope(message, tuple(_enums(message)), ()))
@@ -119,7 +119,7 @@ class TappedDatagram:
     rejected: str = ""
 
     def line(self, with_hex: bool) -> str:
-        """`12:00:00.123 sensor_board imu_info accel_x=1.5`."""
+        """Return one line: `12:00:00.123 sensor_board imu_info accel_x=1.5`."""
         start = f"{_clock(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
@@ -157,7 +157,7 @@ class TappedMessage:
     message: Any
 
     def line(self, with_hex: bool) -> str:
-        """`12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
+        """Return one line: `12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
         line = f"{_clock(self.at)} {self.type_name} {one_line(words(ros_tree(self.message)))}"
         return f"{line} [{self.cdr.hex()}]" if with_hex else line
 
@@ -177,7 +177,7 @@ def _clock(at: dt.datetime) -> str:
 
 
 def _local_time(at: int) -> dt.datetime:
-    """`at`: ns since 1970."""
+    """Return the local time of `at`, ns since 1970."""
     return dt.datetime.fromtimestamp(at / 1e9).astimezone()
 
 

@@ -32,9 +32,10 @@ class Order(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class TargetRow:
-    """A destination or topic of a route, or the clients of a gateway: delivered messages in total and per second,
-    dropped and withheld ones. `lost` are dropped messages without the intended losses; `is_losing`: losses are a
-    problem now.
+    """A destination or topic of a route, or the clients of a gateway.
+
+    Delivered messages are in total and per second. `lost` are dropped messages without the intended losses;
+    `is_losing`: losses are a problem now.
     """
 
     name: str

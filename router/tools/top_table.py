@@ -39,7 +39,7 @@ _AGE: dict[str, Cell] = {"age": lambda row: Text(age_text(row.age), style="dim" 
 class RouteTable:
     """At most `height` lines with the routes in this order, from number `first` (counted from 0) on.
 
-    `columns` are further ones; without any, latencies where there is room, and ages.
+    `columns` are additional ones. Without any, the table shows ages, and latencies if there is room.
     """
 
     view: View
@@ -139,13 +139,13 @@ def _drops(row: RouteRow) -> Text:
 
 
 def reasons_text(dropped: Mapping[str, int]) -> str:
-    """`12 stale, 3 queue_full`, the largest first, and intended losses last."""
+    """Return `12 stale, 3 queue_full`, the largest first, and intended losses last."""
     by_count = sorted(dropped.items(), key=lambda item: (item[0] in INTENDED_REASONS, -item[1], item[0]))
     return ", ".join(f"{count} {reason}" for reason, count in by_count)
 
 
 def latency_text(seconds: float | None) -> str:
-    """`35 us`, `1.2 ms`; `-` for None."""
+    """Return `35 us` or `1.2 ms`; `-` for None."""
     if seconds is None:
         return "-"
     if math.isinf(seconds):

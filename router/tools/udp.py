@@ -24,7 +24,7 @@ ANYWHERE = Address(ANY_HOST, 0)
 
 
 def destination(text: str, table: RouteTable | None) -> Address:
-    """`HOST:PORT`, or the name of an endpoint or listener of the table."""
+    """Parse `HOST:PORT`, or the name of an endpoint or listener of the table. Raises UsageError."""
     if table is not None and text in table.listeners and text not in table.endpoints:
         return listener_address(table.listeners[text])
     if (named := _named(text, table)) is not None:
@@ -36,7 +36,7 @@ def destination(text: str, table: RouteTable | None) -> Address:
 
 
 def listening(text: str, table: RouteTable | None) -> Address:
-    """`[HOST:]PORT` (every local address when there is no host), or a name of the table."""
+    """Parse `[HOST:]PORT` (without a host, all local addresses), or a name of the table. Raises UsageError."""
     if (named := _named(text, table)) is not None:
         return named
     host, _, port = text.rpartition(":")
@@ -46,7 +46,7 @@ def listening(text: str, table: RouteTable | None) -> Address:
 
 
 def origin(text: str, table: RouteTable | None) -> Address:
-    """`HOST[:PORT]`, or an endpoint of the table: its host, and its `source_port` if it has one."""
+    """Parse `HOST[:PORT]`, or an endpoint's name: its host, and its `source_port` if it has one. Raises UsageError."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
         return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)

@@ -285,7 +285,7 @@ def _extended(
 def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
     """Return the lock with the current names of messages, enums and oneofs, and the renames from old to new.
 
-    An envelope that has disappeared is compared with the current one, although it is another: its numbers count.
+    An envelope that has disappeared is compared with the current one despite the different name: its numbers matter.
     """
     moved = _moved(lock, current)
     names = dict(moved)

@@ -50,7 +50,7 @@ struct carrier {
 
 /* ---- the mirror ---- */
 
-/* `reason` is ROUTED, or the reason for rejecting the datagram. */
+/* Copy a datagram to the mirror. `reason` is ROUTED, or the reason for rejecting the datagram. */
 static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
     struct mirror_record *record = (struct mirror_record *)carrier->routing.record;
     size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
@@ -96,7 +96,7 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     return length;
 }
 
-/* The queues were empty, so no later datagram was stamped under a past setting of the clock. */
+/* Record that the queues were empty: no later datagram was stamped under a past setting of the clock. */
 static void found_empty(struct carrier *carrier) {
     freshness_forget_past(&carrier->routing.freshness);
     int64_t now = boottime_ns();

@@ -51,10 +51,10 @@ void deadman_close(struct timers *timers, struct deadman *deadman);
  * While one of the datagrams fails, all are sent again each second, until a command feeds or disarms the deadman. */
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now);
 
-/* `deadman_start` for a deadman that publishes. It reaches nobody before subscribers are discovered, so for some time, and
- * until a command is sent, it publishes to each new subscriber: at once, and again after half a second, because subscriber
- * and publisher do not discover each other at the same time and best effort loses messages in between. `deadman_greet`
- * returns whether it does so. */
+/* Like `deadman_start`, for a deadman that publishes. It reaches no subscriber that is not discovered yet, so for some
+ * time, and until a command is sent, it publishes to each new subscriber: at once, and again after half a second, because
+ * subscriber and publisher do not discover each other at the same time and best effort loses messages in between.
+ * `deadman_greet` returns whether it does so. */
 void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, int64_t now);
 bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now);
 

@@ -137,7 +137,7 @@ static void end_turn(struct machine *machine, const struct loop *loop) {
     top->real = function(top->real);        \
     WANT(to_integer(top))
 
-/* Execute operations. Their result is the second value of the stack. */
+/* Execute operations. The second value of the stack is their result. */
 static int execute(struct machine *machine, const struct routine *routine, uint32_t *at) {
     const struct operation *operations = routine->operations;
     const uint8_t *literals = machine->layout->literals;

@@ -1,5 +1,5 @@
-/* Events of native threads for Python's log, as records of a ring. Ids stand for names that Python knows. Their rate is
- * limited: the counter that an event names has the full number. */
+/* Events of native threads for Python's log, as records of a ring. Ids stand for names, which Python looks up. The rate of
+ * events is limited: the counter that an event names has the full number. */
 #ifndef EVENTS_H
 #define EVENTS_H
 
@@ -80,7 +80,7 @@ enum place {
     PLACE_MESSAGE,
     PLACE_CONDITION,
     PLACE_ROUTE,     /* `for_each` or `collect` */
-    PLACE_OPERATIONS /* and the index of one */
+    PLACE_OPERATIONS /* plus the index of an operation */
 };
 
 /* Why a target did not get a message: DROP_REASONS in compiler/metrics.py. */

@@ -1,9 +1,9 @@
 /* The machine that runs routines (operations.h): it reads a message into slots, evaluates conditions on it, and writes the
  * messages of targets. Each thread has its own machine.
  *
- *     machine_begin(machine, layout);             set slots to their defaults
- *     machine->slots[...] = ...;                  values other than fields: time of receipt, sender
- *     machine_read(machine, data, size);             read fields into slots
+ *     machine_begin(machine, layout);                  set slots to their defaults
+ *     machine->slots[...] = ...;                       values other than fields: time of receipt, sender
+ *     machine_read(machine, data, size);               read fields into slots
  *     evaluate_condition(...), evaluate_message(...)   any number of times (evaluate.h)
  *
  * Text, bytes and lists in slots point into the message that was read: it must not change until the next begin. */

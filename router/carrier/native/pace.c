@@ -74,8 +74,8 @@ static const struct waiting_datagram *take(struct lane *lane) {
     return taken;
 }
 
-/* Allocate room for all datagrams that may wait, for one more, and for gaps, so that one of the free pieces can hold
- * another one. */
+/* Allocate enough that a datagram fits into one of the free pieces even while all that may wait, and one more, are in the
+ * lane. */
 static bool lane_open(struct lane *lane, int64_t bytes, int64_t datagrams) {
     lane->capacity = (size_t)bytes + (size_t)datagrams * (sizeof(struct waiting_datagram) + 8) + 4 * LONGEST_WAITING;
     lane->bytes = malloc(lane->capacity);

@@ -86,7 +86,7 @@ static uint32_t record_at(struct ring *ring, uint64_t taken) {
     return size >= WORD && size % WORD == 0 && size <= ring->capacity ? size : 0;
 }
 
-/* Whether nothing was dropped since `taken` was read: then everything read of the record since is valid. */
+/* Whether nothing was dropped since `taken` was read: then everything that was read of the record is valid. */
 static bool is_oldest(struct ring *ring, uint64_t taken) {
     atomic_thread_fence(memory_order_acquire);
     return atomic_load_explicit(&ring->taken, memory_order_relaxed) == taken;

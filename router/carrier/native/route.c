@@ -105,7 +105,7 @@ static const struct payload_case *find_case(const struct program *program, uint3
     return &program->cases[low]; /* envelope_read returns no other number */
 }
 
-/* Return ROUTED, or the reason for rejecting the datagram. */
+/* Route a datagram. Return ROUTED, or the reason for rejecting it. */
 static int route(struct routing *routing, const struct payload_case *found, struct received *received) {
     const struct program *program = routing->program;
     const struct listener *listener = received->listener;

@@ -121,7 +121,7 @@ int sender_take_refused(struct sender *sender) {
 
 /* ---- sending ---- */
 
-/* Return 0 or an errno. */
+/* Send a datagram. Return 0 or an errno. */
 static int send_once(struct sender *sender, const void *data, size_t size) {
     int fd = atomic_load_explicit(&sender->fd, memory_order_relaxed);
     const struct sockaddr *to = (const struct sockaddr *)&sender->address;

@@ -79,7 +79,7 @@ static inline void strip(struct value *text) {
     for (; text->size && is_padding(*text->bytes); text->bytes++) text->size--;
 }
 
-/* Convert a list of integers to bytes. Records a refusal. */
+/* Convert a list of integers to bytes. If that fails, record the refusal and return false. */
 static inline bool to_octets(struct machine *machine, struct value *list, enum scalar stored) {
     if (stored == SCALAR_UINT8) return true;
     struct value octets = text_of(take_text(machine, list->size), list->size);

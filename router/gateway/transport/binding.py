@@ -34,7 +34,7 @@ class Binding:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Raises StartError, except if no network interface has the address yet: then retries in the background."""
+        """Attempt now; if no network interface has the address yet, in the background. Otherwise raises StartError."""
         try:
             await self._attempt()
         except OSError as error:

@@ -21,7 +21,8 @@ PIECE = 64 * 1024
 """Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""
 
 UNSENT = 128 * 1024
-"""Bytes that the kernel keeps unsent for a client. Values that wait here can still be replaced by newer ones."""
+"""Bytes that the kernel keeps unsent for a client. Newer values can still replace those that wait in the router.
+"""
 
 STALLED_SECONDS = 60.0
 """The kernel closes the connection of a client that acknowledges or reads nothing for this long."""

@@ -48,14 +48,14 @@ CONNECTIONS_SECONDS = 1.0
 """The interval of checks of connections."""
 
 MOST_OTHERS = 100
-"""The most other owners of its key that a gateway remembers."""
+"""Maximum other owners of its key that a gateway remembers."""
 
 MOST_RECEIVED = 1000
 MOST_RECEIVED_BYTES = 64 << 20
-"""The most samples, and bytes, in the queue to the loop; others are rejected."""
+"""Maximum samples, and their bytes, in the queue to the loop; others are rejected."""
 
 MOST_QUERIES = 100
-"""The most pending queries; each answer may be large."""
+"""Maximum pending queries; each answer may be large."""
 
 LARGE = 64 * 1024
 """Bytes above which a put can take long."""
@@ -122,14 +122,14 @@ class ZenohTransport:
     # -- the session ---------------------------------------------------------------------------------------------
 
     async def _connect(self, config: zenoh.Config) -> None:
-        """Raises ZError."""
+        """Open the session, and start the tasks that use it. Raises ZError."""
         self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
         if self._session is not None:
             for task in (self._mind_key, self._mind_connections):
                 self._tasks.append(self._loop.create_task(task(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
-        """Runs in the session's thread. Raises ZError. Returns None if the transport was closed meanwhile."""
+        """Open a session, in its thread; return None if the transport was closed meanwhile. Raises ZError."""
         session = zenoh.open(config)
         if self._is_closed:
             session.close()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it
@@ -273,7 +273,7 @@ class ZenohTransport:
             self._client = None
 
     def _release(self) -> None:
-        """Runs in the session's thread. Raises ZError."""
+        """Undeclare everything, the token last, in the session's thread. Raises ZError."""
         while self._declared:
             self._declared.pop().undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it; the token last
 
@@ -320,7 +320,7 @@ class Inbox:
         self._clock.stop()
 
     def on_sample(self, sample: zenoh.Sample) -> None:
-        """Runs in Zenoh's thread."""
+        """Queue a sample, or reject it if there is no room. Runs in Zenoh's thread."""
         if sample.kind != zenoh.SampleKind.PUT:  # not `is`: each is a new object
             return
         size = len(sample.payload)
@@ -360,7 +360,7 @@ class Queries:
         self._waiting: deque[zenoh.Query] = deque()
 
     def on_query(self, query: zenoh.Query) -> None:
-        """Runs in Zenoh's thread."""
+        """Queue a query, or reject it if too many are pending. Runs in Zenoh's thread."""
         if len(self._waiting) >= MOST_QUERIES:
             with query:
                 query.reply_err("too many pending queries: try again")
@@ -488,7 +488,7 @@ class Putter:
                 self._failed_large.append(error)
 
     def _put(self, key: str, data: bytes, *, is_large: bool) -> None:
-        """Raises ZError."""
+        """Put a value under a key. Raises ZError."""
         publisher = self._publishers.get((key, is_large))
         if publisher is None:
             priority = zenoh.Priority.DATA_LOW if is_large else zenoh.Priority.DATA

@@ -32,7 +32,7 @@ _TEMPORARY = "Unable to connect|timeout|os error (?:19|99|100|101|110|113)\\b"
 """Errors that end when others, or a network interface, appear."""
 
 _LONGEST = 64
-"""The most characters of a host name that are shown."""
+"""Maximum characters shown of a host name."""
 
 
 def session_config(settings: ZenohSettings) -> zenoh.Config:
