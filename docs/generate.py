@@ -166,7 +166,8 @@ def findings_page() -> str:
         mistake = next(sections(page))
         kind, text = good(page)
         lines += ["", f"## {code.value}", "", code.meaning, "", "```text", first_finding(mistake), "```", ""]
-        lines += ["Write instead:", "", f"```{kind}", text.removeprefix("extends: base/base.yaml\n").strip(), "```"]
+        correct = text.removeprefix("extends: base/base.yaml\n").strip() or text.strip()
+        lines += ["Write instead:", "", f"```{kind}", correct, "```"]
     return "\n".join([*lines, ""])
 
 

@@ -185,7 +185,15 @@ def _result(node: tree.Call, arguments: Sequence[Any]) -> Any:
         case "sum":
             return _sum(value, node.kind)
         case name:
-            return FUNCTIONS[name].implementation(*arguments)
+            return _called(name, arguments)
+
+
+def _called(name: str, arguments: Sequence[Any]) -> Any:
+    try:
+        return FUNCTIONS[name].implementation(*arguments)
+    except (ArithmeticError, ValueError) as error:
+        given = ", ".join(map(repr, arguments))
+        raise MappingError(f"{name}({given}) has no value") from error
 
 
 def _of_size(value: str | bytes, most: int) -> str | bytes:

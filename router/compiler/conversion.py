@@ -148,7 +148,7 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
             raise
         if isinstance(target, MessageType):
             both = f"{element.kind} and {target}"
-            hint = f"elements are filled by field name: {both} need fields of the same name and type"
+            hint = f"give {both} fields of the same name and type: elements are filled by name"
         else:
             hint = "write the elements one by one, as in [x[0].y, x[1].y]"
         raise ExpressionError(found.span, found.code, f"list element: {found.message}", hint) from error
@@ -190,20 +190,20 @@ def _want_finite(value: tree.Node, target: Type) -> None:
     """Raise ExpressionError if `nan` or `inf` would fill a field that is not a float."""
     literal = tree.constant_of(value)
     if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
-        hint = f"text needs its own quotes: \"'{literal}'\"" if isinstance(target, String) else ""
+        hint = f"for text, write {{text: {literal}}}" if isinstance(target, String) else ""
         message = f"cannot assign {literal} to {target}"
         raise ExpressionError(
-            value.span, Code.TYPE_MISMATCH, message, hint or "only a float field can hold it: write a value"
+            value.span, Code.TYPE_MISMATCH, message, hint or f"write a finite value: only a float field holds {literal}"
         )
 
 
-_OF_LIST = "; min(x), max(x), sum(x) and len(x) turn a list into a number"
+_OF_LIST = ", or min(x), max(x), sum(x) or len(x)"
 
 
 def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
     """Return the error for a value whose kind cannot fill the type."""
     if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
-        hint = hint or "x[0] is one element" + _OF_LIST * isinstance(target, (Int, Float))
+        hint = hint or "write x[0] for one element" + _OF_LIST * isinstance(target, (Int, Float))
     if not isinstance(target, (List, MessageType)):
         hint = hint or fields_hint(value.kind)
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"cannot assign {value.kind} to {target}", hint)
@@ -254,7 +254,7 @@ def _fit(value: tree.Node, kind: IntKind, limits: IntKind) -> tree.Node:
         return value
     what = f"{value.kind} does not fit {limits}"
     if kind.high < limits.low or kind.low > limits.high:
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, what, f"its range is {limits.low}..{limits.high}")
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, what, f"write a value from {limits.low} to {limits.high}")
     if kind.is_rounded:
         return fitted(value, limits)
     raise ExpressionError(value.span, Code.LOSSY_CONVERSION, what, "limit it with clamp() or wrap()")

@@ -79,7 +79,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if not route.destinations:
         if route.topics:
             message = f"'{route.case.value}' has no destinations, so there are no commands to watch"
-            lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "use a deadman only in a route with destinations")
+            lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "remove the deadman, or add destinations")
         return
     rates = [destination.max_rate for destination in feeding(route, deadman)]
     limited = [rate for rate in rates if rate is not None]
@@ -241,7 +241,8 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: Payload
         bounds = board.fields.get(case.number)
         for field, value in scalars(payload, bounds.message or {}) if bounds else ():
             if misfit := board.misfit(field, value):
-                hint = f"set `allow_non_finite: true` for '{name}'" if isinstance(value, float) else ""
+                allow = f"set `allow_non_finite: true` for '{name}' if its firmware handles {value}"
+                hint = f"send a finite number, or {allow}" if isinstance(value, float) else ""
                 lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board rejects this: {misfit}", hint)
                 return True
     return False

@@ -213,7 +213,9 @@ class _Builder:
 
     def _twice(self, entry: FieldEntry) -> None:
         path = ".".join(entry.path)
-        self.findings.append(Diagnostic(entry.path_spans[-1], Code.DUPLICATE_FIELD, f"'{path}' is filled twice"))
+        self.findings.append(
+            Diagnostic(entry.path_spans[-1], Code.DUPLICATE_FIELD, f"'{path}' is filled twice", "remove one of the two")
+        )
 
     # plans
 

@@ -128,9 +128,9 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
     host = one.address.value.host
     if one.source_port is None or other.source_port is None:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host}"
-        hint = "endpoints are recognised by address: correct it, or give both a 'source_port'"
+        hint = "correct the address, or give each endpoint its own 'source_port'"
         if one.listener or other.listener:
-            hint += ", or a 'listener' each"
+            hint += " or 'listener'"
         return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
     if one.source_port.value == other.source_port.value:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host} and the source port"
@@ -148,9 +148,8 @@ def loop_finding(
     for listener in table.listeners.values():
         if _reaches(endpoint.address.value, listener.address.value):
             message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
-            return Diagnostic(
-                span, Code.FORWARDING_LOOP, message, "the router would receive its own datagrams in an endless loop"
-            )
+            hint = "remove it, or correct its address: datagrams would return to the router in an endless loop"
+            return Diagnostic(span, Code.FORWARDING_LOOP, message, hint)
     return None
 
 

@@ -29,7 +29,8 @@ class Address(NamedTuple):
 
 
 _EXAMPLE = "write an IPv4 address and a port, such as 192.168.0.30:8"
-_NO_MULTICAST = "broadcast and multicast are not supported"
+_NO_MULTICAST = "write the address of one machine: broadcast and multicast are not supported"
+_NO_LOCAL_MULTICAST = "write an address of this machine, or 0.0.0.0 for all of them"
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
 LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
@@ -77,7 +78,7 @@ def parse_local(text: str) -> Address:
     """Parse an address of this machine, or 0.0.0.0 for all of them. Raises BadAddressError."""
     address = parse_address(text)
     if _first(address) >= 224:
-        raise BadAddressError(f"{address.host} cannot be an address of this machine", _NO_MULTICAST)
+        raise BadAddressError(f"{address.host} cannot be an address of this machine", _NO_LOCAL_MULTICAST)
     return address
 
 
@@ -100,7 +101,8 @@ def _is_octet(text: str) -> bool:
 
 def _bad_host(host: str) -> BadAddressError:
     if not _NUMBERS.fullmatch(host):
-        hint = "addresses are IPv4 literals such as 192.168.0.30; host names are not resolved"
+        example = "127.0.0.1" if host == "localhost" else "an IPv4 address such as 192.168.0.30"
+        hint = f"write {example}: host names are not resolved"
         return BadAddressError(f"'{host}' is not an IPv4 address", hint)
     parts = host.split(".")
     if len(parts) != 4:

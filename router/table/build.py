@@ -493,7 +493,8 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
         what = f"'{written.value}' cannot be read: {why}"
-        hint = f"looked for {shown_path(path)}" if isinstance(error, FileNotFoundError) else ""
+        place = f"correct the path: it leads to {shown_path(path)}"
+        hint = place if isinstance(error, FileNotFoundError) else ""
         raise InvalidValueError(written.span, Code.BAD_FILE, what, hint) from error
 
 

@@ -105,7 +105,9 @@ class _Composer:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
             problem = "is inside the value that it repeats" if recursive else "has no anchor"
             what = f"the alias '*{event.anchor}' {problem}"
-            raise self._fatal(self._span(event), what, "" if recursive else "quote text that begins with '*'")
+            raise self._fatal(
+                self._span(event), what, "write out the value" if recursive else "quote text that begins with '*'"
+            )
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
 
@@ -134,7 +136,7 @@ class _Composer:
             broken |= bool(problems)
             place = TextPlace(span)
         if unusable := unusable_character(text):
-            broken |= self._report(span, f"the text contains the character {unusable[1]}", "")
+            broken |= self._report(span, f"the text contains the character {unusable[1]}", "remove it")
         if not event.style and text[-1:] == "," and " " not in text and self._open_bracket() is None:
             broken |= self._report(
                 span, f"'{text}' ends with a ','", "remove it: ',' separates values only inside brackets"

@@ -20,7 +20,7 @@ from router.table.hints import as_variable
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.reading import is_choice
-from router.table.source import Source, read_source
+from router.table.source import UNREADABLE, Source, read_source
 
 KEY = "extends"
 IGNORE = "ignore"
@@ -103,7 +103,7 @@ def _takes_topics(route: MappingNode) -> bool:
 def _root_mapping(root: Node) -> MappingNode:
     if isinstance(root, MappingNode):
         return root
-    what = "a route table is a mapping of keys such as 'version', 'listen' and 'routes'"
+    what = "a route table must be a mapping with keys such as 'version', 'listen' and 'routes'"
     raise TableError.of(root.span, Code.WRONG_TYPE, what)
 
 
@@ -128,9 +128,9 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         found = error.diagnostics[0]
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file exists, but something in it is wrong
-        what = f"'{reference.text}' cannot be extended: {found.message}"
-        looked = f"looked for {shown_path(Path(inputs.real_path(path)))}"
-        hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or looked
+        what = f"'{reference.text}' cannot be extended: {found.message.removeprefix(UNREADABLE)}"
+        place = f"correct the path: it leads to {shown_path(Path(inputs.real_path(path)))}"
+        hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or place
         raise TableError.of(reference.span, Code.BAD_EXTENDS, what, hint) from error
 
 
@@ -138,4 +138,4 @@ def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:
     if (real := inputs.real_path(path)) in seen:
         names = " -> ".join(shown_path(Path(step)) for step in (*seen[seen.index(real) :], real))
         what = f"'{reference.text}' extends itself: {names}"
-        raise TableError.of(reference.span, Code.BAD_EXTENDS, what)
+        raise TableError.of(reference.span, Code.BAD_EXTENDS, what, f"remove '{KEY}' from one of these tables")

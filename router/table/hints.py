@@ -159,8 +159,8 @@ def _owners(name: str, path: Path) -> str:
         for owner, schema in definitions.items()
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
-    owners += ["the table itself"] if name in keys_of(table_schema()) else []
-    return f"it belongs in: {', '.join(owners)}" if owners else ""
+    owners += ["the top level"] if name in keys_of(table_schema()) else []
+    return f"move it to: {', '.join(owners)}" if owners else ""
 
 
 def for_value(error: SchemaError) -> str:

@@ -206,7 +206,7 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
         return _Advice(f"a '{character}' is not allowed inside a word here", "quote text that contains brackets")
     if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
-        return _ADVICE[problem]._replace(hint=f"parsing stops at line {line + 1}")
+        return _ADVICE[problem]._replace(hint=f"add what is missing before line {line + 1}")
     if character == ":" and (advice := _colon(problem, before, written[column + 1 :])):
         return advice
     begun = start.column if start and start.line == line else column

@@ -38,12 +38,13 @@ _NAMED_PARTS = {
 """Mappings whose keys are names, and the noun for an entry with its article."""
 _HINTS_FOR_MISSING = {
     "source": "name who sends it: an endpoint, or {topic: NAME} for ROS; or write 'ignore: why'",
+    "kind": "add `kind: board`, `kind: basestation` or `kind: tool`",
     "transport": "add it, or write 'ignore: why'",
     "version": "start with 'version: 1'",
     "receive": "add the local address that receives what its client publishes",
 }
 _BELONG_TOGETHER = ("envelope", "listen", "routes")
-_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with only 'gateways' needs none of them"
+_HINT_FOR_WHOLE = "write 'envelope', 'listen' and 'routes'; or, for a table without datagrams, only 'gateways'"
 
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
@@ -293,8 +294,10 @@ def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
 def _repeated(error: SchemaError, tree: Node) -> Diagnostic:
     items = error.value if isinstance(error.value, list) else []
     index = next(index for index, item in enumerate(items) if item in items[:index])
-    what = f"{subject(error.path)} contains {shown(items[index])} twice"
-    return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what)
+    item = items[index]
+    written = f"'{_clipped(item)}'" if isinstance(item, str) else shown(item)
+    what = f"{subject(error.path)} contains {written} twice"
+    return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what, "remove one of the two")
 
 
 def _blamed(tree: Node, path: Path) -> SourceSpan:

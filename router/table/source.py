@@ -16,6 +16,7 @@ from router.assets import asset, is_installed
 from router.errors import Code, SourceSpan, TableError, nearest, nearest_path, shown_path
 
 MAX_BYTES = 4 << 20
+UNREADABLE = "the file cannot be read: "
 _LINE_END = re.compile(r"\r\n|\r|\n")
 _UNUSABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\ud800-\udfff\ufffe\uffff]")
 
@@ -85,7 +86,7 @@ def _read(path: Path, file: str) -> bytes:
                 return data
             what = f"the file is larger than {MAX_BYTES >> 20} MiB"
     except OSError as error:
-        what = f"the file cannot be read: {(error.strerror or str(error)).lower()}"
+        what = f"{UNREADABLE}{(error.strerror or str(error)).lower()}"
         if isinstance(error, FileNotFoundError) and (near := nearest_path(path)):
             hint = f"did you mean '{shown_path(near)}'?"
         elif isinstance(error, FileNotFoundError) and not path.is_absolute():
@@ -93,7 +94,7 @@ def _read(path: Path, file: str) -> bytes:
             if is_installed(asset("routes")):
                 hint += "; `router init` writes example tables there"
     except ValueError as error:  # a path that no file system accepts: NUL, half a surrogate pair
-        what = f"the file cannot be read: {error}"
+        what = f"{UNREADABLE}{error}"
     raise TableError.of(SourceSpan(file), Code.BAD_FILE, what, hint)
 
 

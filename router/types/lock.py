@@ -156,7 +156,7 @@ class LockComparison:
                 self._refuse_holder(owner, holders[0], entry)
             elif any(first <= entry.number <= last for first, last in locked.reserved):
                 message = f"number {entry.number} of {owner} is reserved, but used for '{entry.name}'"
-                hint = "the lock says that it is reserved: use a free number"
+                hint = "use a free number: the lock says that this one is reserved"
                 self._refuse(owner, entry.name, self._span(owner, entry, Part.NUMBER), message, hint)
             else:
                 self._add(self._schema.span(owner, entry.name), f"{owner}.{entry.name} is not in the lock")
@@ -165,7 +165,7 @@ class LockComparison:
             if entry.number not in numbers and entry.name not in moved:
                 number = entry.number
                 message = f"number {number} of {owner}, formerly '{entry.name}', is not reserved"
-                hint = f"the lock says {_shown(entry)}; write `reserved {number};` there"
+                hint = f"write `reserved {number};` there: the lock has {_shown(entry)}"
                 self._refuse(owner, entry.name, self._schema.span(owner), message, hint, {entry})
 
     def _compare_types(self, owner: str, old: Entry, new: Entry) -> None:
@@ -175,9 +175,10 @@ class LockComparison:
         if new.type != old.type:
             differences.append(f"is of type {new.type} instead of {old.type}")
         if new.oneof != old.oneof:
-            differences.append(f"is {_place(new)} instead of {_place(old)}")
+            differences.append(_move(old.oneof, new.oneof))
         message = f"{owner}.{new.name} {' and '.join(differences)}"
-        hint = f"the lock says {_shown(old)}; to change it, reserve {old.number} and add a field"
+        back = _restore(old) if new.type != old.type else "move it back"
+        hint = f"{back}, or reserve {old.number} and add a field with a free number"
         part = Part.TYPE if new.type != old.type else Part.NAME
         self._refuse(owner, new.name, self._span(owner, new, part), message, hint, {old})
 
@@ -186,9 +187,9 @@ class LockComparison:
         message = f"{owner}.{new.name} has number {new.number} instead of {old.number}"
         if new.type != old.type:
             message += f" and is of type {new.type} instead of {old.type}"
-        hint = f"the lock says {_shown(old)}"
+        hint = _restore(old)
         if holders:
-            hint = f"{new.number} belongs to '{holders[0].name}'; {hint}"
+            hint += f": {new.number} belongs to '{holders[0].name}'"
         span = self._span(owner, new, Part.NUMBER)
         self._refuse(owner, new.name, span, message, hint, {*holders, *olds})
 
@@ -197,7 +198,7 @@ class LockComparison:
         if holder.type != new.type:
             was, now = (f"'{each.type} {each.name}'" for each in (holder, new))
         message = f"number {new.number} of {owner} belongs to {was}, not to {now}"
-        hint = f"the lock says {_shown(holder)}; keep that name, or reserve the number and use a free one"
+        hint = f"{_restore(holder)}, or reserve {new.number} and use a free number"
         self._refuse(owner, new.name, self._span(owner, new, Part.NUMBER), message, hint, {holder})
 
     def _span(self, owner: str, entry: Entry, part: Part) -> SourceSpan:
@@ -207,7 +208,7 @@ class LockComparison:
         self, owner: str, member: str, span: SourceSpan, message: str, hint: str, entries: Iterable[Entry] = ()
     ) -> None:
         name = f"{owner}.{member}"
-        hint += f"; if it is intended, run `{self._command} --accept {name}`"
+        hint += f"; if the change is intended, run `{self._command} --accept {name}`"
         finding = Diagnostic(span, Code.WIRE_NUMBER_CONFLICT, message, hint)
         self.conflicts.append(Conflict(name, owner, finding, frozenset(entries)))
 
@@ -219,8 +220,15 @@ def _names(declared: Declaration) -> set[tuple[int, str]]:
     return {(entry.number, entry.name) for entry in declared.entries}
 
 
-def _place(entry: Entry) -> str:
-    return f"in the oneof '{entry.oneof}'" if entry.oneof else "in no oneof"
+def _move(old: str, new: str) -> str:
+    """Describe how a field moved between oneofs; an empty name is no oneof."""
+    if old and new:
+        return f"has moved from the oneof '{old}' to '{new}'"
+    return f"has moved into the oneof '{new}'" if new else f"has moved out of the oneof '{old}'"
+
+
+def _restore(old: Entry) -> str:
+    return f"restore {_shown(old).replace('enum ', '')} from the lock"
 
 
 def _shown(entry: Entry) -> str:

@@ -35,6 +35,7 @@ _NO_LABEL = re.compile(r'Expected "required", "optional", or "repeated"')
 _NOT_DEFINED = re.compile(r'^"(?P<name>[\w.]+)" is not defined\.')
 _NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
 _NOT_A_TYPE = re.compile(r'^"(?P<name>[\w.]+)" is not a type')
+_SCALARS = ("bool", "float", "double", "int32", "int64", "uint32", "uint64", "string", "bytes")
 _MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
 
 
@@ -58,7 +59,7 @@ def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnos
     for first, *more in places.values():
         finding = _finding(first, folder.protos, texts[first.file])
         # Further messages about the same position are advice, or repetitions.
-        advice = [other.message.rstrip(".") for other in more if other.message != first.message]
+        advice = [_advice(other.message.rstrip(".")) for other in more if other.message != first.message]
         findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
     return list(_once(findings))
 
@@ -117,7 +118,18 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
         hint = 'write `optional` before the type, or declare `syntax = "proto3";` if the file is proto3'
         return Diagnostic(span, Code.BAD_PROTO, complaint.message.rstrip("."), hint)
     what, *advice = _SENTENCE_END.split(complaint.message, maxsplit=1)
-    return Diagnostic(span, _code(complaint, text), what.rstrip("."), "".join(advice).rstrip("."))
+    return Diagnostic(span, _code(complaint, text), what.rstrip("."), _advice("".join(advice).rstrip(".")))
+
+
+def _advice(sentence: str) -> str:
+    """Return protoc's advice as an imperative, if it is known."""
+    if free := re.fullmatch(r"Next available field number is (\d+)", sentence):
+        return f"use {free[1]}, the next free number"
+    if alias := re.search(r"allow_alias.*next available enum value is (\d+)", sentence):
+        return f"use {alias[1]}, the next free number, or write `option allow_alias = true;` in the enum"
+    if sentence.startswith("Note that enum values use C++ scoping rules"):
+        return "rename the value: enums beside each other need different names for their values"
+    return sentence
 
 
 def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
@@ -135,13 +147,14 @@ def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     """Return a hint with the files that declare a type that is not defined where it is used."""
     found = declaring(name, files)
     if not found:
-        close = nearest(name, [known for content in files.values() for known in scan(content).names])
+        names = [known for content in files.values() for known in scan(content).names]
+        close = nearest(name, [*names, *_SCALARS])
         return f"did you mean '{close}'?" if close else ""
     imported = scan(files.get(user, b"")).imports
     parts = []
     for file, full in found:
         declared = f"{file} declares it" if full == name else f"{file} declares {full}"
-        parts.append(declared if file in imported else f'{declared}: `import "{file}";` is missing')
+        parts.append(declared if file in imported else f'add `import "{file}";`: {declared}')
     return "; ".join(parts)
 
 

@@ -100,7 +100,7 @@ def test_variables_are_filled_in_the_path(base: Path) -> None:
         ("extends:\n", Code.WRONG_TYPE, "path of another table"),
         ("extends: ${NOPE}\n", Code.UNDEFINED_VARIABLE, "not set"),
         (f"extends: {'x' * 300}\n", Code.BAD_EXTENDS, "too long"),
-        ("extends: list.yaml\n", Code.WRONG_TYPE, "mapping of keys"),
+        ("extends: list.yaml\n", Code.WRONG_TYPE, "mapping with keys"),
         ("extends: torn.yaml\n", Code.BAD_YAML, "never closed"),
         ("extends: latin.yaml\n", Code.BAD_FILE, "UTF-8"),
     ],

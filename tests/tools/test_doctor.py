@@ -354,7 +354,8 @@ def test_a_broadcast_address_is_a_problem(table: Path) -> None:
     rewritten(table, "127.0.0.30:8", "127.255.255.255:8")
     [found] = before_start(table, {})
     text = "sensor_board: 127.255.255.255 is not the address of a single machine"
-    assert found == (Grade.PROBLEM, "endpoints", text, "broadcast and multicast are not supported")
+    hint = "write the address of one machine: broadcast and multicast are not supported"
+    assert found == (Grade.PROBLEM, "endpoints", text, hint)
 
 
 def test_who_answers_a_ping() -> None:

@@ -81,22 +81,22 @@ def said(findings: Sequence[Diagnostic]) -> list[str]:
         pytest.param(
             "State state = 2", "repeated State state = 2",
             "motor.proto:10:12: error[wire-number-conflict]: Motor.state is of type repeated enum State instead of "
-            "enum State; the lock says `enum State state = 2`; to change it, reserve 2 and add a field; "
-            "if it is intended, run `router schema lock --protos . --accept Motor.state`",
+            "enum State; restore `State state = 2` from the lock, or reserve 2 and add a field with a free number; "
+            "if the change is intended, run `router schema lock --protos . --accept Motor.state`",
             id="repeated",
         ),
         pytest.param(
             "float rpm = 1", "float speed = 1",
             "motor.proto:9:17: error[wire-number-conflict]: number 1 of Motor belongs to 'rpm', not to 'speed'; "
-            "the lock says `float rpm = 1`; keep that name, or reserve the number and use a free one; "
-            "if it is intended, run `router schema lock --protos . --accept Motor.speed`",
+            "restore `float rpm = 1` from the lock, or reserve 1 and use a free number; "
+            "if the change is intended, run `router schema lock --protos . --accept Motor.speed`",
             id="renamed",
         ),
         pytest.param(
             "  BUSY = 1;\n", "",
             "motor.proto:3:6: error[wire-number-conflict]: number 1 of State, formerly 'BUSY', is not reserved; "
-            "the lock says `BUSY = 1`; write `reserved 1;` there; "
-            "if it is intended, run `router schema lock --protos . --accept State.BUSY`",
+            "write `reserved 1;` there: the lock has `BUSY = 1`; "
+            "if the change is intended, run `router schema lock --protos . --accept State.BUSY`",
             id="enum value removed",
         ),
     ],
@@ -170,7 +170,7 @@ def test_enums_of_one_name_are_not_taken_for_each_other(record: Record, compare:
 
 def test_oneof_that_is_called_as_protoc_calls_its_own_is_a_oneof(changed: Callable[..., list[Diagnostic]]) -> None:
     findings = changed("float rpm = 1;", "oneof _rpm { float rpm = 1; }")
-    assert [found.message for found in findings] == ["Motor.rpm is in the oneof '_rpm' instead of in no oneof"]
+    assert [found.message for found in findings] == ["Motor.rpm has moved into the oneof '_rpm'"]
 
 
 PACKAGE = ('syntax = "proto3";', 'syntax = "proto3";\npackage rover;')
@@ -219,23 +219,23 @@ message Envelope { oneof payload { Motor motor = 1; } }
         ),
         (
             "oneof a { bool x = 1; bool y = 2; }", "oneof b { bool x = 1; } oneof c { bool y = 2; }",
-            ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
+            ["error Motor.y has moved from the oneof 'b' to 'c'",
              "warning the lock records Motor.b under its old name Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof c { bool x = 1; bool y = 2; }",
-            ["error Motor.y is in the oneof 'c' instead of in the oneof 'b'",
+            ["error Motor.y has moved from the oneof 'b' to 'c'",
              "warning the lock records Motor.c under its old name Motor.a"],
         ),
         (
             "oneof a { bool x = 1; } oneof b { bool y = 2; }", "oneof b { bool x = 1; } oneof a { bool y = 2; }",
-            ["error Motor.x is in the oneof 'b' instead of in the oneof 'a'",
-             "error Motor.y is in the oneof 'a' instead of in the oneof 'b'"],
+            ["error Motor.x has moved from the oneof 'a' to 'b'",
+             "error Motor.y has moved from the oneof 'b' to 'a'"],
         ),
         (
             "oneof a { bool x = 1; } bool y = 2;", "bool x = 1; oneof a { bool y = 2; bool z = 3; }",
-            ["error Motor.x is in no oneof instead of in the oneof 'a'",
-             "error Motor.y is in the oneof 'a' instead of in no oneof",
+            ["error Motor.x has moved out of the oneof 'a'",
+             "error Motor.y has moved into the oneof 'a'",
              "warning Motor.z is not in the lock"],
         ),
         ("bool x = 1;", "optional bool x = 1;", []),  # which protoc makes a oneof of

@@ -61,8 +61,8 @@ def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch:
         ),
         pytest.param(
             "enum E {\n  X = 0;\n  Y = 0;\n}",
-            'a.proto:4:7: error[wire-number-conflict]: "Y" uses the same enum value as "X"; If this is intended, '
-            "set 'option allow_alias = true;' to the enum definition. The next available enum value is 1",
+            'a.proto:4:7: error[wire-number-conflict]: "Y" uses the same enum value as "X"; '
+            "use 1, the next free number, or write `option allow_alias = true;` in the enum",
             id="enum value used twice",
         ),
         pytest.param(
@@ -78,7 +78,7 @@ def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch:
         pytest.param(
             "message A {\n\tint32 x = 1;\n\t/* gr\u00f6\u00dfe */ int32 y = 1;\n}",
             'a.proto:4:24: error[wire-number-conflict]: Field number 1 has already been used in "A" by field "x"; '
-            "Next available field number is 2",
+            "use 2, the next free number",
             id="column after tabs and other scripts",
         ),
     ],

@@ -127,7 +127,6 @@ def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
 
 def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
     """Reject a map without `else` that does not cover all values, or whose subject has no list of values."""
-    hint = "list them, or add `else: VALUE`"
     covered = {constant_of(key) for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
         return
@@ -135,11 +134,12 @@ def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scop
         return
     if not isinstance(subject.kind, EnumKind):
         message = f"the map does not cover all values of {subject.kind}"
-        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
+        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, "add `else: VALUE`")
     missing = [name for name, number in subject.kind.enum.values if number not in covered]
     if missing:
         names = ", ".join(missing)
-        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, f"the map has no value for {names}", hint)
+        message, hint = f"the map has no value for {names}", "add them, or `else: VALUE`"
+        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
 
 
 def _element(expected: Type | None) -> Type | None:

@@ -110,7 +110,7 @@ def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) 
         span,
         Code.UNKNOWN_FIELD,
         message,
-        hint or f"a deadman sends constants, such as {example}, and cannot read a message",
+        hint or f"write a constant such as {example}: a deadman has no message to read",
     )
 
 
@@ -179,16 +179,16 @@ def is_null(node: ast.expr, scope: Scope) -> bool:
 
 def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -> ExpressionError:
     """Return the error for a comparison of `written` with null."""
-    hint = f"'{written}' is always present"
+    hint = f"remove the comparison: '{written}' is always present"
     if isinstance(compared, Read) and compared.field.has_presence:
         hint = f"write `{'not ' * is_equal}has({written})`"
     elif not isinstance(compared.kind, MessageKind):
-        hint += ": an omitted field has its default"
+        hint = f"compare '{written}' with its default, which it has if the sender omits it"
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, "expressions have no null", hint)
 
 
 _OF_OTHERS = {
-    ListKind: "only messages have fields: name an element, as in x[0].y",
+    ListKind: "name an element, as in x[0].y: only messages have fields",
     TimeKind: "convert a time with seconds(x)",
 }
 
@@ -197,7 +197,9 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     """Resolve `holder.name`."""
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
-        hint = _of_elements(holder.kind, node) or _OF_OTHERS.get(type(holder.kind), "only messages have fields")
+        hint = _of_elements(holder.kind, node) or _OF_OTHERS.get(
+            type(holder.kind), f"remove '.{node.attr}': only messages have fields"
+        )
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:

@@ -79,7 +79,7 @@ def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False)
     kind, is_checked = within_64_bits(found, is_rounded)
     if kind is None or (is_checked and min(found) == max(found)):
         message = "this integer never fits 64 bits"
-        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"integers range from {INT64.low} to {UINT64.high}")
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"write an integer from {INT64.low} to {UINT64.high}")
     return kind, is_checked
 
 
@@ -268,7 +268,7 @@ def _comparison_hint(left: Node, right: Node) -> str:
     if any(isinstance(kind, MessageKind) for kind in kinds):
         return "compare its fields"
     if any(isinstance(kind, TimeKind) for kind in kinds):
-        return "compare seconds(x), or two times: time_from_seconds(x) makes one"
+        return "compare seconds(x), or convert the other side with time_from_seconds(x)"
     if any(map(is_list, kinds)):
         return _OF_LISTS
     return _comparable_value(left, right) or _comparable_value(right, left)

@@ -7,7 +7,9 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 CONDITIONAL = "write `b if a else c`"
-LEFT_OUT = "has(x) tells whether a field is set; an omitted field keeps its default; `when` withholds a message"
+LEFT_OUT = (
+    "to keep a default, omit the field; to test whether a field is set, write has(x); to withhold a message, use `when`"
+)
 ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "convert it with round(x), trunc(x), floor(x) or ceil(x)"
 WRAPPED = "convert it with round(x), or wrap a float with x % 360"

@@ -163,20 +163,18 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{word} is not part of the language", hint)
 
 
+_WITHOUT_LOOP = "calculate with the whole list, as in x * 2, or write the elements one by one, as in [x[0].y, x[1].y]"
 _HINTS: dict[type[ast.AST], str] = {
-    ast.Constant: f"literals are numbers, strings, True and False; {spellings.LEFT_OUT}",
+    ast.Constant: f"write a number, a string, True or False; {spellings.LEFT_OUT}",
     ast.BitXor: spellings.SQUARE,
     ast.LShift: spellings.SHIFT,
     ast.RShift: spellings.SHIFT,
     ast.BitAnd: spellings.BITS.format("and"),
     ast.BitOr: spellings.BITS.format("or"),
     ast.Invert: spellings.BITS.format("not"),
-    ast.Lambda: "expressions have no lambda",
-    ast.ListComp: "expressions have no loops",
-    ast.GeneratorExp: "expressions have no loops",
-    ast.SetComp: "expressions have no loops",
-    ast.DictComp: "expressions have no loops",
-    ast.NamedExpr: "expressions cannot assign",
+    ast.Lambda: "write its body alone",
+    **dict.fromkeys((ast.ListComp, ast.GeneratorExp, ast.SetComp, ast.DictComp), _WITHOUT_LOOP),
+    ast.NamedExpr: "write the value alone: expressions cannot assign",
     ast.JoinedStr: "join strings with +, str() and text()",
     ast.Tuple: "remove the ',', or write a list, [a, b]; write decimal numbers with a point, 9.81",
     ast.Is: "use ==",
