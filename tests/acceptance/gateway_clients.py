@@ -76,6 +76,13 @@ class Headset:
                     return data
         raise AssertionError("it never came")
 
+    def catch_up(self) -> None:
+        """Take what has arrived and was not read."""
+        self._opened.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                self.next()
+
     def wait_for_silence(self, topic: str, seconds: float) -> None:
         """Wait until no value of `topic` has arrived for this time."""
         deadline = time.monotonic() + PATIENCE

@@ -191,7 +191,7 @@ def test_a_board_whose_port_is_closed_is_counted_one_for_one(site: Rover, table:
             site.basestation.sendto(DRIVE, RADIO)
             wait_until(partial(has_grown, before), "the command")
         assert counted() == (1, 4)
-        assert "nobody listens at 10.78.1.222:8" in router.text()
+        wait_until(lambda: "nobody listens at 10.78.1.222:8" in router.text(), "the report")
 
 
 def test_a_flood_of_forged_errors_keeps_no_datagram_away(site: Rover) -> None:

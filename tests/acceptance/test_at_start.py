@@ -94,6 +94,7 @@ def test_after_a_kill_while_driving_the_brake_is_the_first_that_the_board_gets(p
     with RouterProcess(place.folder, table) as router:
         assert place.receive("driving_board") == BRAKE
         samples, counts = place.samples(), place.scrape()
+        wait_until(lambda: bool(router.events(SENT)), "the report")
         told = [line for line in router.log() if "deadman" in line["event"]]
         assert [(line["event"], line["level"], line["route"], line["to"]) for line in told] == [
             (SENT, "info", "manual_drive", ["driving_board"])

@@ -751,8 +751,9 @@ def test_after_an_edit_the_new_table_drives(rover: Rover) -> None:
 def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rover]:
     """A rover with a copy of the router's code, its program kept."""
     copy = tmp_path_factory.mktemp("package")
+    ignored = shutil.ignore_patterns("__pycache__")  # other tests write there
     for name in ("router", "schemas"):
-        shutil.copytree(ROOT / name, copy / name)
+        shutil.copytree(ROOT / name, copy / name, ignore=ignored)
     with rover_in(tmp_path_factory.mktemp("rover")) as found:
         found.within = ("/usr/bin/env", "-C", str(copy))
         found.environment = {"PYTHONPATH": str(copy)}

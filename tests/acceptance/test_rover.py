@@ -459,7 +459,11 @@ def test_a_value_that_a_mapping_cannot_take_is_told_with_the_line_of_the_table(w
         assert published == (0 if topic == "gps/vel" else 2)
     assert counted[key("messages_dropped", route="gps_info", target="gps/vel", reason="mapping_error")] == 2
 
-    [line] = [line for line in router.events("message dropped") if line["target"] == "gps/vel"]
+    def told() -> list[dict[str, Any]]:
+        return [line for line in router.events("message dropped") if line["target"] == "gps/vel"]
+
+    wait_until(lambda: bool(told()), "the line")  # it is counted first
+    [line] = told()
     assert (line["route"], line["target"], line["reason"]) == ("gps_info", "gps/vel", "mapping_error")
     rover_yaml = ROUTES / "rover.yaml"
     number = next(n for n, text in enumerate(rover_yaml.read_text().splitlines(), 1) if "speed * sin(" in text)

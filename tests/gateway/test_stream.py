@@ -12,8 +12,10 @@ from structlog.testing import capture_logs
 
 from router.errors import StartError
 from router.gateway.transport import stream as gateway_stream
+from router.gateway.transport import tcp as gateway_tcp
+from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
-from router.gateway.transport.stream import Limits
+from router.gateway.transport.stream import MESSAGE_SECONDS, Limits, StreamTransport
 from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
 from tests.gateway.stream_peers import KINDS, MOST, framed, join, served, transport_of, websocket_frame
 from tests.gateway.transport_events import Events, data, opened, resident_kib
@@ -162,23 +164,48 @@ BEGUN = [
 ]
 
 
+class Clock:
+    """The transports' monotonic clock, in seconds. It stands still on a busy computer."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    async def passes(self, seconds: float, transport: StreamTransport) -> None:
+        """Let time pass, and wait for the next check of what is unfinished."""
+        self.now += seconds
+        before = transport._watching
+        await until(lambda: transport._watching is not before)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    for module in (gateway_stream, gateway_tcp, gateway_websocket):
+        monkeypatch.setattr(module, "monotonic", clock)
+    monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
+    return clock
+
+
 @pytest.mark.parametrize(("kind", "pieces"), BEGUN)
 @asynchronous
 async def test_a_message_has_to_end_in_time_although_a_byte_comes_now_and_then(
-    kind: str, pieces: list[bytes], monkeypatch: pytest.MonkeyPatch
+    kind: str, pieces: list[bytes], clock: Clock
 ) -> None:
-    monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
-    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.2)
     with capture_logs() as logs:
         async with served(kind) as (transport, events):
             slow, silent = [await join(kind, transport) for _ in range(2)]
             await until(lambda: len(events.clients) == 2)
             for piece in pieces:
+                await slow.send(piece)
+                await until(lambda: any(client.unfinished_since is not None for client in transport._clients))
+                await clock.passes(MESSAGE_SECONDS / 4, transport)
                 if events.gone:
                     break
-                await slow.send(piece)
-                await asyncio.sleep(0.05)
             await until(lambda: events.gone)
+            assert clock.now > MESSAGE_SECONDS
             assert [client.label for client in events.gone] == [slow.label]
             assert [client.label for client in events.clients] == [silent.label]
             assert events.said == []
@@ -189,21 +216,18 @@ async def test_a_message_has_to_end_in_time_although_a_byte_comes_now_and_then(
 
 @EACH_KIND
 @asynchronous
-async def test_the_time_is_for_each_message_where_one_follows_the_other(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_the_time_is_for_each_message_where_one_follows_the_other(kind: str, clock: Clock) -> None:
     """Also where what comes at a time always ends in the middle of a message."""
-    monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
-    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.5)
     message = framed(kind, b"abc")
     async with served(kind) as (transport, events):
         peer = await join(kind, transport)
         await until(lambda: events.clients)
         stream = message * 7
         ends = range(len(message) - 2, len(stream), len(message))
-        for begin, end in zip([0, *ends], ends, strict=False):
+        for number, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
             await peer.send(stream[begin:end])
-            await asyncio.sleep(0.1)
+            await until(lambda number=number: len(events.said) == number)  # type: ignore[misc]
+            await clock.passes(MESSAGE_SECONDS / 2, transport)
         assert (events.gone, len(events.said)) == ([], 6)
         peer.leave()
 
