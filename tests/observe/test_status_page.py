@@ -400,7 +400,7 @@ def test_topics_are_named_as_far_as_there_is_room(page: Page) -> None:
     shown = f"{box('case:imu_info')}.querySelector('.chip').innerText"
     for size, text in (
         ((1920, 1080), "^·imu_data·imu/data_raw·imu/mag$"),
-        (DESKTOP, r"^·imu_data.*\+[12]$"),
+        ((1366, 768), r"^·imu_data.*\+[12]$"),
         ((800, 600), "^·3$"),
         (PHONE, "^·imu_data"),
     ):
@@ -408,6 +408,13 @@ def test_topics_are_named_as_far_as_there_is_room(page: Page) -> None:
         page.until(f"/{text.replace('/', '.')}/.test({shown})")
     accessibility.show_at(page, DESKTOP)
     assert page.evaluate(f"{box('case:drive_motor')}.innerText.includes('←drive_motor')")
+
+
+def test_a_laptops_screen_has_room_for_the_name_of_a_topic_in_each_row(page: Page) -> None:
+    accessibility.show_at(page, (1366, 768))
+    unnamed = "boxes(1).filter(({ chip }) => !chip.hidden && !/[a-z]/.test(chip.innerText)).map(({ name }) => name)"
+    assert page.evaluate("boxes(1).filter(({ chip }) => !chip.hidden).length") > 20
+    page.until(f"{unnamed}.length === 0")
 
 
 def test_a_topic_of_a_case_that_falls_silent_keeps_its_state(running: FakeRunning, page: Page) -> None:
