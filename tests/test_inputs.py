@@ -309,7 +309,6 @@ _READING = {
 }
 _ALLOWED = {
     "table/schema.py": ["read_text"],  # part of the code, and read once
-    "types/protoc.py": ["read_bytes"],  # what protoc has written
     "compiler/zenoh_config.py": ["from_file"],  # table/build.py has read it
 }
 

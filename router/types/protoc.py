@@ -5,6 +5,7 @@ The result is a FileDescriptorSet with source info.
 
 from __future__ import annotations
 
+import os
 import posixpath
 import re
 import tempfile
@@ -23,6 +24,8 @@ from router.types.proto_source import ProtoText
 
 EVERYTHING = "router_every_proto_of_the_folder.proto"
 """The file that imports all others. Its errors only repeat theirs."""
+
+_IN_MEMORY = "/dev/shm"  # noqa: S108 - Linux's shared memory
 
 _IMPORT_FAILED = re.compile(r'Import "(?P<name>.*)" was not found or had errors\.')
 _NUMBER_TAKEN = re.compile(
@@ -176,17 +179,17 @@ def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
     Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. Raises TableError with one
     finding per error of protoc, and StartError.
     """
-    with _scratch(folder, names) as include:
+    with _scratch(folder, names) as include, os.fdopen(os.memfd_create("descriptors"), "rb") as output:
         if complaints := _complaints(include):
             raise TableError(findings_of(complaints, folder))
-        output = Path(include[0]).with_name("descriptors")
-        options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
+        written_to = f"/proc/self/fd/{output.fileno()}"
+        options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={written_to}"]
         arguments = ["protoc", *(f"--proto_path={path}" for path in include), *options, EVERYTHING]
         if status := _protoc_compiler.run_main([argument.encode() for argument in arguments]):
             message = f"protoc first accepted these files, then failed with status {status}"
             hint = "try again: the files may have changed in the meantime"
             raise TableError.of(SourceSpan(shown_path(folder.root)), Code.BAD_PROTO, message, hint)
-        compiled = FileDescriptorSet.FromString(output.read_bytes())
+        compiled = FileDescriptorSet.FromString(output.read())
     del compiled.file[-1]
     return compiled
 
@@ -205,7 +208,10 @@ def _scratch(folder: Folder, names: Sequence[str]) -> Iterator[list[str]]:
     """Provide the include folders for EVERYTHING, in a temporary folder that is removed. Raises StartError."""
     with ExitStack() as ending:
         try:
-            include = _include(ending.enter_context(tempfile.TemporaryDirectory()), folder, names)
+            try:
+                include = _include(ending.enter_context(tempfile.TemporaryDirectory()), folder, names)
+            except OSError:  # a router must start on a full disk
+                include = _include(ending.enter_context(tempfile.TemporaryDirectory(dir=_IN_MEMORY)), folder, names)
         except OSError as error:
             what = f"protoc needs a temporary folder, but none is writable: {error.strerror}"
             raise StartError(what, "make /tmp writable, or set TMPDIR to a writable folder") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 
 import pytest
 
@@ -33,10 +34,16 @@ def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, m
         load_protos(*settings(root))
 
 
+def test_a_full_disk_is_no_obstacle(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write({"a.proto": proto("message Envelope {}")})
+    monkeypatch.setattr(tempfile, "tempdir", str(root / "none"))
+    assert list(load_protos(*settings(root)).messages) == ["Envelope"]
+
+
 def test_without_a_temporary_folder_the_start_says_so(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write({"a.proto": proto("message Envelope {}")})
 
-    def refuse() -> None:
+    def refuse(**_: object) -> None:
         raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/']")
 
     monkeypatch.setattr("router.types.protoc.tempfile.TemporaryDirectory", refuse)
