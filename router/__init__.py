@@ -1,4 +1,4 @@
-"""A configuration-driven declarative router between protobuf over UDP and ROS 2. `main` is the command `router`."""
+"""A declarative router between protobuf over UDP and ROS 2. `main` is the command `router`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Building and parsing of single datagrams, for tools and log messages. Routes do not use this module."""
+"""Builds and parses single datagrams, for tools and log messages. Routes do not use this module."""
 
 from __future__ import annotations
 

@@ -272,8 +272,9 @@ def did_you_mean_file(written: str, path: Path) -> str:
 def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
     """Return the known name that `name` most likely stands for, or None.
 
-    With a `closeness` of 1, they may differ only in case and in a prefix that all known names share. Otherwise, names
-    with the same words in another order are similar. Such a prefix does not count: `MODE_X` is not similar to `MODE_A`.
+    With a `closeness` of 1, the two may differ only in case and in a prefix that all known names share. Otherwise,
+    names with the same words in another order are similar, and that prefix does not count: `MODE_X` is not similar to
+    `MODE_A`.
     """
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
     words = sorted(name.lower().split("_"))
@@ -293,7 +294,7 @@ def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | No
 
 
 _HALF = 0.5
-"""Similarity to exceed once a shared prefix is removed: in `MODE_OM` for `MODE_ON`, one of two letters is right."""
+"""Similarity that names must exceed without their shared prefix: in `MODE_OM`, one of two letters is right."""
 _SHORTEST = 3
 """Minimum length at which the beginning of a name can stand for the whole name."""
 

@@ -206,7 +206,7 @@ class _Flood:
 
 
 class FloodLog:
-    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their number.
+    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their count.
 
     Thread-safe. Call `flush()` regularly, or the last events of a flood are not logged. Kinds beyond `MOST_KEYS` share
     a summary.

@@ -247,4 +247,4 @@ class _Steps:
 
 
 class StuckError(RuntimeError):
-    """A thread did not answer in time; nothing was changed."""
+    """A thread did not respond in time; nothing was changed."""

@@ -1,4 +1,4 @@
-"""Parsing and printing of message fields as `field=value` words, for all verbs.
+"""Parses and formats message fields as `field=value` words, for all verbs.
 
 `router send` parses these words; `tap`, `listen` and `sim` print them. For protobuf messages the two are inverse.
 To print them, values of any source are first converted to a `Tree`.
@@ -219,7 +219,7 @@ def one_line(listed: Iterable[str], empty: str = "(all default)") -> str:
 
 
 def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
-    """Format a protobuf message as one line, without fields that have their default."""
+    """Format the fields of a protobuf message that are set as one line."""
     return one_line(words(protobuf_tree(message, kind, digits)))
 
 

@@ -108,7 +108,7 @@ class Runtime:
         open than sockets and topics.
         """
         if self._unfinished and self.plane.has_passed():
-            self._close_unfinished()  # first, as `program` may open the same again
+            self._close_unfinished()  # before `program` opens the same addresses or topics
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here

@@ -107,7 +107,10 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 
 
 def _declare(library: Path, folder: Path) -> Path:
-    """Generate the module of a library. Return a C file in `folder` that checks the module at compile time."""
+    """Generate the module of a library. Return a C file in `folder` that checks the module at compile time.
+
+    Raises BuildError.
+    """
     from router.carrier.headers import HeaderError, checks, declarations
 
     made = folder / DECLARED.name

@@ -162,7 +162,7 @@ class FromRosThread(NativeThread):
         return True
 
     def _watched(self, subscription: Subscription) -> int:
-        """Return the eventfd that announces new messages to the thread."""
+        """Return the eventfd that announces new messages to the thread. Raises OSError."""
         with ExitStack() as opening:
             eventfd = os.eventfd(0, os.EFD_CLOEXEC)
             opening.callback(os.close, eventfd)

@@ -172,7 +172,7 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
 
 @contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
-    """Yield a function that appends a line to the file, unbuffered."""
+    """Yield a function that appends a line to the file, unbuffered. Raises UsageError."""
     from router.tools.gateway_messages import json_line
 
     if path is None:

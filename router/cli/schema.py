@@ -126,7 +126,7 @@ def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]
 def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
     """Return the conflict of that name, or all conflicts of a message. `name` may omit package and enclosing messages.
 
-    A field may also be named as in the lock.
+    A field may also be named as in the lock. Raises UsageError.
     """
     if exact := [each for each in found if name in (each.name, each.owner)]:
         return exact

@@ -1,6 +1,6 @@
 """Checks an expression, innermost node first, and returns a typed tree.
 
-The rules are in `names`, `operators`, `lists` and `calls`.
+The rules are in `names`, `operators`, `lists` and `calls`, and raise ExpressionError for the first mistake.
 """
 
 from __future__ import annotations
