@@ -162,7 +162,7 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
 
 
 def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
-    """Return the message for `message` in `message.name`, unless that is a submessage; None for anything else."""
+    """Return the source message if `holder` is the name `message` and no submessage has that name; otherwise None."""
     member = scope.message.field(MESSAGE)
     is_meant = (
         isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)
