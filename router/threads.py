@@ -88,7 +88,7 @@ class WakeEvent:
         self._poll.register(self._event, select.POLLIN)
 
     def wait(self, nanoseconds: int) -> None:
-        """Wait until the event is set, at most `nanoseconds` or an hour.
+        """Wait until the event is set, for at most `nanoseconds` or an hour.
 
         Returns at once if the event was set since the last wait.
         """

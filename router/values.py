@@ -219,7 +219,7 @@ def one_line(listed: Iterable[str], empty: str = "(all default)") -> str:
 
 
 def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
-    """Format the fields of a protobuf message that are set as one line."""
+    """Format a protobuf message on one line, with only the fields that are set."""
     return one_line(words(protobuf_tree(message, kind, digits)))
 
 
