@@ -169,17 +169,17 @@ class _NonBlockingStream:
                 self._write_rest()
 
     def _write_rest(self) -> None:
-        while self._rest and self._room.poll(0):  # then a pipe has room for PIPE_BUF bytes, but perhaps not for more
+        while self._rest and self._room.poll(0):  # a pipe is ready if PIPE_BUF bytes fit
             self._rest = self._rest[os.write(self._descriptor, self._rest[: select.PIPE_BUF]) :]
 
 
 def _non_blocking(stream: TextIO) -> int:
-    """The stream's descriptor, or for a terminal a new one, as writing to a stopped terminal blocks despite `poll`.
+    """Return the stream's descriptor, but for a terminal a new one: writing to a stopped one blocks despite `poll`.
 
-    The descriptor itself is not changed: other processes use the same open file.
+    The stream itself is not made non-blocking, because other processes use the same open file.
     """
     if stream.isatty():
-        with suppress(OSError):  # it belongs to another user
+        with suppress(OSError):  # the terminal belongs to another user
             return os.open(f"/proc/self/fd/{stream.fileno()}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     return stream.fileno()
 
