@@ -116,7 +116,7 @@ def metrics_page() -> str:
         name = f"router_{metric.name}_total" if kind == "counter" else f"router_{metric.name}"
         lines.append(f"| `{name}` | {kind} | {', '.join(metric.exported_labels)} | {metric.help} |")
     lines += [
-        "| `router_build_info` | gauge | version, table_sha256, protos_sha256, start | Always 1; labels: what runs. |",
+        "| `router_build_info` | gauge | version, table_sha256, protos_sha256, start | 1; the labels say what runs. |",
         "",
         fill(_COUNTERS, WIDTH),
         "",

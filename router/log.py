@@ -69,7 +69,7 @@ def fault(error: BaseException, what: str, within: str = "the router itself") ->
     """Describe an unexpected exception, and `what` it did, for example "lost a message"."""
     if is_shortage(error):
         why = str(error) or "no memory"
-        return Fault(logger.error, f"memory, threads or descriptors have run out, which {what}: {why}", None)
+        return Fault(logger.error, f"memory, threads or descriptors have run out; this {what}: {why}", None)
     return Fault(logger.critical, f"a fault in {within} {what}; please report it", error)
 
 

@@ -24,7 +24,7 @@ _CHECKS = 4
 NOTIFY_TIMEOUT = 5.0
 """Seconds for which a notification waits for a busy service manager, and so the longest delay of a reload or stop."""
 
-_REMEDY = "ListenDatagram= in rover-router.socket differs from the table: reinstall the service"
+_REMEDY = "reinstall the service: ListenDatagram= in rover-router.socket differs from the table"
 
 
 @contextmanager

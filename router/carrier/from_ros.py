@@ -83,7 +83,9 @@ class FromRosThread(NativeThread):
         """Log how often the middleware failed to deliver a message since the last call."""
         failures = self.failures
         if failures > self._reported:
-            logger.error("the middleware failed to deliver messages that it holds", times=failures - self._reported)
+            logger.error(
+                "the middleware failed to hand over messages that it has received", times=failures - self._reported
+            )
         self._reported = failures
 
     def leave(self, messages: NativeFromRos) -> None:

@@ -132,7 +132,7 @@ def add_verb(
     shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
     return subparsers.add_parser(
         name,
-        help=VERBS.get(name),
+        help=VERBS.get(name) or description[0].lower() + description[1:].partition(". ")[0],
         description=description,
         epilog=f"{more}\n\n{shown}",
         formatter_class=_Help,

@@ -75,7 +75,7 @@ def add_parser(subparsers: Subparsers) -> None:
     add_for(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object per line, with the data as received")
     parser.add_argument("--hex", action="store_true", help="envelopes and ROS: also print the bytes")
-    parser.add_argument("--type", metavar="TYPE", help="ROS: the topic's type (default: what its publishers say)")
+    parser.add_argument("--type", metavar="TYPE", help="ROS: the topic's type (default: that of its publishers)")
     about = "gateways: only matching topics, for example /loki_1/**; may be repeated"
     completes(parser.add_argument("--topic", dest="topics", action="append", metavar="GLOB", help=about), topics)
     parser.add_argument("--record", type=Path, metavar="FILE", help="gateways: also append JSON lines to this file")

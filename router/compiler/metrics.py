@@ -36,7 +36,7 @@ COMMAND = "command"
 
 METRICS = (
     Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
-    Metric("received_bytes", "counter", ("listener",), "Bytes in those datagrams."),
+    Metric("received_bytes", "counter", ("listener",), "Bytes of the datagrams taken from the listener's socket."),
     Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
     Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is missing."),
     Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were restored or removed."),
@@ -44,7 +44,7 @@ METRICS = (
     Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),
     Metric("messages_received", "counter", ("route", "source"), "Messages that a route accepted, by source."),
     Metric("datagrams_sent", "counter", ("route", "destination"), "Datagrams handed to the kernel."),
-    Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
+    Metric("sent_bytes", "counter", ("route", "destination"), "Bytes of the datagrams handed to the kernel."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
     Metric("messages_sent", "counter", ("route", "target"), "ROS messages that a gateway handed to its clients."),
     Metric(
@@ -105,7 +105,7 @@ METRICS = (
     ),
     Metric("mirror_dropped", "counter", (), "Routed datagrams that recordings and taps missed."),
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
-    Metric("recorded_bytes", "counter", (), "Bytes in those datagrams."),
+    Metric("recorded_bytes", "counter", (), "Bytes of the datagrams written to a recording."),
     Metric("record_dropped", "counter", ("reason",), "Datagrams missing from a recording, by reason."),
     Metric("config_reloads", "counter", ("result",), "Reloads of the table, by result."),
     Metric("config_last_reload_successful", "number", (), "1 unless the last reload failed."),

@@ -51,7 +51,7 @@ class Kind(enum.Enum):
     LISTENER_WAITING = (
         Level.CRITICAL,
         "{listener} receives nothing: its address or network interface does not exist",
-        "It waits for {address}: `ip -br address` shows the addresses and interfaces that exist.",
+        "Bring up the network of {address}, or correct `listen`; `ip -br address` shows what exists.",
         "listener_waiting",
     )
     DEADMAN_CANNOT_SEND = (
@@ -76,20 +76,20 @@ class Kind(enum.Enum):
     DEADMAN_ACTIVE = (
         Level.WARNING,
         "commands of {route} do not get through: its deadman sends in their place",
-        "`router explain` says who sends them. Check that they arrive often enough, and that both clocks agree.",
+        "Check that they arrive often enough, and that both clocks agree; `router explain` says who sends them.",
         "deadman_active",
     )
     PUBLISH_STALLED = (
         Level.WARNING,
         "publishing on {topic} is stuck in the ROS middleware",
-        "A subscriber may be stuck or was killed; forwarding and deadmen continue.",
+        "A subscriber was killed or has its own /dev/shm: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4. Forwarding continues.",
         "publish_stalled_seconds",
         1.0,  # of all calls together
     )
     RELOAD_FAILED = (
         Level.WARNING,
         "the last reload failed; the old table is still running",
-        "`router validate` says what is wrong with the changed table.",
+        "Run `router validate`, correct what it reports, and reload.",
         "config_last_reload_successful",
     )
     MESSAGES_DROPPED = (
@@ -102,7 +102,7 @@ class Kind(enum.Enum):
     MESSAGES_WAITING = (
         Level.WARNING,
         "messages wait for a thread that publishes or sends",
-        "The computer is overloaded (`router top`), or the ROS middleware blocks the thread.",
+        "Run `router top`: the computer is overloaded, or the ROS middleware blocks the thread.",
         "messages_waiting",
         20,  # of all targets together, in each snapshot; where much is published, there are always a few
     )
@@ -128,7 +128,7 @@ class Kind(enum.Enum):
     QOS_INCOMPATIBLE = (
         Level.WARNING,
         "nothing passes between {topic} and peers with another {policy}",
-        "`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` the router's.",
+        "Compare their QoS (`ros2 topic info -v {topic}`) with the router's (`router explain {route}`).",
         "qos_incompatible",
     )
     GATEWAY_DISCONNECTED = (
@@ -140,7 +140,7 @@ class Kind(enum.Enum):
     RECORDING_INCOMPLETE = (
         Level.WARNING,
         "recordings or taps are missing datagrams",
-        "The disk is full or too slow, or the computer is too busy: run `df` and `router doctor`.",
+        "Run `df` and `router doctor`: the disk is full or too slow, or the computer is too busy.",
         "record_dropped",  # and mirror_dropped
     )
     ENDPOINT_NEVER_HEARD = (

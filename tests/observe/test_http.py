@@ -116,7 +116,7 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")
     assert (problem["labels"], problem["routes"]) == ({"route": "manual_drive"}, ["manual_drive"])
     assert problem["words"] == "commands of manual_drive do not get through: its deadman sends in their place"
-    assert problem["remedy"].startswith("`router explain` says who sends them")
+    assert problem["remedy"].startswith("Check that they arrive often enough")
 
 
 def test_ready_is_that_everything_is_open(server: HttpServer, running: FakeRunning) -> None:
@@ -576,7 +576,7 @@ def test_a_connection_without_a_thread_is_closed_and_the_next_is_served(
                 with pytest.raises((ConnectionError, http.client.RemoteDisconnected)):
                     ask(server, "/ready")
         assert ask(server, "/ready").status == 200
-    what = "memory, threads or descriptors have run out, which lost an HTTP response: can't start new thread"
+    what = "memory, threads or descriptors have run out; this lost an HTTP response: can't start new thread"
     assert [(each["event"], each["log_level"]) for each in logs] == [(what, "error")]
 
 

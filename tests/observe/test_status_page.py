@@ -253,7 +253,7 @@ def test_a_listener_without_its_network_is_said_before_what_follows_from_it(runn
     running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
     running.count("listener_waiting", "rover", to=1)
     until_said(page, "rover receives nothing", "bad")
-    assert page.text("#todo").startswith("It waits for 127.0.0.5:25000")
+    assert page.text("#todo").startswith("Bring up the network of 127.0.0.5:25000")
     running.count("listener_waiting", "rover", to=0)
     until_said(page, "arm_board is silent", "warn")
 

@@ -221,7 +221,7 @@ class ZenohTransport:
             what = (
                 "this gateway waits until the key is free"
                 if has_to_wait
-                else "it took the key later and must give it up"
+                else "the other one took it later and must give it up"
             )
             logger.error(f"another gateway uses the Zenoh key: {what}", key=self._key, other=str(min(new)))
             self._events.contended()
