@@ -1,1 +1,1 @@
-"""The router shown on this machine: simulator, router and a ROS subscriber, and whether messages arrived."""
+"""The demo: runs simulator, router and ROS nodes on this computer, and checks that messages arrive."""

@@ -28,36 +28,36 @@ from router.table.model import RouteTable
 ROOT = Path(__file__).parent.parent
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-SUCCESS = "It works: boards, basestation and real ROS 2 heard each other, and a lost link stopped the rover."
+SUCCESS = "It works: boards, basestation and ROS 2 nodes exchanged messages, and a lost link stopped the rover."
 NEXT_STEPS = """\
 Where to look next:
-  routes/rover.yaml                      what goes where
-  .venv/bin/router validate routes/      what is wrong with it, before driving
-  .venv/bin/router explain imu_info      what becomes of one message
-  .venv/bin/router demo                  boards and router, until Ctrl-C"""
+  routes/rover.yaml                      the rover's table
+  .venv/bin/router validate routes/      checks it before you drive
+  .venv/bin/router explain imu_info      shows how one message is routed
+  .venv/bin/router demo                  runs boards and router, until Ctrl-C"""
 
 
 def leave(number: int, frame: FrameType | None) -> None:
-    """Every signal that ends the demo goes through its `finally`."""
+    """Signal handler that ends the demo through its `finally`."""
     raise SystemExit(128 + number)
 
 
 def play(console: Console, table: RouteTable) -> list[Finding]:
-    """Raises DemoError."""
+    """Run the demo. Raises DemoError."""
     if problems := taken_places(table):
         told = "\n  ".join(problems)
-        raise DemoError(f"addresses of {TABLE} are taken; does another demo, router or simulator run?\n  {told}")
+        raise DemoError(f"addresses of {TABLE} are in use: stop the other demo, router or simulator\n  {told}")
     demo = Demo(table)
     try:
         return demo.run(console)
     finally:
         for number in ENDING:
-            signal.signal(number, signal.SIG_IGN)  # nothing interrupts the end
+            signal.signal(number, signal.SIG_IGN)  # do not interrupt the cleanup
         demo.end()
 
 
 def tell(console: Console, findings: list[Finding], pages: Mapping[str, Address | None]) -> int:
-    """The verdict, and the exit code that belongs to it. `pages` are for a browser, by what they show."""
+    """Print the verdict and return the exit code. `pages` maps what a page shows to its address."""
     verdicts = Table.grid(padding=(0, 2))
     for finding in findings:
         mark = Text("ok", style="green") if finding.ok else Text("FAIL", style="red")
@@ -68,7 +68,7 @@ def tell(console: Console, findings: list[Finding], pages: Mapping[str, Address 
         console.print(NEXT_STEPS, highlight=False)
         for shows, page in pages.items():
             if page is not None:
-                console.print(f"  {f'http://{page}/':<37}  {shows}, while that runs", highlight=False)
+                console.print(f"  {f'http://{page}/':<37}  {shows}, while the demo runs", highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
     return 1
@@ -86,7 +86,7 @@ def main() -> int:
     except RouterError as error:
         console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
         return 1
-    pages = {"what flows where": table.http.value if table.http else None, "ROS topics": page_of(table)}
+    pages = {"status page": table.http.value if table.http else None, "ROS topics": page_of(table)}
     return tell(console, findings, pages)
 
 

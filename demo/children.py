@@ -1,4 +1,4 @@
-"""Child processes that never outlive the demo, whatever ends it. Knows not what they do."""
+"""Child processes that never outlive the demo, whatever ends it."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from contextlib import suppress
 from typing import IO, Any
 
 PATIENCE = 5.0
-"""Seconds that a child has to end by itself."""
+"""Seconds to wait for a child's exit before it is killed."""
 
 LAST_WORDS = 4000
 """Bytes of stderr worth showing."""
 
 
 class Child:
-    """A running Python module. Its stdout is JSON lines, of which `latest` is the newest.
+    """A running Python module that prints JSON lines; `latest` is the newest.
 
-    Has a session of its own, so that Ctrl-C reaches the demo alone, which then ends its children in order.
+    It has a session of its own, so that Ctrl-C reaches only the demo, which then ends its children in order.
     """
 
     def __init__(self, name: str, env: Mapping[str, str], *module: str) -> None:
         self.name = name
         self.latest: dict[str, Any] = {}
-        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the child is of interest
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the object exists
         self._process = subprocess.Popen(
             [sys.executable, "-m", "demo.tied", *module],
             env=dict(env),
@@ -39,7 +39,7 @@ class Child:
             start_new_session=True,
         )
         if self._process.stdin is None or self._process.stdout is None:
-            raise AssertionError("pipes were asked for")
+            raise AssertionError("Popen opened no pipes")
         self._stdin = self._process.stdin
         self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
         self._reader.start()
@@ -51,14 +51,14 @@ class Child:
                     self.latest = json.loads(line)
 
     def tell(self, line: str) -> None:
-        """Write a line to its stdin. Nothing happens if it has ended."""
+        """Write a line to its stdin. Does nothing if it has ended."""
         with suppress(BrokenPipeError):
             self._stdin.write(line.encode() + b"\n")
             self._stdin.flush()
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
+        """The exit code; None while it runs."""
         return self._process.poll()
 
     def ask_to_end(self) -> None:
@@ -66,7 +66,7 @@ class Child:
             self._process.send_signal(signal.SIGTERM)
 
     def end(self) -> None:
-        """Ask, wait, and kill if it must be; afterwards its last line has been read."""
+        """Send SIGTERM, wait, kill after PATIENCE, and read the output to its end."""
         self.ask_to_end()
         try:
             self._process.wait(PATIENCE)
@@ -78,7 +78,7 @@ class Child:
             self._stdin.close()
 
     def last_words(self) -> str:
-        """The end of what it wrote to stderr, read beside the child's own position in the file."""
+        """The end of its stderr, read without moving the file position that the child shares."""
         size = os.fstat(self._stderr.fileno()).st_size
         start = max(0, size - LAST_WORDS)
         return os.pread(self._stderr.fileno(), size - start, start).decode(errors="replace").strip()

@@ -1,4 +1,4 @@
-"""What the demo's processes say, and what must arrive for it to pass, read from the route table."""
+"""What must arrive for the demo to pass, according to the route table."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from router.table.addresses import Address
 from router.table.model import EndpointKind, GatewayFormat, Route, RouteTable, Transport
 
 COMMANDED, LOST, FOUND = 3.0, 5.0, 8.0
-"""Seconds by the simulator's clock: until when the rover's software commands the boards, and when the link to all
-basestations is lost and found again. A command of the software after LOST would disarm the operator's deadmen."""
+"""Seconds on the simulator's clock: the end of the software's commands to boards, then the loss and the return of the
+link to all basestations. A command of the software after LOST would disarm the operator's deadmen."""
 
 
 def checked_table(path: Path) -> RouteTable:
-    """The table with the types of all topics. Raises TableError if it has errors."""
+    """Read the table, with the types of all topics. Raises TableError if it has errors."""
     checked = check_table(path)
     if checked.table is None or checked.has_errors:
         raise TableError(checked.diagnostics)
@@ -24,22 +24,22 @@ def checked_table(path: Path) -> RouteTable:
 
 
 def active_routes(table: RouteTable) -> list[Route]:
-    """All that carry something."""
+    """Routes that the table does not ignore."""
     return [route for route in table.routes if route.ignore is None]
 
 
 def inbound_topics(table: RouteTable) -> dict[str, str]:
-    """ROS type by topic of what the router publishes."""
+    """ROS types of the topics that the router publishes, by topic."""
     return _topics([route for route in active_routes(table) if not route.is_outbound])
 
 
 def outbound_topics(table: RouteTable) -> dict[str, str]:
-    """ROS type by topic of what the router subscribes to."""
+    """ROS types of the topics that the router subscribes to, by topic."""
     return _topics([route for route in active_routes(table) if route.is_outbound])
 
 
 def command_topics(table: RouteTable) -> set[str]:
-    """Those of outbound topics that command a board. While they do, no deadman of the operator's commands trips."""
+    """Outbound topics with commands to a board. These commands keep the operator's deadmen disarmed."""
     boards = {name for name, endpoint in table.endpoints.items() if endpoint.kind is EndpointKind.BOARD}
     return {
         topic.topic.value
@@ -54,7 +54,7 @@ def _topics(routes: list[Route]) -> dict[str, str]:
 
 
 def page_of(table: RouteTable) -> Address | None:
-    """Where the table has a page for browsers."""
+    """Address of the table's page for browsers; None without one."""
     for gateway in table.gateways.values():
         is_for_browsers = gateway.transport.value is Transport.WEBSOCKET and gateway.format is GatewayFormat.JSON
         if is_for_browsers and gateway.address is not None:
@@ -63,12 +63,12 @@ def page_of(table: RouteTable) -> Address | None:
 
 
 def shown_topics(table: RouteTable) -> set[str]:
-    """What the page has to show: absolute names of what the router publishes."""
+    """Topics that the page must show: absolute names of what the router publishes."""
     return {resolved(topic, table.node) for topic in inbound_topics(table)}
 
 
 def expected_arrivals(table: RouteTable) -> set[tuple[str, str]]:
-    """Destination endpoint and payload case of everything that is to arrive at the simulator."""
+    """Pairs of destination endpoint and payload case that must arrive at the simulator."""
     return {
         (destination.endpoint.value, route.case.value)
         for route in active_routes(table)
@@ -77,14 +77,14 @@ def expected_arrivals(table: RouteTable) -> set[tuple[str, str]]:
 
 
 def basestations(table: RouteTable) -> list[str]:
-    """The endpoints whose link is lost for a while: those that send something."""
+    """Basestations that send something: the demo cuts their link for a while."""
     senders = {source.value for route in active_routes(table) for source in route.sources}
     kinds = {name: endpoint.kind for name, endpoint in table.endpoints.items()}
     return [name for name, kind in kinds.items() if kind is EndpointKind.BASESTATION and name in senders]
 
 
 def halted_boards(table: RouteTable) -> set[str]:
-    """To whom deadmen speak while the link is lost."""
+    """Boards to which deadmen send while the link is lost."""
     silent = basestations(table)
     return {
         to.value

@@ -1,4 +1,4 @@
-"""What somebody sees who opens the table's page late: a client of the websocket, as the page is. Knows no verdict."""
+"""Opens the gateway page late, as a websocket client, and collects what it shows."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from websockets.sync.client import connect
 from router.table.addresses import Address
 
 PATIENCE = 5.0
-"""Seconds in which the latest values must be there; they are sent at once."""
+"""Seconds to wait for the latest values, which the gateway sends at once."""
 
 
 class Shown(NamedTuple):
-    """Whether there was a page, of which topics data came, and of which of those before the schema of its type."""
+    """Whether there was a page; the topics with data; those of them whose data came before the schema of the type."""
 
     has_page: bool = False
     topics: frozenset[str] = frozenset()
@@ -26,7 +26,7 @@ class Shown(NamedTuple):
 
 
 def look(address: Address, wanted: Collection[str]) -> Shown:
-    """Opens page and websocket, and watches until all `wanted` topics have come, or it takes too long."""
+    """Open page and websocket, and read until all `wanted` topics have arrived or PATIENCE is over."""
     introduced, topics, early = set[str](), set[str](), set[str]()
     try:
         with urllib.request.urlopen(f"http://{address}/", timeout=PATIENCE) as answer:
@@ -46,7 +46,7 @@ def look(address: Address, wanted: Collection[str]) -> Shown:
 
 
 def _documents(address: Address) -> Iterator[dict[str, Any]]:
-    """Raises OSError, WebSocketException."""
+    """Yield documents until PATIENCE is over. Raises OSError, WebSocketException."""
     deadline = time.monotonic() + PATIENCE
     with connect(f"ws://{address}/", open_timeout=PATIENCE, max_size=None, proxy=None) as opened:
         while (left := deadline - time.monotonic()) > 0:

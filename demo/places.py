@@ -1,4 +1,4 @@
-"""What the demo needs free on this machine: the table's addresses, and a ROS domain; or a network of its own."""
+"""What must be free on this computer for the demo: the table's addresses and a ROS domain; or a network namespace."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from router.table.model import RouteTable, Transport
 from router.tools.udp import open_udp
 
 DOMAINS = range(1, 102)
-"""ROS 2 domains whose ports lie below Linux's ephemeral ones."""
+"""ROS 2 domains whose ports are below Linux's ephemeral range."""
 
 
 def taken_places(table: RouteTable) -> list[str]:
-    """One line for each address of the table that cannot be had."""
+    """One line for each address of the table that cannot be bound."""
     wanted = {f"listener {name}": listener.address.value for name, listener in table.listeners.items()}
     wanted |= {f"endpoint {name}": endpoint.address.value for name, endpoint in table.endpoints.items()}
     wanted |= {f"gateway {name}": each.receive.value for name, each in table.gateways.items() if each.receive}
@@ -49,7 +49,7 @@ def _is_taken(address: Address) -> bool:
 
 
 def free_ros_domain() -> int:
-    """A domain in which nobody on this machine takes part: discovery of a domain has a UDP port of its own."""
+    """A domain that no process on this computer uses: each domain has its own UDP port for discovery."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
@@ -57,11 +57,11 @@ def free_ros_domain() -> int:
             except OSError:
                 continue
             return domain
-    raise UsageError("all ROS domains of this machine are in use")
+    raise UsageError("all ROS domains of this computer are in use")
 
 
 def alone() -> list[str] | None:
-    """The command that runs another one in a network namespace with loopback only; None where that is not possible."""
+    """Prefix that runs a command in a network namespace with loopback only; None if that is not possible."""
     if any(shutil.which(name) is None for name in ("unshare", "ip")):
         return None
     user = ["--map-root-user"] if os.geteuid() else []

@@ -1,4 +1,4 @@
-"""The demo's four processes: started in order, watched, ended in order, and judged by what they said."""
+"""The demo's four processes: starts, watches and ends them in order, and judges their output."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from router.tools.top import View, Window, view
 TABLE = Path("routes/sim.yaml")
 DURATION = 12.0
 START_PATIENCE = 30.0
-"""Seconds within which a process must be up; a cold start reads a lot from disk."""
+"""Seconds to wait for a process to be up; a cold start reads a lot from disk."""
 
 MATCHING = 0.5
-"""Seconds after the ROS nodes have found the router until the router has found them."""
+"""Seconds from when the ROS nodes have discovered the router until the router has discovered them."""
 
 REFRESH = 0.5
 DRAINING = 0.5
-"""Seconds after the talker's last message in which boards and basestation may still be sent something."""
+"""Seconds after the talker's last message, for the router to send its last datagrams."""
 
 SETTLING = 1.0
 """Seconds after the last datagram was sent, for the listener's last report."""
 
 
 class DemoError(RouterError):
-    """The demo cannot go on; the message says why, for a person who has just arrived."""
+    """The demo cannot continue; the message gives the reason, for a first-time user."""
 
 
 class Demo:
-    """The four processes and what they say. The simulator starts when the others are up; then its clock counts."""
+    """The four processes and their output. The simulator starts last, and its clock is the demo's clock."""
 
     def __init__(self, table: RouteTable) -> None:
         if table.http is None:
-            raise DemoError(f"{TABLE} has no metrics address, and the demo reads its rates there")
+            raise DemoError(f"{TABLE} has no `http` address, from which the demo reads the metrics")
         self._url = url_of(table)
         self._table = table
         self._env = os.environ | {
@@ -90,17 +90,17 @@ class Demo:
         return judge(self._table, listener.latest, simulator.latest, self._look(window), shown, recorded)
 
     def _look_at_page(self) -> Shown | None:
-        """None where the table has no page."""
+        """Return what the page shows; None if the table has no page."""
         address = page_of(self._table)
         return look(address, shown_topics(self._table)) if address else None
 
     def _wait_until_up(self, listener: Child, talker: Child) -> None:
-        """Until the ROS nodes have found the router's topics: before that, the router withholds messages."""
+        """Wait until the ROS nodes have discovered the router's topics: before that, the router publishes nothing."""
         self._wait_until(
             lambda: bool(listener.latest) and all(topic["publishers"] for topic in listener.latest["topics"].values()),
-            "router and ROS listener did not find each other",
+            "router and ROS listener did not discover each other",
         )
-        self._wait_until(lambda: bool(talker.latest), "router and ROS talker did not find each other")
+        self._wait_until(lambda: bool(talker.latest), "router and ROS talker did not discover each other")
         time.sleep(MATCHING)
 
     def _wait_until(self, holds: Callable[[], bool], complaint: str) -> None:
@@ -117,16 +117,16 @@ class Demo:
             window.add(metrics(self._url))
             return view(*window.ends, health(self._url).problems)
         except TransportError:
-            self._check()  # a router that has ended has better words than a refused connection
+            self._check()  # if the router has ended, its own message is better than a refused connection
             raise
 
     def _check(self) -> None:
-        """Nobody ends by itself."""
+        """Raises DemoError if a process has ended."""
         for child in self._running:
             _check_exit(child, expected=None)
 
     def end(self) -> None:
-        """All are asked to end before any is waited for."""
+        """Send SIGTERM to all processes, then wait for each."""
         for child in self._running:
             child.ask_to_end()
         for child in self._running:

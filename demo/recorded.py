@@ -1,4 +1,4 @@
-"""What the router recorded of the lost link, read as anybody would read it."""
+"""Reads the router's recording of the lost link."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from router.table.model import RouteTable
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recording that a deadman has had saved: where it is, and how many datagrams are in it."""
+    """A recording that was saved because a deadman tripped, and its number of datagrams."""
 
     path: Path
     datagrams: int
 
 
 def recordings(table: RouteTable) -> frozenset[Path]:
-    """Those that deadmen have had saved so far; none where the table keeps nothing."""
+    """Recordings saved so far because a deadman tripped; empty if the table records nothing."""
     return frozenset(table.record.directory.resolve().glob("*_deadman-*.mcap")) if table.record else frozenset()
 
 
 def first_of(paths: Collection[Path]) -> Recorded | None:
-    """The oldest, taken apart; None where there is none."""
+    """Read the oldest recording; None if there is none."""
     if not paths:
         return None
-    path = min(paths)  # they are called after the time
+    path = min(paths)  # names contain the time
     with closing(Recording(path)) as recording:
         return Recorded(path, sum(1 for _ in recording.datagrams()))

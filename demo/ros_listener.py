@@ -1,7 +1,7 @@
-"""A ROS 2 node that has nothing of the router but the table's topic names: counts what really arrives.
+"""A ROS 2 node that shares only the table's topic names with the router, and counts the messages that arrive.
 
 `python -m demo.ros_listener TABLE` prints a JSON object twice a second:
-{"topics": {topic: {"publishers": how many it knows, "count": messages so far,
+{"topics": {topic: {"publishers": number discovered, "count": messages so far,
                     "sample": the newest one, decoded by rclpy, as text}}}
 """
 
@@ -29,7 +29,7 @@ ANY_PUBLISHER = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Listener:
-    """Subscribes raw: a message is only decoded when it is shown."""
+    """Counts raw messages; decodes only the samples that it reports."""
 
     def __init__(self, node: Node, topics: dict[str, str]) -> None:
         self._node = node

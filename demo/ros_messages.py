@@ -1,4 +1,4 @@
-"""ROS messages of any type, found by name and filled with plausible values. Knows no node and no table."""
+"""ROS messages of any type, found by name and filled with plausible values."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import re
 from typing import Any
 
 ELEMENTS = 3
-"""In a sequence that may have so many."""
+"""Elements in each sequence, unless its bound is lower."""
 
 _SEQUENCE = re.compile(r"sequence<(?P<element>.+?)(, (?P<bound>\d+))?>")
 _ARRAY = re.compile(r"(?P<element>.+)\[(?P<length>\d+)\]")
 
 
 def message_class(name: str) -> Any:
-    """Of `sensor_msgs/msg/Imu`."""
+    """Return the Python class of a type, for example of `sensor_msgs/msg/Imu`."""
     package, _, short = name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), short)
 
 
 def filled(kind: Any, number: int, stamp: object) -> Any:
-    """A message of this class. No number in it is zero, all follow from `number`; times are `stamp`."""
+    """Make a message of this class. Its numbers are derived from `number` and never zero; its times are `stamp`."""
     message = kind()
     for name, spelled in kind.get_fields_and_field_types().items():
         setattr(message, name, _value(spelled, number, stamp))
@@ -28,7 +28,7 @@ def filled(kind: Any, number: int, stamp: object) -> Any:
 
 
 def _value(spelled: str, number: int, stamp: object) -> Any:
-    """`spelled` is a field's type in rclpy's words."""
+    """Make the value of a field; `spelled` is its type as rclpy names it."""
     if found := _SEQUENCE.fullmatch(spelled):
         return [_value(found["element"], number, stamp)] * min(ELEMENTS, int(found["bound"] or ELEMENTS))
     if found := _ARRAY.fullmatch(spelled):

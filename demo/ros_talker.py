@@ -1,8 +1,8 @@
-"""The rover's software, as far as the router can tell: publishes every topic that the table takes from ROS.
+"""Stands for the rover's software: publishes every topic that the table takes from ROS.
 
-`python -m demo.ros_talker TABLE` prints {"ready": true} when the router has subscribed to all of them. Then it reads
-from stdin until when it commands the boards, a time of CLOCK_MONOTONIC in seconds, and begins. Later it leaves the
-boards to the operator.
+`python -m demo.ros_talker TABLE` prints {"ready": true} when the router has subscribed to all of them. Then it reads a
+time of CLOCK_MONOTONIC in seconds from stdin, and begins to publish. From that time on it sends no more commands to
+boards, so that the operator drives.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ INTERVAL = 0.1
 """Seconds."""
 
 ANY_SUBSCRIBER = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Reliable and kept: what a subscriber may ask for at most."""
+"""Reliable and transient local: compatible with every subscriber."""
 
 
 def talk(
     node: Node, publishers: dict[str, Publisher], commands: set[str], until: float, ended: threading.Event
 ) -> None:
-    """Publish one message per INTERVAL on each topic, on those of `commands` only `until` then."""
+    """Publish one message per INTERVAL on each topic; on topics of `commands` only before the time `until`."""
     for number in itertools.count():
         stamp = node.get_clock().now().to_msg()
         for topic, publisher in publishers.items():
@@ -46,7 +46,7 @@ def talk(
 
 def main() -> int:
     table = checked_table(Path(sys.argv[1]))
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # which would end ROS between two publishers
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its handler would interrupt talk()
     node = rclpy.create_node("demo_talker", namespace=table.node.namespace)
     publishers = {
         topic: node.create_publisher(message_class(name), topic, ANY_SUBSCRIBER)
@@ -57,7 +57,7 @@ def main() -> int:
     print(json.dumps({"ready": True}), flush=True)
     until = float(sys.stdin.readline())
     ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())  # until here it ends the process
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())  # before, SIGTERM ended the process
     talk(node, publishers, command_topics(table), until, ended)
     rclpy.shutdown()
     return 0

@@ -1,4 +1,4 @@
-"""What the demo shows while it runs: in place on a terminal, a line now and then elsewhere."""
+"""What the demo shows while it runs: a live table in a terminal, otherwise a line every few seconds."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from router.tools.top_table import RouteTable as Routes
 from router.tools.top_view import summary_line
 
 LINE_INTERVAL = 3.0
-"""Seconds between two lines where there is no terminal."""
+"""Seconds between two lines without a terminal."""
 
 CHANGES_SHOWN = 3
-"""Of the boards' states, the newest."""
+"""How many of the newest changes of boards' states are shown."""
 
 
 class Screen(Protocol):
     def show(self, view: View, heard: Said, simulated: Said) -> None:
-        """`heard` and `simulated` are the newest words of listener and simulator."""
+        """Show the state. `heard` and `simulated` are the newest reports of listener and simulator."""
 
 
 @contextmanager
@@ -54,7 +54,7 @@ class _Lines:
         self._next += LINE_INTERVAL
         ros = sum(topic["count"] for topic in heard.get("topics", {}).values())
         arrived = sum(case["count"] for cases in simulated["received"].values() for case in cases.values())
-        line = f"{seconds:.0f} s: {summary_line(view)}; heard on ROS {ros}, arrived at boards and basestation {arrived}"
+        line = f"{seconds:.0f} s: {summary_line(view)}; received on ROS {ros}, at boards and basestation {arrived}"
         self._print(line)
 
     def _print(self, line: str) -> None:
@@ -62,7 +62,7 @@ class _Lines:
 
 
 def _changes(simulated: Said) -> list[str]:
-    """How the boards' states have changed, in words, the newest last."""
+    """Changes of the boards' states as text, the newest last."""
     return [f"{change['at']:.1f} s: {change['board']} {change['text']}" for change in simulated["changes"]]
 
 
@@ -73,8 +73,8 @@ class _Terminal:
 
     def show(self, view: View, heard: Said, simulated: Said) -> None:
         def on_ros(row: RouteRow) -> Text:
-            """The slowest topic of the route counts: each shall get every message."""
-            route = self._routes.get(row.route)  # none is that of a gateway
+            """The count of the route's slowest topic, because each topic must get every message."""
+            route = self._routes.get(row.route)  # None for a gateway
             topics = () if route is None else route.topics
             return _count([topic_count(heard, topic.topic.value) for topic in topics])
 
@@ -89,14 +89,14 @@ class _Terminal:
         title.append(f"  {summary_line(view)}", style="not bold")
         changes = [Text(change, style="yellow", no_wrap=True) for change in _changes(simulated)[-CHANGES_SHOWN:]]
         legend = Text(style="dim").append("destinations", style="cyan").append(", ").append("ROS topics", style="green")
-        legend.append("; on ROS, on UDP: what has really arrived there")
+        legend.append("; on ROS, on UDP: messages that arrived there")
         room = self._console.height - 3 - len(changes)
         table = Routes(view, Order.DROPS, room, columns={"on ROS": on_ros, "on UDP": on_udp})
         self._live.update(Group(title, table, *changes, legend), refresh=True)
 
 
 def _count(counts: list[int]) -> Text:
-    """Arrived messages of a route's least served target; nothing where the table names no target."""
+    """Messages that arrived at the route's slowest target; empty if there is no target."""
     if not counts:
         return Text("")
     return Text(str(min(counts)), style="" if min(counts) else "red")

@@ -1,6 +1,6 @@
-"""`python -m demo.tied MODULE ARGUMENT...` is `python -m MODULE ARGUMENT...`, killed when its parent is gone.
+"""`python -m demo.tied MODULE ARGUMENT...` is `python -m MODULE ARGUMENT...`, killed when its parent dies.
 
-The kernel sees to it (PR_SET_PDEATHSIG), so it holds even when the parent is killed by SIGKILL.
+The kernel does that (PR_SET_PDEATHSIG), so it works even if the parent gets SIGKILL.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whether the demo worked, from what the ROS subscriber, the simulator and the metrics say, and in which words."""
+"""Judges from the reports of ROS listener, simulator and metrics whether the demo worked."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from router.tools.top import View
 from router.tools.top_table import reasons_text
 
 WANTED_DROPS = frozenset({"rate_limited", "stale"})
-"""Losses that a table asks for, by `max_rate` and `ttl`."""
-
+"""Losses that a table intends, by `max_rate` and `ttl`."""
 
 Said = Mapping[str, Any]
 """The newest JSON line of a child process."""
@@ -34,7 +33,7 @@ Said = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that must be so: whether it is, and in words."""
+    """The result of one check, and its text."""
 
     ok: bool
     text: str
@@ -48,9 +47,10 @@ def judge(
     shown: Shown | None = None,
     recorded: Recorded | None = None,
 ) -> list[Finding]:
-    """`heard` and `simulated` are the last words of the ROS listener and the simulator, `view` the last scrape.
+    """Check everything. `heard` and `simulated` are the last reports of ROS listener and simulator.
 
-    `shown` is what the table's page had to show, None where it has none; `recorded` what was saved of the lost link.
+    `view` is the last scrape, `shown` what the table's page showed (None without a page), `recorded` the recording of
+    the lost link.
     """
     return [
         _topics(table, heard),
@@ -91,24 +91,24 @@ def _arrivals(table: RouteTable, simulated: Said) -> Finding:
     if undecodable:
         return Finding(False, f"{undecodable} datagrams arrived undecodable")
     topics, datagrams = len(outbound_topics(table)), sum(counts.values())
-    words = f"all {len(counts)} payload cases at boards and basestation, those from {topics} ROS topics among them"
+    words = f"all {len(counts)} payload cases at boards and basestation, including those from {topics} ROS topics"
     return Finding(True, f"{words}: {datagrams} datagrams")
 
 
 def _frames(table: RouteTable, simulated: Said) -> Iterator[Finding]:
-    """What is split into one datagram for each element is put together again."""
+    """Check that lists that were split into datagrams are reassembled."""
     for route in table.routes:
         for destination in route.destinations if route.for_each else ():
             case, endpoint = route.case.value, destination.endpoint.value
             frames = simulated.get("frames", {}).get(endpoint, {}).get(case, {"complete": 0})
-            yield Finding(frames["complete"] > 0, f"{endpoint} put {frames['complete']} frames of {case} together")
+            yield Finding(frames["complete"] > 0, f"{endpoint} reassembled {frames['complete']} frames of {case}")
 
 
 def _deadman(table: RouteTable, simulated: Said) -> Finding:
-    """Whether each board was told to halt while the link was lost, and obeyed again when it was found."""
+    """Check that each board was halted while the link was lost, and obeyed commands again afterwards."""
     boards = sorted(halted_boards(table))
     if not boards:
-        return Finding(False, "no deadman guards what a basestation commands")
+        return Finding(False, "no route from a basestation has a deadman")
     halted = {board: _change(simulated, board, "halted", LOST, FOUND) for board in boards}
     released = {board: _change(simulated, board, "obeying", FOUND, math.inf) for board in boards}
     missing = [f"{board} was not halted" for board, at in halted.items() if at is None]
@@ -117,29 +117,29 @@ def _deadman(table: RouteTable, simulated: Said) -> Finding:
     if missing:
         return Finding(False, f"{cut} from {LOST:.0f} to {FOUND:.0f} s, and {', '.join(missing)}")
     told = ", ".join(f"{board} after {at - LOST:.2f} s" for board, at in halted.items() if at is not None)
-    return Finding(True, f"{cut} for {FOUND - LOST:.0f} s: halted {told}; obeyed again when it was back")
+    return Finding(True, f"{cut} for {FOUND - LOST:.0f} s: deadmen halted {told}; boards obeyed again afterwards")
 
 
 def _change(simulated: Said, board: str, state: str, start: float, end: float) -> float | None:
-    """When a board first came into a state within these seconds."""
+    """The time at which a board first entered a state between `start` and `end`."""
     changes = (c for c in simulated.get("changes", ()) if (c["board"], c["state"]) == (board, state))
     return next((float(change["at"]) for change in changes if start <= change["at"] < end), None)
 
 
 def _recording(recorded: Recorded | None) -> Finding:
-    """Whether there is a file of what came before that."""
+    """Check that the datagrams before the halt were saved."""
     if recorded is None or not recorded.datagrams:
-        return Finding(False, "what came before the boards were halted was not recorded")
-    return Finding(True, f"the {recorded.datagrams} datagrams before that are in {recorded.path}")
+        return Finding(False, "the datagrams before the halt were not recorded")
+    return Finding(True, f"the {recorded.datagrams} datagrams before the halt are in {recorded.path}")
 
 
 def _page(table: RouteTable, shown: Shown) -> Finding:
-    """Whether somebody who opens the page late gets everything at once."""
+    """Check that a client that opens the page late gets everything at once."""
     wanted = shown_topics(table)
     if not shown.has_page:
         return Finding(False, "the dashboard's page or websocket cannot be reached")
     if missing := sorted(wanted - shown.topics):
-        return Finding(False, f"the dashboard's page got nothing of {', '.join(missing)}")
+        return Finding(False, f"the dashboard's page got nothing for {', '.join(missing)}")
     if shown.early:
         return Finding(False, f"the dashboard's page got data before its schema: {', '.join(sorted(shown.early))}")
     return Finding(True, f"the dashboard's page got all {len(wanted)} topics, each with its schema first")
@@ -157,5 +157,5 @@ def _losses(table: RouteTable, view: View | None) -> Finding:
     if lost:
         return Finding(False, f"the router lost messages: {reasons_text(lost)}")
     received = sum(row.received for row in view.routes if row.route not in table.gateways)
-    withheld = f", withheld {reasons_text(wanted)} as the table asks" if wanted else ""
-    return Finding(True, f"the router took {received} messages and lost none{withheld}")
+    withheld = f", dropped {reasons_text(wanted)} as the table says" if wanted else ""
+    return Finding(True, f"the router accepted {received} messages and lost none{withheld}")

@@ -145,7 +145,7 @@ SCENARIOS = (
     ),
     Scenario(
         "footprint_rover",
-        "The same with all routes of the rover, and start to the first brake at the board",
+        "The same as `footprint` with all routes of the rover, and start to the first brake at the board",
         (Router("router", TABLES / "rover.yaml", board=DRIVING_BOARD),),
         start_and_memory,
         (*BRAKE, *FOOTPRINT, Aim("rss_mb")),
@@ -172,14 +172,14 @@ SCENARIOS = (
     ),
     Scenario(
         "table_size",
-        "CPU per datagram: 260 routes beside 26, the same four payload cases, one subscriber of imu_data",
+        "CPU per datagram: 260 routes compared with 26, the same four payload cases, one subscriber of imu_data",
         (sized_router("routes_260", sized.LARGE), sized_router("routes_26", sized.SMALL)),
         partial(inbound_cost, rates=SIZE_RATES, topics=(IMU,)),
         cpu_at_most("routes_26", (1.05, 1.05), SIZE_RATES),
     ),
     Scenario(
         "table_size_spread",
-        "CPU per datagram: 260 routes beside 26, all payload cases in turn, nobody subscribes",
+        "CPU per datagram: 260 routes compared with 26, all payload cases in turn, nobody subscribes",
         (sized_router("routes_260", sized.LARGE, spread=True), sized_router("routes_26", sized.SMALL, spread=True)),
         partial(inbound_cost, rates=SIZE_RATES, topics=()),
         cpu_at_most("routes_26", (1.05, 1.05), SIZE_RATES),

@@ -123,7 +123,7 @@ def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: Rou
     witnesses.view = seen(dropped={"rate_limited": 5, "stale": 1})
     *findings, losses = witnesses.judged()
     assert all(finding.ok for finding in (*findings, losses))
-    assert losses.text.endswith("lost none, withheld 1 stale, 5 rate_limited as the table asks")
+    assert losses.text.endswith("lost none, dropped 1 stale, 5 rate_limited as the table says")
 
 
 CUT = f"the link to basestation was cut from {LOST:.0f} to {FOUND:.0f} s, and "
@@ -138,17 +138,17 @@ CUT = f"the link to basestation was cut from {LOST:.0f} to {FOUND:.0f} s, and "
             "manual_drive at driving_board",
         ),
         (lambda told: told.received["driving_board"].pop("drive_motor"), "drive_motor at driving_board"),
-        (lambda told: told.frames.update(complete=0), "basestation put 0 frames of detected_object together"),
+        (lambda told: told.frames.update(complete=0), "basestation reassembled 0 frames of detected_object"),
         (lambda told: told.forget(2), f"{CUT}driving_board was not halted"),
         (lambda told: told.forget(4), f"{CUT}driving_board did not obey again"),
         (lambda told: told.tell(view=seen(dropped={"queue_full": 2})), "lost messages: 2 queue_full"),
         (lambda told: told.tell(view=seen(rejected={"malformed": 1})), "lost messages: 1 malformed"),
         (lambda told: told.tell(view=seen(kernel_drops=4)), "the router lost messages: 4 kernel_drops"),
         (lambda told: told.tell(shown=Shown()), "the dashboard's page or websocket cannot be reached"),
-        (lambda told: told.show(topics=told.shown.topics - {"/imu/mag"}), "page got nothing of /imu/mag"),
+        (lambda told: told.show(topics=told.shown.topics - {"/imu/mag"}), "page got nothing for /imu/mag"),
         (lambda told: told.show(early=frozenset({"/imu/mag"})), "page got data before its schema: /imu/mag"),
-        (lambda told: told.tell(recorded=None), "came before the boards were halted was not recorded"),
-        (lambda told: told.tell(recorded=Recorded(Path("empty.mcap"), 0)), "halted was not recorded"),
+        (lambda told: told.tell(recorded=None), "the datagrams before the halt were not recorded"),
+        (lambda told: told.tell(recorded=Recorded(Path("empty.mcap"), 0)), "halt were not recorded"),
     ],
 )
 def test_one_fault_is_one_complaint(
