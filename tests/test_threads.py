@@ -133,9 +133,9 @@ def test_a_thread_that_dies_before_it_runs_holds_nobody_up(monkeypatch: pytest.M
 
 
 def test_an_executor_whose_thread_cannot_be_started_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "START_S", 0.05)
     executor = DaemonThread("calls")
     with monkeypatch.context() as short:
+        short.setattr(threads, "START_S", 0.05)
         short.setattr(threads, "Thread", StillbornThread)
         with pytest.raises(RuntimeError, match="can't start new thread"):
             executor.submit(int)

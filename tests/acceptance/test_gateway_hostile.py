@@ -194,9 +194,11 @@ def test_what_is_long_to_read_delays_neither_other_commands_nor_the_end(now: Sce
     for reason, times in (("not_allowed", 1), ("malformed", 1), ("invalid", 2), ("too_large", 1)):
         assert rejected(counts, "headset", reason) == times
     assert counts[key("messages_published", route="headset", topic="/gw/many")] == 1
+    now.peer.open("/gw/words", "std_msgs/msg/String")
+    now.await_subscription("/gw/words")
     with now.connect("OPEN"):
         now.await_clients("open", 1)
-        now.peer.say("/gw/word", {"data": "x" * 20_000}, times=200)
+        now.peer.say("/gw/words", {"data": "x" * 20_000}, times=200)
         wait_until(lambda: bool(lagging(now)), "the client to lag")
         for _ in range(3):
             client.send(numbers)

@@ -10,9 +10,8 @@ import re
 import shutil
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from time import time
+from collections.abc import Callable
+from time import sleep, time
 from typing import Any
 from unittest.mock import ANY
 from urllib.request import urlopen
@@ -66,13 +65,16 @@ gateways:
 """
 
 
-@contextmanager
-def later(write: Callable[[], object]) -> Iterator[None]:
-    """Writes a moment after this was entered, as a slow copy goes on."""
-    timer = threading.Timer(0.2, write)
-    timer.start()
-    yield
-    timer.join()
+def write_while_it_waits(monkeypatch: pytest.MonkeyPatch, write: Callable[[], object]) -> None:
+    """Write when a reload begins to wait for files that may still be written, as a slow copy goes on."""
+    writes = iter([write])
+
+    def wait(seconds: float) -> None:
+        for each in writes:
+            each()
+        sleep(seconds)
+
+    monkeypatch.setattr(watching, "sleep", wait)
 
 
 def numbers(router: Router) -> Snapshot:
@@ -277,26 +279,26 @@ def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(
         assert site.basestation.recv(1000) == DRIVE
 
 
-def test_a_reload_waits_for_files_that_are_being_written(site: Site) -> None:
+def test_a_reload_waits_for_files_that_are_being_written(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is there meanwhile is valid: the base that the table extends, whose routes go elsewhere."""
     with site.router(PH) as router:
         table = router.program.table.path
         table.rename(site.folder / "base.yaml")
         beginning = "version: 1\nextends: base.yaml\n"
         table.write_text(beginning)
-        with later(lambda: table.write_text(f"{beginning}routes:\n{turns('1s')}")):
-            assert router.reload().text == "route manual_drive added"
+        write_while_it_waits(monkeypatch, lambda: table.write_text(f"{beginning}routes:\n{turns('1s')}"))
+        assert router.reload().text == "route manual_drive added"
 
 
-def test_a_reload_waits_for_files_that_only_the_new_table_names(site: Site) -> None:
+def test_a_reload_waits_for_files_that_only_the_new_table_names(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     with site.router(PH) as router:
         table, base = router.program.table.path, site.folder / "base.yaml"
         beginning = table.read_text()
         table.write_text("version: 1\nextends: base.yaml\n")
         let_rest(table)
         base.write_text(beginning)
-        with later(lambda: base.write_text(beginning + turns("1s"))):
-            assert router.reload().text == "route manual_drive added"
+        write_while_it_waits(monkeypatch, lambda: base.write_text(beginning + turns("1s")))
+        assert router.reload().text == "route manual_drive added"
 
 
 def test_a_reload_refuses_files_that_do_not_come_to_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

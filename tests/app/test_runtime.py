@@ -468,7 +468,8 @@ def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
             site.send(DRIVE)
             assert site.basestation.recv(1000) == DRIVE
         assert site.basestation.recv(1000) == BRAKE
-    assert len([each for each in logs if each["event"] == "shutdown step did not finish in time; continuing"]) == 2
+    left = [each["step"] for each in logs if each["event"] == "shutdown step did not finish in time; continuing"]
+    assert {each.rpartition(".")[2] for each in left} >= {"stuck", "<lambda>"}  # a busy computer may delay other steps
     # What is opened next must not get the descriptor of a thread that still receives.
     assert (router.listeners["rover"].socket.fileno() >= 0) == (place == "_stop_plane")
     goes_on.set()

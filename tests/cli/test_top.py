@@ -66,10 +66,10 @@ def test_what_is_no_router_is_said_in_a_line(text: str, capsys: pytest.CaptureFi
 
 def read_until(terminal: int, wanted: str) -> None:
     """Read what the terminal shows until it shows `wanted`."""
-    limit, seen = time.monotonic() + PATIENCE, ""
-    while wanted not in seen:
+    limit, seen = time.monotonic() + PATIENCE, b""
+    while wanted.encode() not in seen:
         assert readable(terminal, limit - time.monotonic()), f"no {wanted!r} in {seen!r}"
-        seen += os.read(terminal, 65536).decode()
+        seen += os.read(terminal, 65536)  # which may end within a character
 
 
 def test_on_a_terminal_keys_sort_and_end_it(served: str) -> None:
