@@ -8,11 +8,11 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from router.assets import asset
@@ -44,9 +44,9 @@ def run(args: argparse.Namespace) -> int:
     table = _table()
     _, program = good_table(table)
     if sys.stderr.isatty():
-        say(f"in another terminal: router top -t {shlex.quote(str(table))}; press Ctrl-C to stop")
-    with _simulated(program):
-        route(program, [], os.environ)
+        say(f"in another terminal: router top -t {shlex.quote(str(table))}\npress Ctrl-C to stop")
+    with _simulated(program) as play:
+        route(program, [], os.environ, started=play)
     return OK
 
 
@@ -58,8 +58,9 @@ def _table() -> Path:
 
 
 @contextmanager
-def _simulated(program: Program) -> Iterator[None]:
-    """Simulate the table's endpoints in a thread. An error there stops the process like SIGTERM and is raised here.
+def _simulated(program: Program) -> Iterator[Callable[[], None]]:
+    """Simulate the table's endpoints in a thread, which sends once the returned function is called: what is sent while
+    the router starts becomes stale. An error there stops the process like SIGTERM and is raised here.
 
     Raises UsageError if an address is in use.
     """
@@ -67,8 +68,10 @@ def _simulated(program: Program) -> Iterator[None]:
     from router.tools.simulator import Simulator
 
     failures: list[Exception] = []
+    started = Event()
 
     def play() -> None:
+        started.wait()
         try:
             simulator.run(None, math.inf, lambda _: None)
         except Exception as error:  # noqa: BLE001 - raised by the main thread
@@ -81,9 +84,10 @@ def _simulated(program: Program) -> Iterator[None]:
     thread = Thread(target=play, name="simulator")
     thread.start()
     try:
-        yield
+        yield started.set
     finally:
         simulator.stop()
+        started.set()
         thread.join()
         simulator.close()
     if failures:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -134,8 +134,12 @@ def route(
     begun: Beginning | None = None,
     keeper: Keeper | None = None,
     start: str = "compiled",
+    started: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run a program until SIGINT or SIGTERM. The other arguments are those of `Router`. Raises StartError."""
+    """Run a program until SIGINT or SIGTERM. Calls `started` once it runs; `Router` has the other arguments.
+
+    Raises StartError.
+    """
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
 
@@ -147,6 +151,7 @@ def route(
     with router:
         tune_interpreter()
         _show_places(router)
+        started()
         with supervised(router.feed_watchdog):
             _serve_signals(router, _ENDING)
         for number in _ENDING:
