@@ -361,7 +361,7 @@ def _senders(node: yaml.Node) -> Iterator[str]:
 def _test(message: NewMessage, site: Site) -> Iterator[str]:
     receivers = _basestations(message, site.table)
     subject = message.case.replace("_", " ")
-    yield f"{subject} reaches {'the operator and ROS as it is' if receivers else 'ROS as the operator sent it'}:"
+    yield f"{subject} reaches {'the operator and ROS unchanged' if receivers else 'ROS as the operator sent it'}:"
     yield "  given:"
     yield f"    case: {message.case}"
     yield f"    from: {message.board}"

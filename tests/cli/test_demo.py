@@ -81,5 +81,5 @@ def test_it_says_where_to_look_and_ends_with_ctrl_c(tmp_path: Path) -> None:
         assert b"gateway dashboard  http://127.0.0.1:28765/" in seen
         process.send_signal(2)
         assert process.wait(PATIENCE) == 0
-    assert "dropped" not in seen  # the simulated rover sends nothing before the router can deliver it
+    assert b"dropped" not in seen  # the simulated rover sends nothing before the router can deliver it
     os.close(ours)
