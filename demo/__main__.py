@@ -68,7 +68,7 @@ def tell(console: Console, findings: list[Finding], pages: Mapping[str, Address 
         console.print(NEXT_STEPS, highlight=False)
         for shows, page in pages.items():
             if page is not None:
-                console.print(f"  {f'http://{page}/':<37}  {shows}, while the demo runs", highlight=False)
+                console.print(f"  {f'http://{page}/':<37}  {shows}, while `router demo` runs", highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
     return 1

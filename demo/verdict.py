@@ -157,5 +157,5 @@ def _losses(table: RouteTable, view: View | None) -> Finding:
     if lost:
         return Finding(False, f"the router lost messages: {reasons_text(lost)}")
     received = sum(row.received for row in view.routes if row.route not in table.gateways)
-    withheld = f", dropped {reasons_text(wanted)} as the table says" if wanted else ""
+    withheld = f"; dropped as the table says: {reasons_text(wanted)}" if wanted else ""
     return Finding(True, f"the router accepted {received} messages and lost none{withheld}")

@@ -123,7 +123,7 @@ def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: Rou
     witnesses.view = seen(dropped={"rate_limited": 5, "stale": 1})
     *findings, losses = witnesses.judged()
     assert all(finding.ok for finding in (*findings, losses))
-    assert losses.text.endswith("lost none, dropped 1 stale, 5 rate_limited as the table says")
+    assert losses.text.endswith("lost none; dropped as the table says: 1 stale, 5 rate_limited")
 
 
 CUT = f"the link to basestation was cut from {LOST:.0f} to {FOUND:.0f} s, and "
