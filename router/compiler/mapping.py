@@ -109,7 +109,7 @@ def build(
     if target.fields and not builder.rows and not outcome.findings:
         hint = "map its fields, or write `fields: auto`"
         if automatic is not None:
-            hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
+            hint = f"map the fields by hand: {automatic.kind} and {target} have no field name in common"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
     return outcome
 

@@ -30,9 +30,10 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     for first, second in combinations(_held(table), 2):
         if first.is_udp == second.is_udp and _overlap(first, second):
             message = f"{second.owner} uses the address of {first.owner}"
-            hint = "only one of them can receive there; use another port"
+            hint = "use another port"
             if first.interface != second.interface:  # a socket without an interface receives on all interfaces
                 hint += f", or give {second.owner if first.interface else first.owner} an 'interface'"
+            hint += ": only one of them can receive there"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _listener_findings(table)
     for endpoint in table.endpoints.values():

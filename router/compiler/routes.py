@@ -81,9 +81,12 @@ def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
 def _without_for_each(message: MessageType) -> dict[str, tuple[str, str]]:
     """Return the names that are missing without `for_each`, with message and hint: see `Scope.absent`."""
     lists = [member.name for member in message.fields if isinstance(member.type, List)]
-    hint = f"add `for_each: {lists[0] if len(lists) == 1 else 'LIST'}`"
-    hint += f"; its lists are {', '.join(lists)}" if len(lists) > 1 else ""
-    return dict.fromkeys((ITEM, INDEX, COUNT), (_NO_FOR_EACH, hint))
+    hint = " or ".join(f"`for_each: {name}`" for name in lists[:_MOST_LISTS] or ("LIST",))
+    return dict.fromkeys((ITEM, INDEX, COUNT), (_NO_FOR_EACH, f"add {hint}"))
+
+
+_MOST_LISTS = 4
+"""Maximum number of lists that a hint offers."""
 
 
 def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:

@@ -159,8 +159,18 @@ def _owners(name: str, path: Path) -> str:
         for owner, schema in definitions.items()
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
-    owners += ["the top level"] if name in keys_of(table_schema()) else []
-    return f"move it to: {', '.join(owners)}" if owners else ""
+    near = [owner for owner in owners if path[:1] == ("routes",) and owner in _OF_ROUTES] or owners
+    places = [_OF_ROUTES.get(owner, f"a '{owner}'") for owner in near]
+    places += ["the top level"] if name in keys_of(table_schema()) else []
+    return f"move it to {', or to '.join(places)}" if places else ""
+
+
+_OF_ROUTES = {
+    "route": "the route",
+    "destination": "an item of 'destinations'",
+    "topic": "an item of 'topics'",
+}
+"""The definitions of parts of a route, and how a hint names them."""
 
 
 def for_value(error: SchemaError) -> str:

@@ -214,7 +214,8 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
     if keyword == "maxProperties":
         hint = hints.without_case(error.value) if path[-1] == "send" and isinstance(error.value, dict) else ""
-        return Diagnostic(span, code, f"{name} {_expected(error)}, and nothing else", hint)
+        count = len(error.value) if isinstance(error.value, dict) else 0
+        return Diagnostic(span, code, f"{name} has {count} keys; it {_expected(error)}", hint)
     hint = hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")

@@ -45,7 +45,7 @@ def findings(folder: Path, *edits: tuple[str, str]) -> list[tuple[str, str]]:
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]", "{basestation: {max_rate: 5}}",
          "write a list: [{endpoint: basestation, ...}]"),
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]",
-         "{endpoint: basestation, ttl: 1 s}", "move it to: route, inbound"),
+         "{endpoint: basestation, ttl: 1 s}", "move it to the route"),
         ("orientation_covariance: [-1, 0, accel_y]", "orientation_covariance: [[-1, 0], [0, 1]]",
          "write one list of 4 values, row by row"),
         ("qos: {profile: sensor_data, depth: 5, deadline: 500ms}", "qos: best_effort",

@@ -23,9 +23,8 @@ def called_name(node: ast.Call, text: Parsed) -> str:
         known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
         known = "write has(x)" if name == HAS else known
         hint = known or did_you_mean("", FUNCTIONS)
-        raise ExpressionError(
-            text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only the listed functions can be called", hint
-        )
+        message = "expressions can call only their own functions"
+        raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, message, hint)
     if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
         message = f"{node.func.id}() takes its arguments by position"
         hint = f"write {FUNCTIONS[node.func.id].signature}" if node.func.id in FUNCTIONS else ""
