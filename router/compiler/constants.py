@@ -193,7 +193,7 @@ def _called(name: str, arguments: Sequence[Any]) -> Any:
         return FUNCTIONS[name].implementation(*arguments)
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(map(repr, arguments))
-        raise MappingError(f"{name}({given}) has no value") from error
+        raise MappingError(f"{name}({given}) has no result") from error
 
 
 def _of_size(value: str | bytes, most: int) -> str | bytes:

@@ -78,14 +78,18 @@ def _table(checked: Checked) -> Iterator[CheckResult]:
     warnings = 0
     for found in checked.diagnostics:
         if found.severity is Severity.ERROR:
-            yield problem("table", f"{found.span}: {found.message}", found.hint or "`router validate` shows the place")
+            yield problem(
+                "table", f"{found.span}: {found.message}", found.hint or "run `router validate` to see the place"
+            )
         else:
             warnings += 1
     if checked.program is None:
         return
     table = checked.program.table
     if warnings:
-        yield warning("table", plural(warnings, "warning"), f"`router validate {shown_path(checked.path)}` shows them")
+        yield warning(
+            "table", plural(warnings, "warning"), f"run `router validate {shown_path(checked.path)}` to see them"
+        )
     yield fine("table", f"{shown_path(checked.path)}: {summary(table)}")
 
 

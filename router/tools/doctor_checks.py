@@ -85,8 +85,8 @@ def receive_buffers(program: Program) -> Iterator[CheckResult]:
     yield warning(
         "buffers",
         f"the table asks for receive buffers of {wanted} bytes, the kernel allows {allowed}: bursts may be dropped",
-        f"sysctl -w net.core.rmem_max={wanted}, and permanently in /etc/sysctl.d/60-rover-router.conf; the service of "
-        "`make install-service` does not need it",
+        f"run `sysctl -w net.core.rmem_max={wanted}`, and to keep it, write it in /etc/sysctl.d/60-rover-router.conf; "
+        "the service of `make install-service` does not need it",
     )
 
 
@@ -215,7 +215,7 @@ def listeners(program: Program) -> Iterator[CheckResult]:
             yield fine("listeners", f"{about}: network interface {listener.interface} is up")
         elif listener.interface is not None:
             what = f"{about}: network interface {listener.interface} is down: the listener receives nothing"
-            yield warning("listeners", what, f"ip link set {listener.interface} up")
+            yield warning("listeners", what, f"run `ip link set {listener.interface} up`")
 
 
 def _absence(listener: Listener) -> tuple[str, str] | None:
@@ -264,7 +264,9 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
         return
     holder = port_holder(protocol, address.port)
     if holder.startswith(_KEEPS):
-        yield fine("ports", f"{what}: {holder} keeps {address} for the service; start it: systemctl start rover-router")
+        yield fine(
+            "ports", f"{what}: {holder} keeps {address} for the service; start it: `systemctl start rover-router`"
+        )
         return
     yield problem(
         "ports",
@@ -297,7 +299,7 @@ def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[Chec
     try:
         answered = answering(set(reachable.values()))
     except PermissionError:
-        remedy = "run this as root, or: sysctl -w net.ipv4.ping_group_range='0 2147483647'"
+        remedy = "run this as root, or run `sysctl -w net.ipv4.ping_group_range='0 2147483647'`"
         yield warning("endpoints", "this user may not ping, so it is unknown whether endpoints are up", remedy)
         return
     for name, host in reachable.items():

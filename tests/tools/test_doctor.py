@@ -233,7 +233,7 @@ def test_an_interface_that_is_down_is_a_warning(table: Path, monkeypatch: pytest
     program = on_interface(table, "lo")
     monkeypatch.setattr(doctor_checks, "interface_is_up", lambda _: False)
     [found] = listeners(program)
-    assert (found.grade, found.remedy) == (Grade.WARNING, "ip link set lo up")
+    assert (found.grade, found.remedy) == (Grade.WARNING, "run `ip link set lo up`")
 
 
 def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
