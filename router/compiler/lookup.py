@@ -198,6 +198,8 @@ def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str
         return f"did you mean '{ANY}'?"
     if is_source and name == ROS:
         return "write a topic as `source: {topic: NAME}`"
+    if not is_source and name.startswith("/"):
+        return f"write a topic as a key of the route: `topic: {name}`"
     is_topic = is_source and not nearest(name, known, _ALIKE)
     topic = f"; write a topic as `source: {{topic: {name}}}`" if is_topic else ""
     return did_you_mean(name, known, _ALIKE) + topic

@@ -40,6 +40,7 @@ _ELSEWHERE = {
     "websocket": ("ws", "websockets"),
     "framing": ("frame",),
     "regex": ("pattern", "re"),
+    "directory": ("path", "folder", "dir", "file"),
     "protos": ("proto_path", "path", "folder", "directory"),
     "rotate_after": ("rotate", "rotation", "split"),
     "retention": ("size", "max_size", "keep"),
@@ -110,7 +111,7 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
     if words := in_other_words(name, known):
         return words
     if is_topics_of_source(name, path):
-        return _source_with_topics(value)
+        return _topics_of_source(value)
     if ":" in name:
         return f"write `{': '.join(name.split(':', 1))}`, with a space after ':'"
     if key := meant(name, known):
@@ -130,7 +131,7 @@ def is_topics_of_source(name: str, path: Path) -> bool:
     return name == "topics" and [step for step in path if isinstance(step, str)][-1:] == ["source"]
 
 
-def _source_with_topics(value: Node) -> str:
+def _topics_of_source(value: Node) -> str:
     written = to_data(value)
     if isinstance(written, dict):
         written = _in_flow(written.get("topic")) or "NAME"
@@ -139,7 +140,7 @@ def _source_with_topics(value: Node) -> str:
         names = [item.get("topic") if isinstance(item, dict) else item for item in written]
         rest = ", ..." if any(isinstance(item, dict) and len(item) > 1 for item in written) else ""
         return f"write a list of topics: `source: [{_each(names, 'topic', rest)}]`"
-    return f"write `source: {{topic: {_in_flow(written) or 'NAME'}}}`"
+    return f"write `topic: {_in_flow(written) or 'NAME'}`"
 
 
 def _each(names: Iterable[object], key: str, rest: str = "") -> str:
@@ -179,7 +180,9 @@ def for_value(error: SchemaError) -> str:
     if error.keyword == "pattern":
         pattern = error.limit
         is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited")
-        return f"leave '{error.path[-1]}' out" if is_unset else as_variable(value) or _meant_quantity(value, pattern)
+        if is_unset:
+            return f"leave '{error.path[-1]}' out"
+        return as_variable(value) or _locator(value, error) or _meant_quantity(value, pattern)
     if error.keyword == "maximum" and matches(EACH, str(error.schema.get("pattern", ""))):
         return _MOST_OFTEN[1]
     if error.keyword == "const" and value == str(error.limit):
@@ -193,6 +196,12 @@ def for_value(error: SchemaError) -> str:
     if error.path[-1] == "fields":
         return _AUTO if value in ("*", "all") else _for_fields([value])
     return ""
+
+
+def _locator(value: str, error: SchemaError) -> str:
+    """Return a hint for an address in place of a Zenoh locator."""
+    is_meant = "zenoh" in error.path and re.fullmatch(r"[\w.-]+:\d+", value) and matches(f"tcp/{value}", error.limit)
+    return f"did you mean 'tcp/{value}'?" if is_meant else ""
 
 
 def _meant_quantity(text: str, pattern: str) -> str:
@@ -233,6 +242,7 @@ _INSTEAD: Mapping[Path, str] = {
     ("http",): _LOCAL,
     ("foxglove",): _LOCAL,
     ("endpoints", "*"): "{{address: {0}, kind: board}}",
+    ("gateways", "*", "transport", "zenoh"): "{{key: {0}}}",
     ("node",): "{{name: {0}}}",
     ("record",): "{{directory: {0}}}",
     ("defaults", "deadman"): "{{timeout: {0}}}",
@@ -241,6 +251,15 @@ _INSTEAD: Mapping[Path, str] = {
 }
 """Mappings that people write as a single value, and what to write instead."""
 
+_WORDS: Mapping[tuple[Path, str], str] = {
+    (("gateways", "*", "topics"), "*"): "leave 'topics' out to send every topic",
+    (("gateways", "*", "topics"), "all"): "leave 'topics' out to send every topic",
+    (("gateways", "*", "transport"), "udp"): "write `transport: {udp: IP:PORT}`",
+    (("gateways", "*", "transport"), "tcp"): "write `transport: {tcp: 0.0.0.0:8600}`",
+    (("gateways", "*", "transport"), "websocket"): "write `transport: {websocket: 0.0.0.0:8765}`",
+    (("gateways", "*", "transport"), "zenoh"): "write `transport: {zenoh: {key: NAME}}`",
+}
+"""Words that people write in place of a mapping, and the hint for them."""
 _ON: Mapping[Path, str] = {
     ("record",): "{directory: ../recordings}",
     ("http",): "{address: 127.0.0.1:9108}",
@@ -263,6 +282,10 @@ def for_type(error: SchemaError, tree: Node) -> str:
         return _ADD_SPACE
     if error.path[:-1] == ("routes",):
         return f"write `{name}: {{ignore: why}}`" if value in (False, "ignore", "none") else ""
+    if said := next(
+        (hint for (place, word), hint in _WORDS.items() if word == value and _is_at(error.path, place)), ""
+    ):
+        return said
     if error.is_list_in_list:
         rows = to_data(node_at(tree, error.path[:-1]))
         count = sum(len(row) if isinstance(row, list) else 1 for row in rows) if isinstance(rows, list) else 0
@@ -302,7 +325,7 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
         return f"write it without quotes: {value}"
     if isinstance(value, bool):
         return _for_truth(error.path, value)
-    if hint := _for_collection(error, value):
+    if hint := _for_collection(error, value) or _with_unit(error, value):
         return hint
     if _is_at(error.path[-3:], ("deadman", "send", "*")):
         return without_case({name: value})
@@ -315,7 +338,8 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
         key = "NAME" if name == "address" else name
         return f"write `{text}`" if isinstance(error.path[-1], int) else f"write `{key}: {text}`"
     if error.limit == "array":
-        return f"write `{name}: [{written}]`"
+        is_address = "zenoh" in error.path and re.fullmatch(r"[\w.-]+:\d+", written)
+        return f"write `{name}: [{'tcp/' if is_address else ''}{written}]`"
     if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
         return f'quote it: "{written}"'
     return ""
@@ -349,23 +373,43 @@ def _for_collection(error: SchemaError, value: object) -> str:
     if not isinstance(value, list):
         return ""
     if error.path in _BY_NAME:
-        return "replace each '-' with a name and ':'"
-    if error.path[-1] in _NAMED.values():
-        return f"write a list of mappings: [{_each(value, str(error.path[-1]))}]"
-    return _for_fields(value) if error.path[-1] == "fields" else ""
+        return "remove each '-'" if value and all(map(_is_named, value)) else "replace each '-' with a name and ':'"
+    name = str(error.path[-1])
+    if name in _NAMED.values() and error.limit == "string":
+        return f"write a list of mappings: [{_each(value, name)}]"
+    if name == "topic":
+        return f"write `topics: [{_in_flow(value) or '...'}]`"
+    return _for_fields(value) if name == "fields" else ""
+
+
+def _is_named(item: object) -> bool:
+    return isinstance(item, dict) and len(item) == 1 and isinstance(next(iter(item.values())), (dict, list))
+
+
+def _with_unit(error: SchemaError, value: object) -> str:
+    """Return a hint for a number without its unit."""
+    pattern = str(error.schema.get("pattern", ""))
+    if not pattern or not isinstance(value, (int, float)):
+        return ""
+    written = [each for unit in ("ms", "s", "B", "B/s") if matches(each := f"{value}{unit}", pattern)]
+    return " or ".join((f"write `{written[0]}`", *(f"`{each}`" for each in written[1:]))) if written else ""
 
 
 def _for_fields(items: list[object]) -> str:
     """Return a hint for `fields` written as a list."""
     if items == ["auto"]:
         return _AUTO
-    first = items[0] if items else None
+    first, rest = items[0] if items else None, ", ..." * (len(items) > 1)
     if isinstance(first, dict) and len(first) == 1:
         [(field, expression)] = first.items()
-        written = f"{field}: {_in_flow(expression) or 'EXPRESSION'}{', ...' * (len(items) > 1)}"
-        return f"remove each '-', as in `fields: {{{written}}}`"
-    field = first if isinstance(first, str) else "FIELD"
-    return f"write each field with its expression, as in `fields: {{{field}: EXPRESSION}}`"
+        return f"remove each '-', as in `fields: {{{field}: {_in_flow(expression) or 'EXPRESSION'}{rest}}}`"
+    written = _ASSIGNMENT.fullmatch(first) if isinstance(first, str) else None
+    field, expression = written.groups() if written else ("FIELD", None)
+    return f"write each field with its expression, as in `fields: {{{field}: {expression or 'EXPRESSION'}{rest}}}`"
+
+
+_ASSIGNMENT = re.compile(r"([\w.]+)(?:\s*[=:]\s*(\S.*))?")
+"""A field's name, perhaps with an expression."""
 
 
 def _is_at(path: Path, place: Path) -> bool:
