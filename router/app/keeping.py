@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
@@ -32,10 +33,11 @@ class Keeper:
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
         """Start to save the running program, compiled from `read`. `program` returns it with counters of its own."""
-        if read.plain() != self._kept:
-            self._thread.submit(self._keep, program, read.plain())
-        else:
-            self._thread.submit(store.works)
+        work = partial(self._keep, program, read.plain()) if read.plain() != self._kept else store.works
+        try:
+            self._thread.submit(work)
+        except (RuntimeError, MemoryError) as error:  # no thread can be started
+            self._failed(error)
 
     def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
         from router.carrier.image import image_of
@@ -44,10 +46,14 @@ class Keeper:
             if (compiled := program()) is not None:
                 store.write(read, *image_of(self._library, compiled))
         except OSError as error:
-            if not self._has_failed:
-                logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
-            self._has_failed = True
+            self._failed(error)
         except Exception as error:  # noqa: BLE001 - a bug, which is logged: the router runs all the same
             fault(error, "prevented it from keeping the compiled program").log()
         else:
             self._kept = read
+
+    def _failed(self, error: Exception) -> None:
+        """Log the first failure."""
+        if not self._has_failed:
+            logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
+        self._has_failed = True

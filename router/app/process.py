@@ -73,14 +73,15 @@ def _notify_socket() -> socket.socket | None:
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return None
-    notifying = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    notifying.settimeout(NOTIFY_TIMEOUT)
-    try:
-        notifying.connect(f"\0{address[1:]}" if address.startswith("@") else address)
-    except OSError as error:
-        notifying.close()
-        logger.warning("the service manager cannot be notified", address=address, error=str(error))
-        return None
+    with ExitStack() as opening:
+        try:
+            notifying = opening.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+            notifying.settimeout(NOTIFY_TIMEOUT)
+            notifying.connect(f"\0{address[1:]}" if address.startswith("@") else address)
+        except OSError as error:
+            logger.warning("the service manager cannot be notified", address=address, error=str(error))
+            return None
+        opening.pop_all()
     return notifying
 
 

@@ -314,7 +314,10 @@ class Services:
             return
         last = self._last_request
         if last is None or last.running() or last.done():
-            self._last_request = self._saving.submit(_save, self._recorder, reason)
+            try:
+                self._last_request = self._saving.submit(_save, self._recorder, reason)
+            except (RuntimeError, MemoryError) as error:  # no thread can be started
+                logger.error("cannot save the last datagrams", problem=str(error))
 
 
 def _save(recorder: Recorder, reason: str) -> None:

@@ -38,8 +38,8 @@ _MEMINFO_DROPS = 8
 _INODE = 9
 """Column of the inode in /proc/net/udp and /proc/net/tcp."""
 
-_BOUND = {"udp": "07", "tcp": "0A"}
-"""State in /proc/net of a socket that receives from any sender."""
+_BOUND = {"udp": ("07", "01"), "tcp": ("0A",)}
+"""States in /proc/net of sockets that keep others from binding their port: a UDP socket also if it is connected."""
 
 
 def send_arrivals(opened: socket.socket) -> None:
@@ -197,7 +197,7 @@ def _inodes(protocol: str, port: int) -> Iterator[str]:
     for table in protocol, f"{protocol}6":
         for row in _rows(table):
             local, state, inode = row[1], row[3], row[_INODE]
-            if state == _BOUND[protocol] and int(local.rpartition(":")[2], 16) == port:
+            if state in _BOUND[protocol] and int(local.rpartition(":")[2], 16) == port:
                 yield inode
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -79,6 +80,21 @@ def test_a_service_manager_that_is_gone_is_told_of_in_the_log(tmp_path: Path, mo
     with capture_logs() as log:
         notify("READY=1")
     assert [line["event"] for line in log] == ["the service manager cannot be notified"]
+
+
+def test_without_a_free_descriptor_a_reload_goes_on(manager: socket.socket) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with capture_logs() as logged:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+        try:
+            with reloading():
+                pass
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert [entry["error"] for entry in logged] == ["[Errno 24] Too many open files"] * 2
+    manager.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        manager.recv(1000)
 
 
 def test_a_service_manager_that_does_not_listen_holds_nobody_up(

@@ -86,12 +86,13 @@ def test_a_reload_opens_again_what_a_stuck_thread_kept_open(
     site: Site, stuck: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_in, goes_on = stuck
-    monkeypatch.setattr("router.app.plane._PATIENCE_S", 0.05)
     with site.router(KEPT) as router:
         site.send(numbered(1))
         assert is_in.wait(20)
         site.write(ROUTES, listen=f'  rover: {{address: "127.0.0.1:{free_port()}"}}')
-        assert router.reload().ok
+        with monkeypatch.context() as impatient:  # the next reload waits for threads that have yet to run
+            impatient.setattr("router.app.plane._PATIENCE_S", 0.05)
+            assert router.reload().ok
         goes_on.set()
         wait_until(lambda: router.total("messages_published") == 1)
         site.write(KEPT.replace("Float32", "Float64"))

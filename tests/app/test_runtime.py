@@ -20,13 +20,16 @@ from structlog.testing import capture_logs
 
 from router import threads
 from router.app import Router
+from router.app.keeping import Keeper
 from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
+from router.carrier.library import load
 from router.carrier.publishing import PublishThread
 from router.compiler.metrics import REJECT_REASONS
 from router.declared import MAX_DATAGRAM
 from router.errors import StartError
+from router.inputs import Inputs
 from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
@@ -216,6 +219,39 @@ def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeyp
         assert saved.get(timeout=10) == "second"
         wait_until(lambda: [entry.get("problem") for entry in logged].count("the disk is full") == 2)
     assert saved.empty()
+
+
+class NoThread:
+    """A thread for which there is no memory."""
+
+    def __init__(self, *_: object) -> None: ...
+
+    def start(self) -> None:
+        raise RuntimeError("can't start new thread")
+
+
+def test_a_recording_for_which_there_is_no_thread_ends_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        capture_logs() as logged,
+        Router(site.program(ROUTE + "record: {directory: recordings, last: 60s}\n")) as router,
+    ):
+        with monkeypatch.context() as short:
+            short.setattr(threads, "Thread", NoThread)
+            router.save_recording("signal")
+        assert [entry["problem"] for entry in logged if "cannot save" in entry["event"]] == ["can't start new thread"]
+        router.save_recording("signal")
+        wait_until(lambda: "saved the last datagrams" in [entry["event"] for entry in logged])
+
+
+def test_a_program_for_which_there_is_no_thread_is_not_kept_and_ends_nothing(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = Keeper(load(), Inputs(), Inputs(), None)
+    monkeypatch.setattr(threads, "Thread", NoThread)
+    with capture_logs() as logged, Router(site.program(ROUTE), keeper=keeper) as router:
+        assert router.reload().ok
+    why = [(entry["log_level"], entry["why"]) for entry in logged if "is not kept" in entry["event"]]
+    assert why == [("warning", "can't start new thread")]
 
 
 def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,6 +135,14 @@ def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
     )
 
 
+def test_the_port_of_a_listener_that_accepts_nothing_new_is_the_routers(stack: ExitStack) -> None:
+    """After a reload, a thread that is stuck may keep it open."""
+    ended = listen(stack)
+    ended.end_input()
+    with pytest.raises(StartError, match=rf"the router itself \(pid {os.getpid()}\) has the port"):
+        Listener(plan(port=ended.address.port))
+
+
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
