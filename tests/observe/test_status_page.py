@@ -118,15 +118,17 @@ def test_the_whole_rover_is_seen_without_scrolling(page: Page) -> None:
     assert last <= DESKTOP[1]
 
 
+OVERLAPPING = """[0, 1, 2].flatMap((column) => boxes(column).flatMap((one, i, all) =>
+  all.slice(i + 1).filter((other) => {
+    const [a, b] = [one, other].map(({element}) => element.getBoundingClientRect());
+    return a.top < b.bottom && b.top < a.bottom;
+  }).map((other) => [one.name, other.name])))"""
+
+
 def test_no_box_overlaps_another_and_lines_end_at_boxes(page: Page) -> None:
-    overlapping = """[0, 1, 2].flatMap((column) => boxes(column).flatMap((one, i, all) =>
-      all.slice(i + 1).filter((other) => {
-        const [a, b] = [one, other].map(({element}) => element.getBoundingClientRect());
-        return a.top < b.bottom && b.top < a.bottom;
-    }).map((other) => [one.name, other.name])))"""
     for size in SIZES[1:]:
         accessibility.show_at(page, size)
-        assert page.evaluate(overlapping) == []
+        assert page.evaluate(OVERLAPPING) == []
         ends = page.evaluate("links.filter((link) => link.element).map((link) => link.line.getAttribute('d'))")
         assert len(ends) > 30
         assert all(path.startswith("M") and "NaN" not in path for path in ends)
@@ -316,24 +318,32 @@ gateways:
 """
 
 
-def test_a_deadman_of_a_client_is_drawn_from_its_gateway_to_its_topic(browser: Browser, tmp_path: Path) -> None:
+@pytest.fixture
+def clients(tmp_path: Path) -> Iterator[FakeRunning]:
+    """A router with a gateway on whose topics clients may publish, two of them with a deadman."""
     table = tmp_path / "clients.yaml"
     table.write_text(CLIENT_DEADMEN)
     program = check_table(table).program
     assert program is not None
-    running = FakeRunning(program)
-    running.count("config_last_reload_successful", to=1)
-    health = FakeHealth(running)
+    opened = FakeRunning(program)
+    opened.count("config_last_reload_successful", to=1)
+    yield opened
+    opened.mirror.close()
+    assert opened.failures == []
+
+
+def test_a_deadman_of_a_client_is_drawn_from_its_gateway_to_its_topic(clients: FakeRunning, browser: Browser) -> None:
+    health = FakeHealth(clients)
     drawn, other = (f"links.find((link) => link.route === 'phone:{topic}')" for topic in ("/cmd_vel", "/arm_vel"))
     is_seen = f"{drawn}.line.checkVisibility() && {drawn}.mark.checkVisibility()"
-    with closing(served(running, health=health)) as server:
+    with closing(served(clients, health=health)) as server:
         page = open_page(browser, f"http://{server.address}/")
         until_compared(page)
         assert page.evaluate("boxes(2).map(({ name }) => name)") == ["clients of phone", "/cmd_vel", "/arm_vel"]
         assert not page.evaluate(is_seen)
-        running.count("messages_published", "phone", "/cmd_vel", to=9)
-        running.count("deadman_active", "phone:/cmd_vel", to=1)
-        running.count("deadman_datagrams_sent", "phone:/cmd_vel", "/cmd_vel", to=40)
+        clients.count("messages_published", "phone", "/cmd_vel", to=9)
+        clients.count("deadman_active", "phone:/cmd_vel", to=1)
+        clients.count("deadman_datagrams_sent", "phone:/cmd_vel", "/cmd_vel", to=40)
         page.until(f"{drawn}.state === 'sending' && {is_seen}")
         assert page.evaluate(f"{other}.state") == ""
         commands = line("gateway:phone", "to:/cmd_vel")
@@ -352,8 +362,16 @@ def test_a_deadman_of_a_client_is_drawn_from_its_gateway_to_its_topic(browser: B
         page.until(f"{drawn}.state === 'calm' && {is_seen}")
         assert page.complaints() == []
         page.close()
-    running.mirror.close()
-    assert running.failures == []
+
+
+def test_a_box_that_grows_moves_those_below_it(clients: FakeRunning, browser: Browser) -> None:
+    with closing(served(clients)) as server:
+        page = open_page(browser, f"http://{server.address}/", (1920, 1080))
+        assert page.evaluate(OVERLAPPING) == []
+        page.evaluate(f"{box('to:gateway:phone')}.querySelector('.more').textContent = 'grows '.repeat(90)")
+        page.until(f"{OVERLAPPING}.length === 0")
+        assert page.complaints() == []
+        page.close()
 
 
 def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
