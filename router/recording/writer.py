@@ -173,6 +173,9 @@ def _encoded(records: Iterable[McapRecord]) -> bytes:
     return encoded
 
 
+_DISK_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
+
+
 def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
     there = settings.directory
     remedy = f"create it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
@@ -182,16 +185,22 @@ def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
 class RecordingDirectory:
     """The files `STEM_TIME[_REASON].mcap` in a table's `record.directory`; others are not touched.
 
-    They have at most `retention` bytes in total. Creates the directory. Raises StartError.
+    They have at most `retention` bytes in total. Creates the directory. Raises StartError, but not if the disk is full
+    or fails: that prevents no start, as it ends no router.
     """
 
     def __init__(self, settings: RecordSettings, stem: str) -> None:
+        there = settings.directory
         try:
-            settings.directory.mkdir(parents=True, exist_ok=True)
+            there.mkdir(parents=True, exist_ok=True)
+            if not os.access(there, os.W_OK | os.X_OK):
+                if os.statvfs(there).f_flag & os.ST_RDONLY:
+                    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+                raise _cannot_record(settings, "this user has no write permission there")
         except OSError as error:
-            raise _cannot_record(settings, error.strerror) from error
-        if not os.access(settings.directory, os.W_OK | os.X_OK):
-            raise _cannot_record(settings, "this user has no write permission there")
+            if error.errno not in _DISK_FAILURES:
+                raise _cannot_record(settings, error.strerror) from error
+            logger.error("nothing can be recorded now; routing all the same", where=str(there), problem=error.strerror)
         self.path = settings.directory.resolve()
         self._stem = stem
         self._retention = settings.retention

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic, sleep, time_ns
@@ -209,6 +211,37 @@ def test_a_directory_that_cannot_be_is_an_error_of_the_start(last: int | None, t
     (tmp_path / "file").touch()
     with pytest.raises(StartError, match=r"table.yaml:3:1: cannot record to .*: (Not a directory|File exists)"):
         recorder(FakeMirror(), settings(tmp_path / "file", last=last))
+
+
+def _read_only(monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=os.ST_RDONLY))
+    return errno.EROFS
+
+
+def _without_folder(number: int, monkeypatch: pytest.MonkeyPatch) -> int:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", fail)
+    return number
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [_read_only, *(partial(_without_folder, number) for number in (errno.ENOSPC, errno.EROFS, errno.EIO))],
+    ids=["read-only", "full and empty", "read-only and empty", "broken and empty"],
+)
+def test_a_disk_that_has_failed_prevents_no_start(
+    failure: Callable[[pytest.MonkeyPatch], int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ExitStack() as recording, capture_logs() as logs:
+        with monkeypatch.context() as failing:
+            number = failure(failing)
+            made, mirror = recording.enter_context(running_recorder(tmp_path / "new"))
+        assert [(line["log_level"], line["problem"]) for line in logs] == [("error", os.strerror(number))]
+        show(made, mirror, shown := now(imu(1)))
+    assert [again(each) for path in files(tmp_path / "new") for each in read(path)] == shown
 
 
 def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
