@@ -91,7 +91,7 @@ class Router:
             self._runtime.close_with(opening)
             services = opening.enter_context(StopStack(opening))  # closed after deadmen have sent a last time
             self._runtime.end_with(opening)
-            self._runtime.plane.tell()
+            self._runtime.plane.start_reporting()
             with background_threads():
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)

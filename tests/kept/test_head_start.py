@@ -185,9 +185,9 @@ def test_a_socket_that_a_head_start_sends_by_is_closed_once_no_thread_uses_it(
     left, was_open = started.senders["basestation"].socket, []
 
     class Observed(Plane):
-        def has_passed(self) -> bool:
+        def wait_until_adopted(self) -> bool:
             was_open.append(left.fileno() >= 0)
-            return super().has_passed()
+            return super().wait_until_adopted()
 
     monkeypatch.setattr(whole, "Plane", Observed)
     with Router(program, head_start=started):
