@@ -70,19 +70,19 @@ def run(args: argparse.Namespace) -> int:
     if attempt is not None:
         _log(attempt)
     with uncollected():  # until the router has started
-        with inputs.noted() as asked:
+        with inputs.noted() as selection:
             parameters = ros_parameters(args.ros_args)
             environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
             table = _table(args, ROUTES_PATH, parameters.get(ROUTES_PATH))
-        with inputs.recording(asked) as read:
+        with inputs.recording(selection) as read:
             program = good_table(table, environ)[1]  # only the program, so that a reload can free the rest
-        _warn_of(without_effect(args.ros_args, program, environ.asked))
+        _warn_of(without_effect(args.ros_args, program, environ.names_read))
         start = "compiled"
         keeper = None
         if attempt is not None:
             start = _reconcile(attempt, program, read)
             kept = attempt.head_start.inputs if attempt.head_start is not None else None
-            keeper = Keeper(library(), asked, read, kept)
+            keeper = Keeper(library(), selection, read, kept)
         if not signal.sigpending() & _ENDING:  # held back since the head start began
             route(program, args.ros_args, environ, attempt, keeper, start)
     return OK
