@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 class Keeper:
     """Saves compiled programs, in a thread of its own.
 
-    `asked` are the inputs that selected the table, `read` the inputs of the first program, and `kept` the inputs of the
-    program on disk, or None.
+    `selection` are the inputs that selected the table, `read` the inputs of the first program, and `kept` the inputs of
+    the program on disk, or None.
     """
 
-    def __init__(self, library: ctypes.CDLL, asked: Inputs, read: Inputs, kept: Plain | None) -> None:
-        self.asked = asked
+    def __init__(self, library: ctypes.CDLL, selection: Inputs, read: Inputs, kept: Plain | None) -> None:
+        self.selection = selection
         self.read = read
         self._library = library
         self._kept = kept

@@ -101,7 +101,7 @@ class Plane:
         self._forwarding, self._names = forwarding, forwarding.names
         self._deadmen, self._carrier = forwarding.deadmen, forwarding.carrier
         self._generations = count(KEPT_GENERATION + 1)
-        self._explaining = {KEPT_GENERATION: first} if head_start is not None else {}
+        self._programs = {KEPT_GENERATION: first} if head_start is not None else {}
         """Programs that explain events, by generation; the newest one is last."""
         self._is_running, self.has_stopped = head_start is not None, False
         size = counts.counters.size
@@ -128,7 +128,7 @@ class Plane:
         """Return the topics on which native threads are publishing now, each with the seconds since the call began."""
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
 
-    def tell(self) -> None:
+    def start_reporting(self) -> None:
         """Start to report events, and to signal that Python is alive. All receivers of events must be complete."""
         self._events.start()
 
@@ -213,16 +213,17 @@ class Plane:
 
     # running a program
 
-    def adopt(self, built: Built, left: Sequence[Listener] = ()) -> None:
-        """Switch to a program; the first one starts the threads. Listeners in `left` are drained and closed to input.
+    def adopt(self, built: Built, unused: Sequence[Listener] = ()) -> None:
+        """Switch to a program; the first one starts the threads. `unused` listeners are drained and closed to input.
 
-        Raises StuckError or StartError with nothing changed. Until `has_passed`, threads may use the earlier program.
+        Raises StuckError or StartError with nothing changed. Threads may use the earlier program until
+        `wait_until_adopted` returns True.
         """
         earlier, generation = self.now, built.native.generation
         with ExitStack() as undo:
             for thread in self._from_ros:
-                thread.leave(built.from_ros)
-                undo.callback(thread.stay)
+                thread.hand_over(built.from_ros)
+                undo.callback(thread.take_back)
             # Before the publish thread receives a message of this program.
             topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
             built.native.arrays.keep(topics)
@@ -235,7 +236,7 @@ class Plane:
             if self._head_start is not None:  # it has the same state: no timer ends, and no deadman is replaced
                 self._carrier.change(change_to(built.native, built.timers(None, of_topics=False)), built.native)
         else:
-            for listener in left:
+            for listener in unused:
                 listener.end_input()
             deadmen = replaced(built.deadmen, earlier.deadmen)
             change = change_to(built.native, built.timers(earlier, of_topics=False), deadmen)
@@ -247,9 +248,9 @@ class Plane:
             thread.follow(other)
             thread.adopt(built.from_ros)
         self.now = built
-        self._explaining = {**(self._explaining if earlier is None else {}), generation: built.program}
+        self._programs = {**(self._programs if earlier is None else {}), generation: built.program}
 
-    def has_passed(self) -> bool:
+    def wait_until_adopted(self) -> bool:
         """Wait until nothing of an earlier program is in use. Return False if that takes longer than a second."""
         if not self._is_running or self.now is None:
             return True
@@ -260,12 +261,12 @@ class Plane:
         if late:
             logger.error("thread did not leave the old program in time; its sockets and topics stay open", threads=late)
             return False
-        if not self._has_turned() or not all(thread.has_passed for thread in self._from_ros):
+        if not self._wait_for_turn() or not all(thread.has_adopted for thread in self._from_ros):
             return False
         self._head_start = None
         return True
 
-    def _has_turned(self) -> bool:
+    def _wait_for_turn(self) -> bool:
         """Wait until the receive thread has finished its present turn, in which it may drop an earlier message."""
         turns = self._carrier.turns
         for _ in range(int(_PATIENCE_S / _TURN_S)):
@@ -336,12 +337,12 @@ class Plane:
     # explaining events
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
-        newest = next(reversed(self._explaining.values()), None)
+        newest = next(reversed(self._programs.values()), None)
         return why_rejected(newest, listener, data, length) if newest is not None else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" if an earlier program refused the message."""
-        program = self._explaining.get(generation)
+        program = self._programs.get(generation)
         return where_refused(program.lowered, route, topic, target, place) if program is not None else ""
 
 

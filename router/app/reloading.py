@@ -96,7 +96,7 @@ class Reloader:
         """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
         try:
-            with inputs.recording(self._keeper.asked if self._keeper else None) as read:
+            with inputs.recording(self._keeper.selection if self._keeper else None) as read:
                 checked = self._check(now)
             findings = checked.diagnostics
             then = checked.program_in(now.counters.continued())

@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time 
     from prometheus_client.metrics_core import Metric as Family
 
     from router.gateway.clients import ClientQueue
-    from router.observe.metrics import Asked, CountersCollector
+    from router.observe.metrics import CountersCollector, SeriesFunction
     from router.recording.recorder import Recorder
 
 _TOTALS = (
@@ -91,7 +91,7 @@ class Router:
             self._runtime.close_with(opening)
             services = opening.enter_context(StopStack(opening))  # closed after deadmen have sent a last time
             self._runtime.end_with(opening)
-            self._runtime.plane.tell()
+            self._runtime.plane.start_reporting()
             with background_threads():
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)
@@ -211,14 +211,14 @@ class Router:
         if self._interfaces is not None:
             self._interfaces.close()
 
-    def _asked(self) -> dict[str, Asked]:
+    def _computed_series(self) -> dict[str, SeriesFunction]:
         """Return the series without a counter, whose values are computed at each scrape."""
 
-        def of_clients(value: Callable[[ClientQueue], float]) -> Asked:
+        def of_clients(value: Callable[[ClientQueue], float]) -> SeriesFunction:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
 
         return {
-            **self._services.asked(),
+            **self._services.computed_series(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
@@ -238,7 +238,7 @@ class Router:
         }
         # Use this program's counters: those of the running program are adopted only once no thread is stuck.
         copies = partial(self._counts.copies, program.counters.size)
-        return CountersCollector(program.counters, copies, self._asked(), build)
+        return CountersCollector(program.counters, copies, self._computed_series(), build)
 
 
 class Services:
@@ -285,10 +285,10 @@ class Services:
             opening.callback(server.close)
             self.http_address = server.address
 
-    def asked(self) -> Mapping[str, Asked]:
+    def computed_series(self) -> Mapping[str, SeriesFunction]:
         """Return the series of the services and of the table."""
 
-        def recorded(metric: str) -> Asked:
+        def recorded(metric: str) -> SeriesFunction:
             return lambda: self._recorder.samples()[metric] if self._recorder else ()
 
         own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}

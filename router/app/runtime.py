@@ -107,7 +107,7 @@ class Runtime:
         For the first program, deadmen send here, and gateways are opened later, by `start`, because they take longer to
         open than sockets and topics.
         """
-        if self._unfinished and self.plane.has_passed():
+        if self._unfinished and self.plane.wait_until_adopted():
             self._close_unfinished()  # before `program` opens the same addresses or topics
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
@@ -137,7 +137,7 @@ class Runtime:
         try:
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
-            self.plane.adopt(change.built, self.sockets.left(change.sockets))
+            self.plane.adopt(change.built, self.sockets.unused_listeners(change.sockets))
         except BaseException:
             change.undo.close()
             raise
@@ -152,7 +152,7 @@ class Runtime:
         Sockets and topics that a stuck thread uses stay open until it continues. All steps run even if one raises.
         """
         with ExitStack() as last_first:
-            last_first.callback(self._close_passed, change, earlier)
+            last_first.callback(self._close_unused, change, earlier)
             if self._ros is not None and change.ros is not None:
                 self._ros.watch(change.ros)
 
@@ -168,13 +168,13 @@ class Runtime:
         except Exception as error:  # noqa: BLE001 a bug is logged; the program keeps running
             fault(error, "prevented it from closing unused sockets and topics").log()
 
-    def _close_passed(self, change: Change, earlier: Built | None) -> None:
+    def _close_unused(self, change: Change, earlier: Built | None) -> None:
         """Close what no thread uses any more, of this reload and earlier ones."""
-        self._unfinished.append(lambda: self._close_left(change, earlier))
+        self._unfinished.append(lambda: self._close_earlier(change, earlier))
         with ExitStack() as last_first:
             # The threads of a head start may still send through the sockets that moves replace.
             is_first = earlier is None and not change.sockets.moves
-            if is_first or self.plane.has_passed():
+            if is_first or self.plane.wait_until_adopted():
                 last_first.callback(self._counts.replace, change.program.counters)
                 last_first.callback(self._close_unfinished)
             else:
@@ -190,9 +190,9 @@ class Runtime:
                 last_first.callback(close)
             self._unfinished = []
 
-    def _close_left(self, change: Change, earlier: Built | None) -> None:
+    def _close_earlier(self, change: Change, earlier: Built | None) -> None:
         with ExitStack() as last_first:
-            last_first.callback(change.sockets.left.close)
+            last_first.callback(change.sockets.unused.close)
             if self._ros is not None and change.ros is not None:
                 last_first.callback(self._ros.finish, change.ros)
             last_first.callback(change.built.state.forget_previous)
@@ -227,8 +227,8 @@ class Runtime:
 
     def _follow_drops(self, gateways: GatewayThread, change: GatewayChange) -> None:
         drops = self.drops
-        for service in change.left:
-            drops.leave(service.name)
+        for service in change.unused:
+            drops.unfollow(service.name)
         for service in change.opened:
             if service.name in gateways.kernel_drops:
                 drops.follow(service.name, gateways.kernel_drops[service.name])

@@ -24,7 +24,7 @@ class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
     `moves` are new sockets for senders that stay, each with the listener whose port it uses. `opened` closes the
-    sockets opened for the change. Once the change is applied, `left` closes the sockets that it does not use.
+    sockets opened for the change. Once the change is applied, `unused` closes the sockets that it does not use.
     """
 
     program: Program
@@ -32,7 +32,7 @@ class SocketChange:
     senders: dict[str, NativeSender]
     moves: list[tuple[NativeSender, ListeningSocket | None, socket.socket]]
     opened: ExitStack
-    left: ExitStack = field(default_factory=ExitStack)
+    unused: ExitStack = field(default_factory=ExitStack)
 
 
 def _log_absence(listener: model.Listener) -> None:
@@ -88,10 +88,10 @@ class KernelDrops:
 
     def follow(self, name: str, dropped: Callable[[], int], *, since: int = 0) -> None:
         """Count the drops of a socket for `name`: the result of `dropped`, minus `since`."""
-        self.leave(name)
+        self.unfollow(name)
         self._now[name] = dropped, since
 
-    def leave(self, name: str) -> None:
+    def unfollow(self, name: str) -> None:
         """Stop counting for `name`, before its socket is closed or gets another name."""
         if name in self._now:
             dropped, since = self._now.pop(name)
@@ -167,19 +167,19 @@ class Sockets:
         senders = [sender for _, sender in self._senders.values()]
         return {sender.source.address[1] for sender in senders if sender.source is not None and sender.is_bound}
 
-    def left(self, change: SocketChange) -> list[Listener]:
+    def unused_listeners(self, change: SocketChange) -> list[Listener]:
         """Return the listeners that the change does not use."""
         return [each for each in self._bound.values() if each not in change.listeners.values()]
 
     def apply(self, change: SocketChange) -> None:
         """Replace the sockets with those of the change."""
-        for listener in self.left(change):
-            change.left.callback(listener.close)
+        for listener in self.unused_listeners(change):
+            change.unused.callback(listener.close)
         for endpoint, (_, sender) in self._senders.items():
             if change.senders.get(endpoint) is not sender:
-                change.left.callback(sender.close)
+                change.unused.callback(sender.close)
         for sender, source, opened in change.moves:
-            change.left.callback(sender.move(source, opened).close)
+            change.unused.callback(sender.move(source, opened).close)
         self._follow_drops(change)
         plans = {plan.name: plan for plan in change.program.listeners}
         for name, listener in change.listeners.items():
@@ -199,7 +199,7 @@ class Sockets:
     def _follow_drops(self, change: SocketChange) -> None:
         moved = {name for name, each in self.listeners.items() if change.listeners.get(name) is not each}
         for name in moved:
-            self._drops.leave(name)
+            self._drops.unfollow(name)
         known = self._bound.values()
         for name, listener in change.listeners.items():
             if self.listeners.get(name) is not listener:

@@ -21,7 +21,7 @@ _PULSE_MS = 5000
 
 
 @dataclass(frozen=True, slots=True)
-class Changed:
+class DeadmanChange:
     """The deadman of a route has tripped or was released."""
 
     route: str
@@ -29,7 +29,7 @@ class Changed:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class CountedReport:
     """A loss or a rejection, and the counter of its kind."""
 
     counter: int
@@ -53,7 +53,7 @@ class EventReader:
         self._detail = detail
         self._place = place
 
-    def read(self, kind: int, record: memoryview) -> Changed | Told:
+    def read(self, kind: int, record: memoryview) -> DeadmanChange | CountedReport:
         if kind == EventKind.REJECTED:
             return self._rejected(record)
         if kind == EventKind.LOST:
@@ -61,21 +61,23 @@ class EventReader:
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
-            return Changed(route, kind == EventKind.TRIPPED)
+            return DeadmanChange(route, kind == EventKind.TRIPPED)
         text = _text(record[ctypes.sizeof(event) :])
         error = _error(event.error) or OSError(f"it cannot be published: {text}")
-        return Told(event.counter, Report("deadman", route, self._name(event.destination), "send_error", error))
+        return CountedReport(
+            event.counter, Report("deadman", route, self._name(event.destination), "send_error", error)
+        )
 
-    def _rejected(self, record: memoryview) -> Told:
+    def _rejected(self, record: memoryview) -> CountedReport:
         event, begin = RejectedEvent.from_buffer(record), ctypes.sizeof(RejectedEvent)
         place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
         host, what = inet_ntoa(event.address.to_bytes(4, "big")), self._detail(place, data, event.length)
         detail = f"from {host}:{event.port}" + (f": {what}" if what else "")
         mismatch = Mismatch(place, host, what) if event.reason == Reason.SOURCE_MISMATCH else None
         report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
-        return Told(event.counter, report)
+        return CountedReport(event.counter, report)
 
-    def _lost(self, record: memoryview) -> Told:
+    def _lost(self, record: memoryview) -> CountedReport:
         event = LostEvent.from_buffer(record)
         route, target = self._name(event.route), self._name(event.target)
         text = bytes(record[ctypes.sizeof(event) :]).partition(b"\0")[0]
@@ -84,7 +86,9 @@ class EventReader:
             topic = self._name(event.topic) if event.topic != NO_NAME else None
             place = self._place(route, topic, target, event.generation, event.place)
             detail = ": ".join(filter(None, (place, detail)))
-        return Told(event.counter, Report("drop", route, target, LOSSES[event.reason], _error(event.error), detail))
+        return CountedReport(
+            event.counter, Report("drop", route, target, LOSSES[event.reason], _error(event.error), detail)
+        )
 
 
 class EventThread:
@@ -142,18 +146,18 @@ class EventThread:
                 position = 0
                 while position < len(records):
                     head = EventHead.from_buffer(records, position)
-                    self._tell(head.kind, records[position : position + head.size], counters, last)
+                    self._dispatch(head.kind, records[position : position + head.size], counters, last)
                     position += head.size
             for counter, (_, report) in list(last.items()):  # losses without an event
                 self._count(counter, report, counters, last)
 
-    def _tell(
+    def _dispatch(
         self, kind: int, record: memoryview, counters: Sequence[int], last: dict[int, tuple[int, Report]]
     ) -> None:
         match self._reader.read(kind, record):
-            case Changed(route, is_tripped):
+            case DeadmanChange(route, is_tripped):
                 self._changed(route, is_tripped)
-            case Told(counter, report):
+            case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
 
     def _count(

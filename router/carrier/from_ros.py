@@ -22,7 +22,7 @@ _IN_TRANSIT_S = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class _Served:
+class _TopicSet:
     """The topics that the thread serves, and the eventfd of each subscription. `structure` points into `topics`."""
 
     messages: NativeFromRos
@@ -54,11 +54,11 @@ class FromRosThread(NativeThread):
         super().__init__(library, counts, events, library.from_ros_counters)
         self.name = "ros urgent" if is_urgent else "ros messages"
         self.is_urgent = is_urgent
-        self.has_passed = True
+        self.has_adopted = True
         """Whether the thread serves the topics that it was last given."""
         self._deadmen = deadmen
         self._adopted = NativeFromRos()
-        self._served = _served(NativeFromRos(), {})
+        self._served = _topic_set(NativeFromRos(), {})
         self._reported = 0
 
     def start(self, take: int, reset: int) -> None:
@@ -88,7 +88,7 @@ class FromRosThread(NativeThread):
             )
         self._reported = failures
 
-    def leave(self, messages: NativeFromRos) -> None:
+    def hand_over(self, messages: NativeFromRos) -> None:
         """Stop serving the topics that `messages` assign to the other thread, after handling what has arrived on them.
 
         Raises StuckError with nothing changed, even if there is no such topic.
@@ -96,11 +96,11 @@ class FromRosThread(NativeThread):
         then, now = messages.only(urgent=not self.is_urgent), self._adopted
         moved = now.topics.keys() & then.topics.keys()
         if self._address:
-            forget_what_is_served(now.subscriptions, {topic: then.subscriptions[topic] for topic in moved})
+            drop_duplicates(now.subscriptions, {topic: then.subscriptions[topic] for topic in moved})
             self.serve(now.without(moved))
 
-    def stay(self) -> None:
-        """Undo `leave`."""
+    def take_back(self) -> None:
+        """Undo `hand_over`."""
         self.adopt(self._adopted)
 
     def adopt(self, messages: NativeFromRos) -> None:
@@ -110,10 +110,10 @@ class FromRosThread(NativeThread):
             self.serve(messages)
         except (StuckError, OSError, RuntimeError) as error:  # errors of rcl are RuntimeErrors
             logger.error("messages from ROS are still routed by the old table; reload the table again", why=str(error))
-            self.has_passed = False
+            self.has_adopted = False
         else:
             self._adopted = messages
-            self.has_passed = True
+            self.has_adopted = True
 
     def serve(self, messages: NativeFromRos) -> None:
         """Switch to the topics of `messages` between two messages.
@@ -128,16 +128,16 @@ class FromRosThread(NativeThread):
         with ExitStack() as adding:
             for subscription in subscriptions.values():
                 if subscription not in eventfds:
-                    eventfds[subscription] = eventfd = self._watched(subscription)
-                    adding.callback(self._leave, subscription, eventfd)
-            forget_what_is_served(earlier.subscriptions, subscriptions)
-            served = _served(messages, {each: eventfds[each] for each in subscriptions.values()})
+                    eventfds[subscription] = eventfd = self._watch(subscription)
+                    adding.callback(self._unwatch, subscription, eventfd)
+            drop_duplicates(earlier.subscriptions, subscriptions)
+            served = _topic_set(messages, {each: eventfds[each] for each in subscriptions.values()})
             if not self._library.from_ros_serve(self._address, ctypes.byref(served.structure)):
                 raise StuckError("the thread for messages from ROS is stuck in the middleware: try again")
             adding.pop_all()
         self._served = served
         for subscription in eventfds.keys() - served.eventfds.keys():
-            self._leave(subscription, eventfds[subscription])
+            self._unwatch(subscription, eventfds[subscription])
 
     def follow(self, other: FromRosThread) -> None:
         """Take over the positions of another thread in its subscriptions, so that no message is handled twice."""
@@ -154,16 +154,16 @@ class FromRosThread(NativeThread):
         with self._in_use:
             address, self._address = self._address, 0
         if not address:
-            return self not in _left
+            return self not in _stuck
         if not self._library.from_ros_stop(address):
-            _left.append(self)
+            _stuck.append(self)
             return False
         for subscription, eventfd in self._served.eventfds.items():
             subscription.announce_to(None)
             os.close(eventfd)
         return True
 
-    def _watched(self, subscription: Subscription) -> int:
+    def _watch(self, subscription: Subscription) -> int:
         """Return the eventfd that announces new messages to the thread. Raises OSError."""
         with ExitStack() as opening:
             eventfd = os.eventfd(0, os.EFD_CLOEXEC)
@@ -175,17 +175,17 @@ class FromRosThread(NativeThread):
             opening.pop_all()
         return eventfd
 
-    def _leave(self, subscription: Subscription, eventfd: int) -> None:
+    def _unwatch(self, subscription: Subscription, eventfd: int) -> None:
         subscription.announce_to(None)
         self._library.from_ros_unwatch(self._address, eventfd)
         os.close(eventfd)
 
 
-_left: list[FromRosThread] = []
+_stuck: list[FromRosThread] = []
 """Stuck threads: what they use must live until the process ends."""
 
 
-def _served(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _Served:
+def _topic_set(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _TopicSet:
     subscriptions = messages.subscriptions
     topics = [
         c.RosTopic(
@@ -198,10 +198,10 @@ def _served(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _S
         for topic, routes in messages.topics.items()
     ]
     array = (c.RosTopic * len(topics))(*topics)
-    return _Served(messages, eventfds, array, c.RosSet(topics=array, count=len(topics)))
+    return _TopicSet(messages, eventfds, array, c.RosSet(topics=array, count=len(topics)))
 
 
-def forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
+def drop_duplicates(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
     """Drop messages of new subscriptions that the replaced ones have also received and will serve."""
     replacing = [each for topic, each in later.items() if earlier.get(topic, each) is not each]
     for subscription in replacing:

@@ -88,12 +88,12 @@ class PublishThread(NativeThread):
         with self._in_use:
             address, self._address = self._address, 0
         if not address:
-            return self not in _left
+            return self not in _stuck
         if not self._library.publish_stop(address):
-            _left.append(self)
+            _stuck.append(self)
             return False
         return True
 
 
-_left: list[PublishThread] = []
+_stuck: list[PublishThread] = []
 """Threads that were stuck at their end: they still use their ring and their counters."""

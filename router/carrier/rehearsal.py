@@ -14,7 +14,7 @@ from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced
 from router.carrier.deferrals import Adoption, timer_change
-from router.carrier.events import Changed, EventReader, Told
+from router.carrier.events import CountedReport, DeadmanChange, EventReader
 from router.carrier.names import Names
 from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
@@ -36,21 +36,21 @@ class Time(NamedTuple):
     at: int
 
 
-class Counted(NamedTuple):
+class Increment(NamedTuple):
     """An increment of a counter."""
 
     counter: int
     amount: int
 
 
-class Left(NamedTuple):
+class Output(NamedTuple):
     """A datagram for an endpoint, or a message for a topic; the next record counts it."""
 
     target: str
     data: bytes
 
 
-Record = Union[Time, Counted, Left, Changed, Told]
+Record = Union[Time, Increment, Output, DeadmanChange, CountedReport]
 
 
 class Stage:
@@ -96,8 +96,8 @@ class Stage:
 
     def _serve(self, running: _Running, earlier: _Running | None) -> None:
         before = earlier.deadmen if earlier else {}
-        left = [each.address for each in before.values() if each not in running.deadmen.values()]
-        timers = running.timers(earlier, left, of_topics=False)
+        dropped = [each.address for each in before.values() if each not in running.deadmen.values()]
+        timers = running.timers(earlier, dropped, of_topics=False)
         change = change_to(running.native, timers, replaced(running.deadmen, before))
         of_topics = running.timers(earlier, (), of_topics=True)
         address = self._opened.address
@@ -143,12 +143,12 @@ class Stage:
     def _record(self, kind: int, record: memoryview) -> Record:
         if kind == RecordKind.TIME:
             return Time(c.TimeRecord.from_buffer(record).at)
-        if kind == RecordKind.COUNTED:
-            counted = c.CountedRecord.from_buffer(record)
-            return Counted(counted.counter, counted.amount)
+        if kind == RecordKind.INCREMENT:
+            increment = c.IncrementRecord.from_buffer(record)
+            return Increment(increment.counter, increment.amount)
         if kind in {RecordKind.SENT, RecordKind.BRAKED, RecordKind.PUBLISHED}:
-            left, begin = c.LeftRecord.from_buffer(record), ctypes.sizeof(c.LeftRecord)
-            return Left(self._names.name(left.target), bytes(record[begin : begin + left.length]))
+            output, begin = c.OutputRecord.from_buffer(record), ctypes.sizeof(c.OutputRecord)
+            return Output(self._names.name(output.target), bytes(record[begin : begin + output.length]))
         return self._reader.read(kind, record)
 
     @property

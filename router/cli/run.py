@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from router.app import Router
     from router.app.keeping import Keeper
     from router.compiler.program import Program
-    from router.kept.head_start import Beginning
+    from router.kept.head_start import HeadStartAttempt
     from router.table.model import Gateway
 
 _DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
@@ -61,56 +61,56 @@ def run(args: argparse.Namespace) -> int:
     from router.app.keeping import Keeper
     from router.carrier.library import library
     from router.compiler.check import uncollected
-    from router.kept.head_start import BEGUN
+    from router.kept.head_start import ATTEMPTS
     from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
-    begun = BEGUN[0] if BEGUN else None
-    if begun is not None:
-        _log(begun)
+    attempt = ATTEMPTS[0] if ATTEMPTS else None
+    if attempt is not None:
+        _log(attempt)
     with uncollected():  # until the router has started
-        with inputs.noted() as asked:
+        with inputs.noted() as selection:
             parameters = ros_parameters(args.ros_args)
             environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
             table = _table(args, ROUTES_PATH, parameters.get(ROUTES_PATH))
-        with inputs.recording(asked) as read:
+        with inputs.recording(selection) as read:
             program = good_table(table, environ)[1]  # only the program, so that a reload can free the rest
-        _warn_of(without_effect(args.ros_args, program, environ.asked))
+        _warn_of(without_effect(args.ros_args, program, environ.names_read))
         start = "compiled"
         keeper = None
-        if begun is not None:
-            start = _checked(begun, program, read)
-            kept = begun.head_start.inputs if begun.head_start is not None else None
-            keeper = Keeper(library(), asked, read, kept)
+        if attempt is not None:
+            start = _reconcile(attempt, program, read)
+            kept = attempt.head_start.inputs if attempt.head_start is not None else None
+            keeper = Keeper(library(), selection, read, kept)
         if not signal.sigpending() & _ENDING:  # held back since the head start began
-            route(program, args.ros_args, environ, begun, keeper, start)
+            route(program, args.ros_args, environ, attempt, keeper, start)
     return OK
 
 
-def _log(begun: Beginning) -> None:
+def _log(attempt: HeadStartAttempt) -> None:
     """Log the head start, or why a kept program is not used."""
     from router.kept.store import CHANGED
 
-    if begun.head_start is not None:
-        listening = [*begun.head_start.listening]
+    if attempt.head_start is not None:
+        listening = [*attempt.head_start.listening]
         logger.info("forwarding with the kept program while the table is compiled", listening=listening)
-    elif begun.why:
-        log = logger.info if begun.why.endswith(CHANGED) else logger.warning
-        log("the kept program is not used: the table is compiled first", why=begun.why)
+    elif attempt.why:
+        log = logger.info if attempt.why.endswith(CHANGED) else logger.warning
+        log("the kept program is not used: the table is compiled first", why=attempt.why)
 
 
-def _checked(begun: Beginning, program: Program, read: inputs.Inputs) -> str:
+def _reconcile(attempt: HeadStartAttempt, program: Program, read: inputs.Inputs) -> str:
     """Close a head start that differs from the compiled program. Return how the router starts, as in STARTS."""
     from router.carrier.image import image_of
     from router.carrier.library import library
 
-    if begun.head_start is None:
-        return "refused" if begun.why else "compiled"
-    if begun.head_start.inputs == read.plain() and begun.head_start.is_of(*image_of(library(), program)):
+    if attempt.head_start is None:
+        return "refused" if attempt.why else "compiled"
+    if attempt.head_start.inputs == read.plain() and attempt.head_start.matches(*image_of(library(), program)):
         return "kept"
     logger.warning("an input has changed since the start: the compiled program replaces the kept one")
-    begun.close()
+    attempt.close()
     return "replaced"
 
 
@@ -131,7 +131,7 @@ def route(
     program: Program,
     ros_args: Sequence[str],
     environ: Mapping[str, str],
-    begun: Beginning | None = None,
+    attempt: HeadStartAttempt | None = None,
     keeper: Keeper | None = None,
     start: str = "compiled",
     started: Callable[[], None] = lambda: None,
@@ -144,10 +144,10 @@ def route(
     from router.app.process import supervised
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_ENDING, signal.SIGHUP, signal.SIGUSR1})
-    head_start = begun.head_start if begun is not None else None
+    head_start = attempt.head_start if attempt is not None else None
     router = Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start)
-    if begun is not None:
-        begun.pass_on()
+    if attempt is not None:
+        attempt.pass_on()
     with router:
         tune_interpreter()
         _show_places(router)

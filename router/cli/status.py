@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
     except TransportError as error:
         state, code, problems = "down", NETWORK_FAULT, (down(url, error),)
     if args.json:
-        told = [problem.json() for problem in problems]
-        print(json.dumps({"state": state, "url": url, "problems": told, "received": received}))
+        listed = [problem.json() for problem in problems]
+        print(json.dumps({"state": state, "url": url, "problems": listed, "received": received}))
     else:
         details = [problem.text for problem in problems]
         if received is not None:

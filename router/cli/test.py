@@ -167,9 +167,9 @@ def _failed_step(step: FailedStep, paint: Paint) -> Iterator[str]:
             yield f"{failure.table.span}: {paint(CYAN, failure.table.note)}"
             yield from excerpt(failure.table.span, paint, CYAN)
         yield ""
-    if len(step.told) > 1:
+    if len(step.events) > 1:
         yield "what happened in this step, in order:"
-        yield from (f"    {visible(line)}" for line in step.told)
+        yield from (f"    {visible(line)}" for line in step.events)
         yield ""
 
 

@@ -265,7 +265,7 @@ def whole(text: str) -> int:
 def progress(
     columns: Callable[[], Iterable[ProgressColumn]], total: int | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Show `columns` of rich on stderr if it is a terminal. Yields a function to update them: `tell(completed=7)`."""
+    """Show `columns` of rich on stderr if it is a terminal. Yields a function to update them: `update(completed=7)`."""
     if not sys.stderr.isatty():
         yield lambda **_: None
         return
@@ -273,12 +273,12 @@ def progress(
     from rich.progress import Progress
 
     with Progress(*columns(), console=Console(stderr=True), refresh_per_second=4, transient=True) as shown:
-        task, told = shown.add_task("", total=total), dict[str, Any]()
+        task, last = shown.add_task("", total=total), dict[str, Any]()
 
-        def tell(**news: Any) -> None:
-            nonlocal told
-            if news != told:  # called for each datagram, mostly without a change
-                told = news
-                shown.update(task, **news)
+        def update(**state: Any) -> None:
+            nonlocal last
+            if state != last:  # called for each datagram, mostly without a change
+                last = state
+                shown.update(task, **state)
 
-        yield tell
+        yield update

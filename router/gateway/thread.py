@@ -55,11 +55,11 @@ PAGE = Path(__file__).with_name("page.html")
 
 @dataclass(frozen=True, slots=True)
 class GatewayChange:
-    """`services` of the next program by gateway; `opened` ones are new, `left` ones are no longer used."""
+    """`services` of the next program by gateway; `opened` ones are new, `unused` ones are closed."""
 
     services: dict[str, GatewayService]
     opened: list[GatewayService]
-    left: list[GatewayService]
+    unused: list[GatewayService]
 
 
 class GatewayThread:
@@ -124,7 +124,7 @@ class GatewayThread:
             for plan in program.gateways:
                 if plan.settings.name not in kept:
                     for rival in [
-                        each for each in change.left if _exclude_each_other(each.plan.settings, plan.settings)
+                        each for each in change.unused if _exclude_each_other(each.plan.settings, plan.settings)
                     ]:
                         await rival.close()
                     service = await self._open(plan, program.counters, outputs)
@@ -142,7 +142,7 @@ class GatewayThread:
     async def _abandon(self, change: GatewayChange) -> None:
         await _close(change.opened)
         async with AsyncExitStack() as opening:  # all of them, even if one raises
-            for service in change.left:
+            for service in change.unused:
                 if service.is_closed:
                     opening.push_async_callback(self._open_again, service)
 
@@ -153,13 +153,13 @@ class GatewayThread:
         self._services[again.name] = again
 
     def retire(self, change: GatewayChange) -> None:
-        """Close the services of `left`. `abandon` can still reopen them."""
-        self._call(_close(change.left))
+        """Close the services of `unused`. `abandon` can still reopen them."""
+        self._call(_close(change.unused))
 
     def finish(self, change: GatewayChange) -> None:
-        """Start the new services, and forget those of `left`."""
+        """Start the new services, and forget those of `unused`."""
         self._services = change.services
-        for service in change.left:
+        for service in change.unused:
             if service.name not in change.services:
                 self.kernel_drops.pop(service.name, None)
         self._call(self._start(change))

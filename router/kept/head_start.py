@@ -75,7 +75,7 @@ class HeadStart:
         self.forwarding.carrier.close()
         self._close_sockets()
 
-    def is_of(self, parts: object, image: bytes) -> bool:
+    def matches(self, parts: object, image: bytes) -> bool:
         """Return whether the kept program has these parts and this image. Call it only once."""
         kept, self._kept = self._kept, None
         return kept == (parts, image)
@@ -198,7 +198,7 @@ class _Image:
             self._words[word] = address
 
 
-class Beginning:
+class HeadStartAttempt:
     """The result of the search for a kept program: a head start, or why there is none ("" if nothing is kept)."""
 
     def __init__(self, head_start: HeadStart | None = None, why: str = "") -> None:
@@ -216,23 +216,23 @@ class Beginning:
             self.head_start = None
 
 
-BEGUN: list[Beginning] = []
+ATTEMPTS: list[HeadStartAttempt] = []
 """The result of `begin`, which runs at most once per process."""
 
 
-def begin() -> Beginning:
+def begin() -> HeadStartAttempt:
     """Start the kept program of this command line, with SIGINT and SIGTERM blocked until the router handles them."""
-    BEGUN.append(_beginning())
-    return BEGUN[0]
+    ATTEMPTS.append(_attempt())
+    return ATTEMPTS[0]
 
 
-def _beginning() -> Beginning:
+def _attempt() -> HeadStartAttempt:
     kept, why = store.find()
     if kept is None or (why := store.count_try()):
-        return Beginning(None, why)
+        return HeadStartAttempt(None, why)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
-        return Beginning(HeadStart(kept))
+        return HeadStartAttempt(HeadStart(kept))
     except Exception as error:  # noqa: BLE001 - after any error, the router starts without it and logs why
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        return Beginning(None, f"{type(error).__name__}: {error}")
+        return HeadStartAttempt(None, f"{type(error).__name__}: {error}")

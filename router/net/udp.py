@@ -116,14 +116,14 @@ class Listener:
         self.socket.close()
 
     def _check_receive_buffer(self) -> None:
-        asked, granted = self._settings.receive_buffer, self.opened.receive_buffer
-        if granted < asked:
+        requested, granted = self._settings.receive_buffer, self.opened.receive_buffer
+        if granted < requested:
             logger.warning(
                 "receive buffer is smaller than the table requests: the kernel may drop bursts",
                 listener=self.name,
-                asked=asked,
+                asked=requested,
                 granted=granted,
-                remedy=f"sysctl -w net.core.rmem_max={asked}",
+                remedy=f"sysctl -w net.core.rmem_max={requested}",
             )
 
 

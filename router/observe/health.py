@@ -212,19 +212,19 @@ class Look:
         """Describe who sends messages expected from others to a listener; also return the routes that reject them."""
         found = sorted(each for each in self.mismatches if each.listener == listener and self._expected(each))
         names = {self._host(endpoint.name): endpoint.name for endpoint in self.program.table.endpoints.values()}
-        told: dict[str, None] = {}
+        sentences: dict[str, None] = {}
         for each in found:
             who = f"{names[each.host]} ({each.host})" if each.host in names else each.host
             expected = self._expected(each)
             if each.host in map(self._host, expected):
-                told[f"{who} uses another port or listener than the table says"] = None
+                sentences[f"{who} uses another port or listener than the table says"] = None
             else:
                 others = " or ".join(f"{name} ({self._host(name)})" for name in expected)
-                told[f"{who} sends messages expected from {others}"] = None
+                sentences[f"{who} sends messages expected from {others}"] = None
         cases = {each.payload_case for each in found}
         routes = tuple(route.name for route in self.program.table.routes if route.case.value in cases)
-        more = f"; and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
-        return "; ".join([*told][:_NAMED]) + more, routes
+        more = f"; and {len(sentences) - _NAMED} more" if len(sentences) > _NAMED else ""
+        return "; ".join([*sentences][:_NAMED]) + more, routes
 
     def _tripped(self) -> Iterator[Problem]:
         """Yield the deadmen that send in place of commands."""

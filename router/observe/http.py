@@ -296,9 +296,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.sendall(self._out.getvalue())  # the timeout is for all of it
 
     def do_GET(self) -> None:
-        path, _, asked = self.path.partition("?")
+        path, _, query_string = self.path.partition("?")
         try:
-            query = parse_qs(asked, max_num_fields=MAX_IN_QUERY)
+            query = parse_qs(query_string, max_num_fields=MAX_IN_QUERY)
         except ValueError:
             self._respond(plain(HTTPStatus.BAD_REQUEST, f"a query can have at most {MAX_IN_QUERY} values"))
             return

@@ -21,7 +21,7 @@ REST_SECONDS = 1e-4
 _EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
 _BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
-Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
+SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]
 """Returns the label values, in the metric's order, and the value of each current series."""
 
 
@@ -29,18 +29,18 @@ class CountersCollector(Collector):
     """Exports all series of the counters from the first scrape on, even at 0.
 
     `counts()` copies the list of each counting thread: a counter or level is their sum, a number or time their maximum.
-    `asked` has, by metric, functions that are called at each scrape instead. `build`: labels of `router_build_info`.
+    `computed` has, by metric, functions that are called at each scrape instead. `build`: labels of `router_build_info`.
     """
 
     def __init__(
         self,
         counters: Counters,
         counts: Callable[[], Sequence[Sequence[int]]],
-        asked: Mapping[str, Asked],
+        computed: Mapping[str, SeriesFunction],
         build: Mapping[str, str],
     ) -> None:
         self._counts = counts
-        self._asked = asked
+        self._computed = computed
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
@@ -61,8 +61,8 @@ class CountersCollector(Collector):
     def _samples(self, metric: Metric, threads: Sequence[Sequence[int]]) -> Iterator[Sample]:
         name = PREFIX + metric.name
         suffix = "_total" if metric.kind == "counter" else ""
-        if metric.name in self._asked:
-            for values, value in self._asked[metric.name]():
+        if metric.name in self._computed:
+            for values, value in self._computed[metric.name]():
                 yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
             return
         for labels, index in self._indexes[metric.name]:

@@ -125,11 +125,11 @@ class Responder:
 
     def metrics(self, accepts: str) -> Response:
         """Return the metrics in one of two formats: with more, clients could defeat the cache."""
-        asked = OPEN_METRICS if OPEN_METRICS in accepts else ""
-        return self._cache.get(f"metrics {asked}", partial(self._collected, asked))
+        accepted = OPEN_METRICS if OPEN_METRICS in accepts else ""
+        return self._cache.get(f"metrics {accepted}", partial(self._collected, accepted))
 
-    def _collected(self, asked: str) -> Response:
-        encode, kind = choose_encoder(asked)
+    def _collected(self, accepted: str) -> Response:
+        encode, kind = choose_encoder(accepted)
         at = f"{wall_ns() / 1e9:.6f}"
         return Response(HTTPStatus.OK, kind, encode(self._registry), {COLLECTED_AT: at})
 

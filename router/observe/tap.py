@@ -61,12 +61,12 @@ def wanted(
     A datagram that does not begin with the field of a payload case always passes: only a decoder can classify it. A
     source is an endpoint or an IPv4 address. Raises TapRequestError.
     """
-    asked = [
+    conditions = [
         *([_of_decision(decisions)] if decisions else []),
         *([_from_source(program, sources)] if sources else []),
         *([_of_case(program, cases)] if cases else []),
     ]
-    return (lambda datagram: all(is_wanted(datagram) for is_wanted in asked)) if asked else None
+    return (lambda datagram: all(is_wanted(datagram) for is_wanted in conditions)) if conditions else None
 
 
 def _of_decision(decisions: Sequence[str]) -> Wanted:

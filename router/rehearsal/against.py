@@ -15,9 +15,9 @@ from router.errors import DecodeError, MappingError
 from router.recording.mirror import Classifier
 from router.recording.reader import Recorded
 from router.rehearsal import cdr
+from router.rehearsal.describing import TableIndex
 from router.rehearsal.fields import leaves
 from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Rehearsal, Rejected, Sent
-from router.rehearsal.telling import TableIndex
 
 Delivery = Union[Sent, Published]
 Loss = tuple[str, str, str, str]

@@ -11,10 +11,10 @@ from router.compiler.program import Program
 from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
+from router.rehearsal.describing import EventDescriber, Related, in_brackets, when
 from router.rehearsal.fields import Difference
 from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
-from router.rehearsal.telling import Related, Teller, in_brackets, when
 from router.types.framing import restored, trimmed
 
 
@@ -43,12 +43,12 @@ class Outcome:
 
 
 class Comparison:
-    """Compares the steps of the tests of one table; `teller` describes events."""
+    """Compares the steps of the tests of one table; `describer` describes events."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
         self._wire = Wire(program.envelope)
-        self.teller = Teller(checked, program)
-        self._index = self.teller.index
+        self.describer = EventDescriber(checked, program)
+        self._index = self.describer.index
         self._table = program.table
 
     def failures(self, outcome: Outcome) -> Iterator[Failure]:
@@ -76,9 +76,9 @@ class Comparison:
         related: dict[Related | None, list[Event]] = {}
         for event in outcome.early:
             if isinstance(event, (Sent, Published, Dropped)):
-                related.setdefault(self.teller.related(event), []).append(event)
+                related.setdefault(self.describer.related(event), []).append(event)
         for place, events in related.items():
-            message = f"before this step, {self.teller.first_of(events)}; no step expects it"
+            message = f"before this step, {self.describer.summarize(events)}; no step expects it"
             yield Failure(outcome.step.expected.span, message, place)
 
     # what is delivered
@@ -93,11 +93,11 @@ class Comparison:
                 if not explained:
                     yield self._missing(target, deliveries[0].span, outcome)
             elif not deliveries:
-                message = f"{self.teller.first_of(events)}; it is not expected"
-                yield Failure(outcome.step.expected.span, message, self.teller.related(events[0]))
+                message = f"{self.describer.summarize(events)}; it is not expected"
+                yield Failure(outcome.step.expected.span, message, self.describer.related(events[0]))
             elif len(deliveries) != len(events):
-                message = f"{len(events)} for {target}, not {len(deliveries)}: {self.teller.first_of(events)}"
-                yield Failure(deliveries[0].span, message, self.teller.related(events[-1]))
+                message = f"{len(events)} for {target}, not {len(deliveries)}: {self.describer.summarize(events)}"
+                yield Failure(deliveries[0].span, message, self.describer.related(events[-1]))
             else:
                 for delivery, event in zip(deliveries, events, strict=True):
                     yield from self._differences(delivery, event, outcome)
@@ -107,7 +107,7 @@ class Comparison:
         for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}{in_brackets(event.detail)}"
-                return Failure(span, f"nothing for {target}: {why}", self.teller.related(event))
+                return Failure(span, f"nothing for {target}: {why}", self.describer.related(event))
             if isinstance(event, Filtered) and event.target == target:
                 condition = self._index.condition(event.route, target)
                 return Failure(span, f"nothing for {target}: it was withheld", condition)
@@ -124,12 +124,12 @@ class Comparison:
             trims = self._table.endpoints[event.target].trim_trailing_zeros
             wholes = [restored(data) for _, data in outcome.given]
             if event.data not in [trimmed(whole) if trims else whole for whole in wholes]:
-                message = f"{self.teller.described(event)}, not what was given"
-                yield Failure(expected.span, message, self.teller.related(event))
+                message = f"{self.describer.describe(event)}, not what was given"
+                yield Failure(expected.span, message, self.describer.related(event))
         elif expected.data is not None:
             if event.data != expected.data:
                 message = f"{event.target} gets the bytes {event.data.hex(' ')}, not {expected.data.hex(' ')}"
-                yield Failure(expected.span, message, self.teller.related(event))
+                yield Failure(expected.span, message, self.describer.related(event))
         elif expected.case is not None:
             yield from self._different_payload(expected, expected.case.name, event, outcome)
 
@@ -140,11 +140,11 @@ class Comparison:
             yield Failure(
                 expected.span,
                 f"{event.target} gets bytes that are not an envelope: {error}",
-                self.teller.related(event),
+                self.describer.related(event),
             )
             return
         if decoded.case.name != case:
-            yield Failure(expected.span, f"{self.teller.described(event)}, not {case}", self.teller.related(event))
+            yield Failure(expected.span, f"{self.describer.describe(event)}, not {case}", self.describer.related(event))
         elif expected.fields is not None:
             now = outcome.given_at(event.at)
             for difference in expected.fields.differences((), decoded.case.type, decoded.message, now):
@@ -154,7 +154,7 @@ class Comparison:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
         field = self._index.field(event.route, event.target, difference.path) if is_mapped else None
         message = f"{when(event)}{event.target}: {difference}"
-        return Failure(difference.span, message, field or self.teller.related(event), is_of_field=True)
+        return Failure(difference.span, message, field or self.describer.related(event), is_of_field=True)
 
     # what is not delivered
 
@@ -175,7 +175,7 @@ class Comparison:
             if counts != Counter(wanted.value) and not is_reported:
                 detail = next((f" ({event.detail})" for event in dropped if event.detail), "")
                 message = f"dropped for {target}: {_listed(counts)}, not {_listed(wanted.value)}{detail}"
-                related = self.teller.related(dropped[0]) if dropped else self._of_name(target, outcome)
+                related = self.describer.related(dropped[0]) if dropped else self._of_name(target, outcome)
                 yield Failure(wanted.span, message, related)
 
     # places and words

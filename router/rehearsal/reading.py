@@ -81,10 +81,10 @@ def read_test_file(path: Path, definitions: Definitions) -> TestFile:
     checked = check_table(_table_of(root, path), variables, definitions)
     if checked.program is None:
         raise TableError(checked.diagnostics)
-    if unused := [name for name in variables if name not in variables.asked]:
+    if unused := [name for name in variables if name not in variables.names_read]:
         key = mapping(root.get("variables")).entries[unused[0]].key
         message = f"{shown_path(checked.path)} has no variable '{unused[0]}'"
-        raise TableError([Diagnostic(key.span, Code.BAD_VALUE, message, did_you_mean(unused[0], variables.asked))])
+        raise TableError([Diagnostic(key.span, Code.BAD_VALUE, message, did_you_mean(unused[0], variables.names_read))])
     if checked.program.table.routes_span is None:
         message, hint = f"{shown_path(checked.path)} has no routes", "only routes are tested, gateways are not"
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
@@ -121,14 +121,14 @@ def _variables(root: MappingNode) -> Mapping[str, str]:
 
 
 class _Variables(dict[str, str]):
-    """Values by name; `asked` are the names that were looked up."""
+    """Values by name; `names_read` are those that were looked up."""
 
     def __init__(self, values: Mapping[str, str]) -> None:
         super().__init__(values)
-        self.asked: set[str] = set()
+        self.names_read: set[str] = set()
 
     def get(self, name: str, default: Any = None) -> Any:
-        self.asked.add(name)
+        self.names_read.add(name)
         return super().get(name, default)
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from router.carrier.events import Changed, Told
+from router.carrier.events import CountedReport, DeadmanChange
 from router.carrier.library import library
-from router.carrier.rehearsal import Counted, Left, Stage, Time
+from router.carrier.rehearsal import Increment, Output, Stage, Time
 from router.compiler.metrics import Series
 from router.compiler.program import Program
 from router.datagrams import Peer
@@ -183,13 +183,13 @@ class Rehearsal:
             match record:
                 case Time(at):
                     self._at = at
-                case Left(_, data):
+                case Output(_, data):
                     self._data = data
-                case Counted(counter, _):
+                case Increment(counter, _):
                     self._count(counter)
-                case Changed(route, is_tripped):
+                case DeadmanChange(route, is_tripped):
                     self.events.append(DeadmanChanged(self._at, route, is_tripped))
-                case Told(_, report):
+                case CountedReport(_, report):
                     self._report(report.detail or str(report.error or ""))
 
     def _count(self, counter: int) -> None:

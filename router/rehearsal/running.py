@@ -19,10 +19,10 @@ from router.table.reading import InvalidValueError
 
 @dataclass(frozen=True, slots=True)
 class FailedStep:
-    """`told` is what happened in it, in order; empty if only contents differ."""
+    """`events` describe what happened in it, in order; empty if only contents differ."""
 
     failures: list[Failure]
-    told: list[str]
+    events: list[str]
 
 
 @dataclass(slots=True)
@@ -64,7 +64,7 @@ def _run(
         if failures := list(comparison.failures(outcome)):
             is_of_fields = all(failure.is_of_field for failure in failures)
             happened = () if is_of_fields else (*outcome.early, *outcome.events)
-            result.failed.append(FailedStep(failures, comparison.teller.lines(happened)))
+            result.failed.append(FailedStep(failures, comparison.describer.lines(happened)))
     return result
 
 

@@ -56,26 +56,26 @@ def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
 
 
 class Variables(ChainMap[str, str]):
-    """Variables of a table, each from the first of `values` that has it. `asked` are the names that were read."""
+    """Variables of a table, each from the first of `values` that has it. `names_read` are those that were looked up."""
 
     def __init__(self, *values: Mapping[str, str]) -> None:
         super().__init__(*values)  # type: ignore[arg-type]  # they are only read
-        self.asked: set[str] = set()
+        self.names_read: set[str] = set()
 
     def get(self, name: str, default: str | None = None) -> str | None:  # type: ignore[override]  # texts only
-        self.asked.add(name)
+        self.names_read.add(name)
         return super().get(name, default)
 
 
-def without_effect(ros_args: Sequence[str], program: Program, asked: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Yield each argument that has no effect, with a remedy. `asked` are the table's variables.
+def without_effect(ros_args: Sequence[str], program: Program, names_read: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Yield each argument that has no effect, with a remedy. `names_read` are the names of the table's variables.
 
     Parameters for another node are skipped.
     """
     rules = list(_rules(ros_args))
     node = _remapped(program.table.node, rules)
     has_node = bool(program.publishers or program.subscriptions or program.gateways)
-    variables = sorted(name.lower() for name in asked)
+    variables = sorted(name.lower() for name in names_read)
     for each in dict.fromkeys((each.node, each.name) for each in _parameters(ros_args)):
         owner, name = each
         read = {*variables, ROUTES_PATH, *(_PARAMETERS_OF_ROS if has_node else ())}

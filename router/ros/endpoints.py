@@ -175,10 +175,10 @@ class RosChange:
     publications: dict[str, Publication]
     subscriptions: dict[str, Subscription]
     opened: Sequence[Publication | Subscription]
-    left: Sequence[Publication | Subscription] = ()
+    unused: Sequence[Publication | Subscription] = ()
 
 
-def opened_beside(
+def open_missing(
     now: Mapping[str, Opened],
     plans: Sequence[TopicPlan],
     spans: Mapping[str, SourceSpan],
@@ -207,6 +207,6 @@ def opened_beside(
     return {plan.label: beside.get(plan.label) or now[plan.label] for plan in plans}, opened
 
 
-def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
+def unused(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
     """Return the open endpoints that are not in `kept`."""
     return [each for topic, each in now.items() if kept.get(topic) is not each]

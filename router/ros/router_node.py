@@ -10,7 +10,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan
-from router.ros.endpoints import Publication, RosChange, Subscription, left_by, opened_beside
+from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
 from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
 from router.ros.node import close_node, open_node
 from router.ros.topics import RosTopics
@@ -80,12 +80,12 @@ class RouterNode:
         An unchanged plan keeps its endpoint.
         """
         with ExitStack() as opening:
-            publications, published = opened_beside(
+            publications, published = open_missing(
                 self._publications, publishers, spans, partial(Publication, self._node, self._peers)
             )
             for each in published:
                 opening.callback(each.close)
-            kept, subscribed = opened_beside(
+            kept, subscribed = open_missing(
                 self._subscriptions, subscriptions, spans, partial(Subscription, self._node, self._peers)
             )
             opening.pop_all()
@@ -111,15 +111,15 @@ class RouterNode:
 
     def apply(self, change: RosChange) -> None:
         """Use the endpoints of the change."""
-        change.left = [
-            *left_by(change.publications, self._publications),
-            *left_by(change.subscriptions, self._subscriptions),
+        change.unused = [
+            *unused(change.publications, self._publications),
+            *unused(change.subscriptions, self._subscriptions),
         ]
         self._use(change)
 
     def watch(self, change: RosChange) -> None:
         """Wait for events of the endpoints in use, and update `wanted` from now on."""
-        if change.left or change.opened:
+        if change.unused or change.opened:
             self._events.stop()
             self._events = self._event_thread()
             self._events.start()
@@ -128,7 +128,7 @@ class RouterNode:
         """Close unused endpoints; no thread may publish on them or wait for their events."""
         for topic in self.publish.keys() - self._publications.keys():
             del self.publish[topic], self.wanted[topic]
-        for opened in change.left:
+        for opened in change.unused:
             self._close_one(opened)
 
     def _use(self, change: RosChange) -> None:

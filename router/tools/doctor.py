@@ -104,10 +104,10 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
         what = f"no router answers at {program.table.http.value}: its health was not checked"
         yield fine("router", what)
     else:
-        yield from _told(program, running)
+        yield from _reported(program, running)
 
 
-def _told(program: Program, running: Health) -> Iterator[CheckResult]:
+def _reported(program: Program, running: Health) -> Iterator[CheckResult]:
     """Yield what a running router reports; it may be running another version of the table."""
     if running.table_sha256 != program.table.sha256:
         yield warning("router", "its table differs from this file", "router reload, or systemctl restart")

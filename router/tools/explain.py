@@ -20,9 +20,9 @@ from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
 from router.errors import StartError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
+from router.rehearsal.describing import EventDescriber
 from router.rehearsal.fields import shown
 from router.rehearsal.rehearsal import Received, Rehearsal
-from router.rehearsal.telling import Teller
 from router.ros.environment import check_environment, ros_remedy
 from router.table.keys import flat, phrases
 from router.table.model import (
@@ -100,7 +100,7 @@ def tried_route(checked: CheckedRoute, everything: Checked, program: Program, wo
     yield ""
     yield f"  given {shown(case.type, message)} from {source}:"
     happened = [event for event in rehearsal.events if not isinstance(event, Received)]
-    yield from (f"    {line}" for line in Teller(everything, program).lines(happened))
+    yield from (f"    {line}" for line in EventDescriber(everything, program).lines(happened))
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:

@@ -124,8 +124,8 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     case = _case(name, endpoint.name)
     _check_names(name, case, site)
     _check_number(number, case, site)
-    asked = _parsed_fields(fields, site) if fields else _usual_fields(prefix_of(endpoint.name), site)
-    message = NewMessage(name, number, endpoint.name, case, asked)
+    new_fields = _parsed_fields(fields, site) if fields else _usual_fields(prefix_of(endpoint.name), site)
+    message = NewMessage(name, number, endpoint.name, case, new_fields)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
         if path.exists():
             raise UsageError(f"the file {shown_path(path)} already exists", "choose another name")

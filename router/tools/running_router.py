@@ -119,8 +119,8 @@ def tap(
     Datagrams without a known payload case are always included. Raises UsageError if the router rejects the request,
     TransportError if none answers, or later if the router stops.
     """
-    asked = [("case", case) for case in cases] + [("from", source) for source in sources]
-    words = urlencode(asked + ([("only", only)] if only else []))
+    parameters = [("case", case) for case in cases] + [("from", source) for source in sources]
+    words = urlencode(parameters + ([("only", only)] if only else []))
     with closing(_connection(url, PATIENCE)) as connection:
         response = _asked(connection, url, "GET", f"/tap?{words}" if words else "/tap")
         if response.status != http.client.OK:

@@ -326,13 +326,13 @@ def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
     """A thread that is stuck in the middleware delays that."""
     scraped: list[set[str]] = []
     with Router(site.program(ROUTE)) as router:
-        passed = router._runtime.plane.has_passed
+        passed = router._runtime.plane.wait_until_adopted
 
         def scrape() -> bool:
             scraped.append({sample.labels.get("route", "") for family in router.collect() for sample in family.samples})
             return passed()
 
-        monkeypatch.setattr(router._runtime.plane, "has_passed", scrape)
+        monkeypatch.setattr(router._runtime.plane, "wait_until_adopted", scrape)
         site.program(ROUTE + TURNS)
         let_rest(router.program.table.path)
         assert router.reload().ok

@@ -52,7 +52,7 @@ def deferring(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL
     return loaded
 
 
-class Left(NamedTuple):
+class Output(NamedTuple):
     """A message that was sent or published: the time, its target, and its bytes."""
 
     at: int
@@ -146,18 +146,18 @@ class Deferring:
     def end_all(self) -> None:
         self._functions.seam_end_all(self._address)
 
-    def taken(self) -> list[Left]:
+    def taken(self) -> list[Output]:
         """The messages sent or published since the last call."""
         return list(self._taken())
 
-    def _taken(self) -> Iterator[Left]:
+    def _taken(self) -> Iterator[Output]:
         notes = c_void_p()
         size = self._functions.seam_taken(self._address, byref(notes))
         records, position = ctypes.string_at(notes, size) if size else b"", 0
         while position < size:
             length_of_record, target, at, length, _ = _NOTED.unpack_from(records, position)
             start = position + _NOTED.size
-            yield Left(at, target, records[start : start + length])
+            yield Output(at, target, records[start : start + length])
             position += length_of_record
 
     def counted(self, target: int) -> dict[str, int]:

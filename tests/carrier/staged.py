@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from router.carrier.events import Told
+from router.carrier.events import CountedReport
 from router.carrier.library import library
-from router.carrier.rehearsal import Left, Stage
+from router.carrier.rehearsal import Output, Stage
 from router.compiler.program import Program
 from tests.small_tables import Ledger
 
@@ -12,13 +12,13 @@ START = 10**12
 
 
 class Staged:
-    """One run of a program. `left` has the sent and published messages, `losses` the route and target of each loss."""
+    """One run of a program. `outputs` has sent and published messages, `losses` the route and target of each loss."""
 
     def __init__(self, program: Program) -> None:
         self.stage = Stage(library(), START)
         self.stage.adopt(program)
         self._program = program
-        self.left: list[tuple[str, bytes]] = []
+        self.outputs: list[tuple[str, bytes]] = []
         self.losses: list[tuple[str, str]] = []
 
     def ledger(self) -> Ledger:
@@ -28,8 +28,8 @@ class Staged:
     def to(self, target: str) -> list[bytes]:
         """The messages sent to this endpoint or published on this topic."""
         for record in self.stage.records():
-            if isinstance(record, Left):
-                self.left.append(record)
-            elif isinstance(record, Told):
+            if isinstance(record, Output):
+                self.outputs.append(record)
+            elif isinstance(record, CountedReport):
                 self.losses.append((record.report.place, record.report.target))
-        return [data for name, data in self.left if name == target]
+        return [data for name, data in self.outputs if name == target]

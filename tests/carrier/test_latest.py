@@ -46,7 +46,7 @@ class Held:
         self._collect()
 
     def _collect(self) -> None:
-        self.arrived += [(left.at, int(left.data)) for left in self.deferring.taken()]
+        self.arrived += [(each.at, int(each.data)) for each in self.deferring.taken()]
 
     def counted(self) -> dict[str, int]:
         return self.deferring.counted(self.target)

@@ -99,7 +99,7 @@ def measured(group: Deferring, size: int, hertz: float, priority: Priority, late
         group.set(now)
         if now < 10 * NS:
             group.offer(target, datagram)
-        sent += sum(len(left.data) for left in group.taken())
+        sent += sum(len(each.data) for each in group.taken())
     return sent
 
 

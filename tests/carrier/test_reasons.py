@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from router.carrier.events import EventReader, Told
+from router.carrier.events import CountedReport, EventReader
 from router.carrier.library import library
 from router.carrier.names import Names
 from router.carrier.reasons import _WORDS, LOSSES, REJECTIONS
@@ -42,7 +42,7 @@ def told(program: Program, *, ahead: int = 0, do: Callable[[Stage], None]) -> li
     stage.adopt(program)
     stage.set_clock(ahead)
     do(stage)
-    return [record.report for record in stage.records() if isinstance(record, Told)]
+    return [record.report for record in stage.records() if isinstance(record, CountedReport)]
 
 
 @pytest.fixture
@@ -277,7 +277,7 @@ def test_so_has_every_loss_on_the_way_out(reason: str) -> None:
     event.route, event.target = names.number("gps_info"), names.number("basestation")
     why = b"" if event.error else b"no memory\0"
     read = EventReader(names, lambda *_: "", lambda *_: "").read(EventKind.LOST, memoryview(bytearray(event) + why))
-    assert isinstance(read, Told)
+    assert isinstance(read, CountedReport)
     (line,) = logged([read.report])
     assert (line["route"], line["target"], line["reason"]) == ("gps_info", "basestation", reason)
     assert line.get("error") or line.get("detail")

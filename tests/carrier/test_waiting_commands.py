@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from router.carrier.events import Changed
-from router.carrier.rehearsal import Left, Stage, Time
+from router.carrier.events import DeadmanChange
+from router.carrier.rehearsal import Output, Stage, Time
 from router.compiler.program import Program
 from tests.envelopes import LEN, framed, tag, varint
 from tests.small_tables import BASESTATION, BRAKE, HEAD, MS, SECOND, SENSOR_BOARD, Ledger, enveloped, program
@@ -45,11 +45,11 @@ def table(folder: Path, routes: str, far: str = FAR) -> Program:
 
 
 class Rehearsing:
-    """A stage with what came out of it: `left` by target, with the time, and `changes` of deadmen."""
+    """A stage with its `outputs` by time and target, and the `changes` of its deadmen."""
 
     def __init__(self, library: ctypes.CDLL, made: Program) -> None:
         self._stage = Stage(library)
-        self.left: list[tuple[int, str, bytes]] = []
+        self.outputs: list[tuple[int, str, bytes]] = []
         self.changes: list[tuple[str, bool]] = []
         self._at = 0
         self.reload(made)
@@ -79,14 +79,14 @@ class Rehearsing:
         for record in self._stage.records():
             if isinstance(record, Time):
                 self._at = record.at
-            elif isinstance(record, Left):
-                self.left.append((self._at, record.target, record.data))
-            elif isinstance(record, Changed):
+            elif isinstance(record, Output):
+                self.outputs.append((self._at, record.target, record.data))
+            elif isinstance(record, DeadmanChange):
                 self.changes.append((record.route, record.is_tripped))
 
     @property
     def sent(self) -> list[bytes]:
-        return [data for _, _, data in self.left]
+        return [data for _, _, data in self.outputs]
 
     def many(self, data: bytes) -> int:
         return self.sent.count(data)
@@ -240,10 +240,10 @@ def test_what_waits_for_a_bandwidth_goes_along_to_the_next_program(rehearse: Reh
     stage = rehearse(PH, SLOW)
     for number in range(1, 101):
         stage.receive(numbered(number))
-    before = len(stage.left)
+    before = len(stage.outputs)
     for more in (OTHER, "", OTHER):
         stage.reload(table(tmp_path, PH.replace("[far_board]}", "[far_board], priority: bulk}") + more, SLOW))
-    assert len(stage.left) == before < 100
+    assert len(stage.outputs) == before < 100
     stage.pass_time(10 * SECOND)
     assert stage.sent == [numbered(number) for number in range(1, 101)]
     stage.assert_counters_balance()
@@ -267,7 +267,7 @@ def test_what_the_next_program_does_not_hold_leaves_before_its_own(
     stage = rehearse(PH, SLOW)
     for number in range(1, 101):
         stage.receive(numbered(number))
-    assert len(stage.left) < 100
+    assert len(stage.outputs) < 100
     routes = routes.replace("far_board", "other_board") if "other_board" in far else routes
     stage.reload(table(tmp_path, routes, far))
     assert stage.sent == [numbered(number) for number in range(1, 101)]

@@ -27,8 +27,8 @@ from router.carrier.image import image_of
 from router.carrier.library import library
 from router.cli import run
 from router.compiler.program import Program
-from router.kept import head_start as beginnings
-from router.kept.head_start import Beginning, HeadStart
+from router.kept import head_start as head_starts
+from router.kept.head_start import HeadStart, HeadStartAttempt
 from router.kept.store import Kept
 from router.net.sockets import ListeningSocket, open_sending
 from tests.acceptance.site import wait_until
@@ -66,7 +66,7 @@ def test_a_deadman_that_trips_while_the_router_is_made_is_told_once_it_is_comple
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = site.program(DRIVING)
-    begun = head_start(program)
+    started = head_start(program)
     assert site.basestation.recv(1000) == BRAKE
 
     class Slow(Runtime):
@@ -77,19 +77,19 @@ def test_a_deadman_that_trips_while_the_router_is_made_is_told_once_it_is_comple
             super().__init__(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(whole, "Runtime", Slow)
-    with capture_logs() as logged, Router(program, head_start=begun):
+    with capture_logs() as logged, Router(program, head_start=started):
         wait_until(lambda: TRIPPED in [entry["event"] for entry in logged], "the report")
 
 
 def test_what_was_told_before_the_router_was_made_is_read_at_once(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "_PULSE_MS", 3_600_000)
     program = site.program(DRIVING)
-    begun = head_start(program)
+    started = head_start(program)
     assert site.basestation.recv(1000) == BRAKE
     site.send(DRIVE)
     assert [site.basestation.recv(1000) for _ in range(2)] == [DRIVE, BRAKE]
     time.sleep(0.1)  # it is told after it was sent
-    with capture_logs() as logged, Router(program, head_start=begun) as router:
+    with capture_logs() as logged, Router(program, head_start=started) as router:
         wait_until(lambda: TRIPPED in [entry["event"] for entry in logged], "the report")
         assert router.total("deadman_trips") == 1
 
@@ -97,10 +97,10 @@ def test_what_was_told_before_the_router_was_made_is_read_at_once(site: Site, mo
 def test_what_was_lost_before_the_router_was_made_is_explained(site: Site) -> None:
     condition = "{endpoint: basestation, when: 1 / temperature > 0}"
     program = site.program(f"  ph_info: {{source: sensor_board, destinations: [{condition}]}}\n")
-    begun = head_start(program)
+    started = head_start(program)
     site.send(b"\xff", NAN_PH, PH)
     assert site.basestation.recv(1000) == PH
-    with capture_logs() as logged, Router(program, head_start=begun):
+    with capture_logs() as logged, Router(program, head_start=started):
         wait_until(
             lambda: {"datagram rejected", "message dropped"} <= {entry["event"] for entry in logged}, "the report"
         )
@@ -111,7 +111,7 @@ def test_what_was_lost_before_the_router_was_made_is_explained(site: Site) -> No
 
 def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     program = site.program(DRIVING.replace("20ms", "1h"))
-    begun = head_start(program)
+    started = head_start(program)
     assert site.basestation.recv(1000) == BRAKE
     site.send(DRIVE)
     assert site.basestation.recv(1000) == DRIVE
@@ -120,8 +120,8 @@ def test_a_router_that_cannot_be_made_leaves_the_board_halted(site: Site, monkey
         raise MemoryError
 
     monkeypatch.setattr(whole, "Plane", fail)
-    with pytest.raises(MemoryError), closing(Beginning(begun)) as beginning:
-        run.route(program, [], os.environ, beginning)
+    with pytest.raises(MemoryError), closing(HeadStartAttempt(started)) as attempt:
+        run.route(program, [], os.environ, attempt)
     assert site.basestation.recv(1000) == BRAKE
 
 
@@ -139,11 +139,11 @@ def test_what_fails_before_the_verb_runs_leaves_the_board_halted(site: Site, mon
     import router
 
     program = site.program(DRIVING.replace("20ms", "1h"))
-    begun = head_start(program)
+    started = head_start(program)
     assert site.basestation.recv(1000) == BRAKE
     site.send(DRIVE)
     assert site.basestation.recv(1000) == DRIVE
-    monkeypatch.setattr(beginnings, "begin", lambda: Beginning(begun))
+    monkeypatch.setattr(head_starts, "begin", lambda: HeadStartAttempt(started))
     monkeypatch.setattr(sys, "argv", ["router", "run"])
     monkeypatch.setitem(sys.modules, "router.cli", None)
     with pytest.raises(ImportError):
@@ -180,17 +180,17 @@ def test_a_socket_that_a_head_start_sends_by_is_closed_once_no_thread_uses_it(
             raise OSError("the port of the listener cannot be shared")
         return open_sending(None, every, is_board=is_board)
 
-    monkeypatch.setattr(beginnings, "open_sending", open_elsewhere)
-    begun = head_start(program)
-    left, was_open = begun.senders["basestation"].socket, []
+    monkeypatch.setattr(head_starts, "open_sending", open_elsewhere)
+    started = head_start(program)
+    left, was_open = started.senders["basestation"].socket, []
 
     class Observed(Plane):
-        def has_passed(self) -> bool:
+        def wait_until_adopted(self) -> bool:
             was_open.append(left.fileno() >= 0)
-            return super().has_passed()
+            return super().wait_until_adopted()
 
     monkeypatch.setattr(whole, "Plane", Observed)
-    with Router(program, head_start=begun):
+    with Router(program, head_start=started):
         assert (was_open, left.fileno()) == ([True], -1)
 
 
@@ -204,9 +204,9 @@ def test_topics_of_a_head_start_are_bound_once(site: Site, monkeypatch: pytest.M
       - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
 """
     program = site.program(topic)
-    begun, bound = head_start(program), []
-    monkeypatch.setattr(begun, "bind_topic", lambda *arguments: bound.append(arguments))
-    with Router(program, head_start=begun) as router:
+    started, bound = head_start(program), []
+    monkeypatch.setattr(started, "bind_topic", lambda *arguments: bound.append(arguments))
+    with Router(program, head_start=started) as router:
         site.write(topic.replace("queue_depth: 10", "queue_depth: 11"))
         assert router.reload().ok
     assert len(bound) == 1

@@ -147,11 +147,11 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
 
     @contextmanager
     def by_image(program: Program) -> Iterator[Carrier]:
-        begun = head_start(program)
+        started = head_start(program)
         try:
-            yield begun.forwarding.carrier
+            yield started.forwarding.carrier
         finally:
-            begun.close()
+            started.close()
 
     @contextmanager
     def by_program(program: Program) -> Iterator[Carrier]:
@@ -169,10 +169,10 @@ def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) ->
     path, ports = table(tmp_path)
     checked = check_table(path)
     assert checked.program
-    begun = head_start(checked.program)
-    assert {kind for kind, *_ in begun.opened} == {"deadman", "limit", "pacer", "deferral", "collect"}
-    with Router(checked.program, head_start=begun) as router, udp(SOURCES["tool"], ports["tool"]) as tool:
-        assert begun.opened == {}
+    started = head_start(checked.program)
+    assert {kind for kind, *_ in started.opened} == {"deadman", "limit", "pacer", "deferral", "collect"}
+    with Router(checked.program, head_start=started) as router, udp(SOURCES["tool"], ports["tool"]) as tool:
+        assert started.opened == {}
         assert router.reload().ok
         datagram = sample("ph_info", _filled(WIRE.envelope.cases["ph_info"])).datagram
         with udp(SOURCES["basestation"], ports["basestation"]) as basestation:

@@ -66,7 +66,7 @@ class FakeRunning:
         """Times are in ns, as in the counters."""
         index = self.program.counters.index(metric, *labels)
         self.program.counters.grow(self.counts)
-        self.counts[index] = to  # type: ignore[call-overload]  # what is asked for may be no integer
+        self.counts[index] = to  # type: ignore[call-overload]  # the value may be no integer
 
     def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
         """`reason`: why no route takes it."""
@@ -76,11 +76,11 @@ class FakeRunning:
 
     def collect(self) -> Iterator[Family]:
         self.collected += 1
-        asked = {
+        computed = {
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         }
-        return CountersCollector(self.program.counters, lambda: [self.counts], asked, {"version": "1"}).collect()
+        return CountersCollector(self.program.counters, lambda: [self.counts], computed, {"version": "1"}).collect()
 
     def mismatches(self) -> dict[Mismatch, int]:
         return self.seen

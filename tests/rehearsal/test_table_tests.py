@@ -359,7 +359,7 @@ def test_what_happened_in_a_failed_step_is_told_in_order_with_its_places(tmp_pat
         """
     missing, other = run_tests(written(tmp_path, IMU, tests))
     (step,) = missing.failed
-    assert [line.replace(f"{tmp_path}/", "") for line in step.told] == [
+    assert [line.replace(f"{tmp_path}/", "") for line in step.events] == [
         "imu_info takes a message from sensor_board",
         "imu_info {accel_x: 0.5} is sent to basestation (table.yaml:17:20)",
         "imu_info withholds a message from recorder (table.yaml:17:60)",
@@ -369,7 +369,7 @@ def test_what_happened_in_a_failed_step_is_told_in_order_with_its_places(tmp_pat
             "(table.yaml:24:53: angular_velocity.y: division by zero)"
         ),
     ]
-    assert [step.told for step in other.failed] == [[]]
+    assert [step.events for step in other.failed] == [[]]
 
 
 # what is no test

@@ -32,7 +32,7 @@ def unread(tmp_path: Path, *words: str, table: str = TABLE) -> dict[str, str]:
     variables = Variables({}, table_variables(ros_parameters(words)))
     program = check_table(tmp_path / "table.yaml", variables).program
     assert program is not None
-    return dict(without_effect(words, program, variables.asked))
+    return dict(without_effect(words, program, variables.names_read))
 
 
 @pytest.mark.parametrize(

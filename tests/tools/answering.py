@@ -28,8 +28,8 @@ def answering(
     `health` replaces the whole text of /health.json.
     """
     if health is None:
-        told = [problem.json() for problem in problems]
-        health = json.dumps({"table": table, "received": 7, "problems": told})
+        listed = [problem.json() for problem in problems]
+        health = json.dumps({"table": table, "received": 7, "problems": listed})
     answers = {"/metrics": text, "/health.json": health}
 
     class Handler(BaseHTTPRequestHandler):

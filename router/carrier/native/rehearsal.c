@@ -52,10 +52,10 @@ static void note(struct rehearsal *rehearsal, const void *record, size_t size) {
     append_record(rehearsal, record, size);
 }
 
-static void note_left(struct stage *stage, enum record_kind kind, uint32_t target, const void *data, size_t size) {
+static void note_output(struct stage *stage, enum record_kind kind, uint32_t target, const void *data, size_t size) {
     static const uint8_t zeros[8];
-    struct left_record record = {.size = padded_to_word(sizeof record + size), .kind = kind, .target = target,
-                                 .length = (uint32_t)size};
+    struct output_record record = {.size = padded_to_word(sizeof record + size), .kind = kind, .target = target,
+                                   .length = (uint32_t)size};
     note(stage->rehearsal, &record, sizeof record);
     append_record(stage->rehearsal, data, size);
     append_record(stage->rehearsal, zeros, record.size - sizeof record - size);
@@ -64,28 +64,28 @@ static void note_left(struct stage *stage, enum record_kind kind, uint32_t targe
 /* ---- the stage ---- */
 
 static void counted(struct stage *stage, uint32_t index, int64_t amount) {
-    struct counted_record record = {.size = sizeof record, .kind = RECORD_COUNTED, .amount = amount, .counter = index};
+    struct increment_record record = {.size = sizeof record, .kind = RECORD_INCREMENT, .amount = amount, .counter = index};
     note(stage->rehearsal, &record, sizeof record);
 }
 
-static int64_t told_now(struct stage *stage) { return stage->rehearsal->now; }
+static int64_t simulated_now(struct stage *stage) { return stage->rehearsal->now; }
 
 static int send_nowhere(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
     int64_t now = stage->rehearsal->now;
     if (now > expires) return COMMAND_STALE;
-    note_left(stage, RECORD_SENT, target->id, data, size);
+    note_output(stage, RECORD_SENT, target->id, data, size);
     if (target->feed_count) command_has_left(stage->rehearsal->timers, target->feeds, target->feed_count, 0, now);
     return 0;
 }
 
 static int brake_nowhere(struct stage *stage, const struct deadman_destination *to) {
-    note_left(stage, RECORD_BRAKED, to->id, to->datagram, to->size);
+    note_output(stage, RECORD_BRAKED, to->id, to->datagram, to->size);
     return 0;
 }
 
 static enum publication publish_nowhere(struct stage *stage, const struct target *target, const char **why) {
     (void)why;
-    note_left(stage, RECORD_PUBLISHED, target->id, stage->machine.output.data, stage->machine.output.size);
+    note_output(stage, RECORD_PUBLISHED, target->id, stage->machine.output.data, stage->machine.output.size);
     return PUBLISHED;
 }
 
@@ -93,7 +93,7 @@ static bool open_stage(struct rehearsal *rehearsal, struct stage *stage, counter
     bool is_open = stage_open(stage, counters, rehearsal->events, rehearsal->timers);
     stage->rehearsal = rehearsal;
     stage->counted = counted;
-    stage->now = told_now;
+    stage->now = simulated_now;
     stage->send = send_nowhere;
     stage->brake = brake_nowhere;
     stage->publish = publish_nowhere;

@@ -13,7 +13,7 @@
 #include "route_ros.h"
 
 /* Records besides events (events.h). Each begins with `size` and `kind`. */
-enum record_kind { RECORD_TIME = 32, RECORD_COUNTED, RECORD_SENT, RECORD_BRAKED, RECORD_PUBLISHED };
+enum record_kind { RECORD_TIME = 32, RECORD_INCREMENT, RECORD_SENT, RECORD_BRAKED, RECORD_PUBLISHED };
 
 /* The time of the following records; before the first one, they are of the time of opening. */
 struct time_record {
@@ -21,14 +21,14 @@ struct time_record {
     int64_t at; /* boot clock */
 };
 
-struct counted_record {
+struct increment_record {
     uint32_t size, kind;
     int64_t amount;
     uint32_t counter, reserved;
 };
 
 /* A message sent by a target or a deadman; the bytes follow. Its counter follows. */
-struct left_record {
+struct output_record {
     uint32_t size, kind;
     uint32_t target, length; /* `target`: as in events */
 };

@@ -104,7 +104,7 @@ def _filled(plan: Plan, path: Path) -> SourceSpan | None:
     return None
 
 
-class Teller:
+class EventDescriber:
     """Describes what happened to messages of one table. `index` finds its places."""
 
     def __init__(self, checked: Checked, program: Program) -> None:
@@ -114,9 +114,9 @@ class Teller:
     def lines(self, events: Iterable[Event]) -> list[str]:
         """Return everything that happened, in order, each with its place in the table."""
         lines = []
-        for _, same in groupby(events, _what):
+        for _, same in groupby(events, _kind):
             alike = [*same]
-            line, place = self.first_of(alike), self.related(alike[0])
+            line, place = self.summarize(alike), self.related(alike[0])
             if place is not None and place.span.file not in line:  # it is if an expression has no value
                 line += f" ({place.span})"
             lines.append(line)
@@ -133,11 +133,11 @@ class Teller:
                 return self.index.target(event.route, event.target)
         return None
 
-    def first_of(self, events: Sequence[Event]) -> str:
+    def summarize(self, events: Sequence[Event]) -> str:
         more = f", and so on, {len(events)} in total" if len(events) > 1 else ""
-        return self.described(events[0]) + more
+        return self.describe(events[0]) + more
 
-    def described(self, event: Event) -> str:
+    def describe(self, event: Event) -> str:
         """Describe an event: `at 500 ms manual_brake {brake: true} is sent to driving_board`."""
         at = when(event)
         match event:
@@ -170,7 +170,7 @@ class Teller:
         return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
 
 
-def _what(event: Event) -> tuple[object, ...]:
+def _kind(event: Event) -> tuple[object, ...]:
     """Return a key that is equal for events that differ only in time and content."""
     names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
     return type(event), *names
