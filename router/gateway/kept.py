@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from router.errors import StartError
 from router.gateway.encoding import ReadyType, Sample
@@ -34,6 +34,13 @@ FRESH_S = 1.0
 """How long fetched messages are reused if none arrives, so that many clients cost few subscriptions."""
 
 
+class Kept(NamedTuple):
+    """Fetched messages, and how many had `arrived` on the topic when the last one was taken."""
+
+    samples: Sequence[Sample] = ()
+    arrived: int = -1
+
+
 class KeptMessages:
     """Fetches the messages from the publishers with a short-lived subscription.
 
@@ -55,30 +62,23 @@ class KeptMessages:
         self._loop = loop
         self._arrived = arrived
         self._tap: TopicTap | None = None
-        self._asking: asyncio.Task[None] | None = None
-        self._found: Sequence[Sample] = ()
-        self._found_at: tuple[int, frozenset[bytes]] | None = None  # `arrived`, publishers
+        self._asking: asyncio.Task[Kept] | None = None
+        self._found: Kept | None = None
+        self._found_from: frozenset[bytes] = frozenset()
         self._forgetting: asyncio.TimerHandle | None = None
 
-    @property
-    def is_current(self) -> bool:
-        """Whether no message has arrived since the last `get`, at most FRESH_S ago."""
-        return self._found_at is not None and self._found_at[0] == self._arrived()
-
-    async def get(self) -> Sequence[Sample]:
+    async def get(self) -> Kept:
         """Return the messages in the order of publication. Concurrent calls share one subscription.
 
         The result is empty if the subscription fails, which is logged, or is closed meanwhile.
         """
-        if self._asking is None:
+        if (asking := self._asking) is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
-            if self._found_at != (self._arrived(), publishers):
-                self._asking = self._loop.create_task(self._ask(publishers))
-        if asking := self._asking:
-            await asyncio.wait([asking])  # it continues for others if this call is cancelled
-            if not asking.cancelled():
-                asking.result()
-        return self._found
+            if self._found and (self._found.arrived, self._found_from) == (self._arrived(), publishers):
+                return self._found
+            asking = self._asking = self._loop.create_task(self._ask(publishers))
+        await asyncio.wait([asking])  # it continues for others if this call is cancelled
+        return Kept() if asking.cancelled() else asking.result()
 
     def close(self) -> None:
         """Unsubscribe, and forget the messages."""
@@ -90,8 +90,9 @@ class KeptMessages:
             self._tap = None
         self._forget()
 
-    async def _ask(self, publishers: frozenset[bytes]) -> None:
+    async def _ask(self, publishers: frozenset[bytes]) -> Kept:
         self._forget()
+        found = Kept()
         try:
             self._tap = self._topics.tap(
                 self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
@@ -101,15 +102,15 @@ class KeptMessages:
                 "cannot fetch the messages that publishers keep for late joiners", topic=self._topic, error=str(error)
             )
         else:
-            self._found, arrived = await self._collect(self._tap, len(publishers))
-            self._found_at = arrived, publishers
+            found = self._found = await self._collect(self._tap, len(publishers))
+            self._found_from = publishers
             self._tap.close()
             self._tap = None
             self._forgetting = self._loop.call_later(FRESH_S, self._forget)
         self._asking = None
+        return found
 
-    async def _collect(self, tap: TopicTap, publishers: int) -> tuple[Sequence[Sample], int]:
-        """Return the messages, and how many had arrived on the topic when the last one was taken."""
+    async def _collect(self, tap: TopicTap, publishers: int) -> Kept:
         samples: deque[Sample] = deque()
         size = 0
         begun = last = self._loop.time()
@@ -117,20 +118,22 @@ class KeptMessages:
             arrived = self._arrived()
             await asyncio.sleep(POLL_S)
             taken = 0
-            while taken < PER_TURN and (message := tap.take()):
+            while taken < MOST_KEPT and (message := tap.take()):
                 taken, last = taken + 1, self._loop.time()
                 samples.append(Sample(self._topic, self._ready, *message))
                 size += len(message[0])
                 while len(samples) > MOST_KEPT or (size > MOST_KEPT_BYTES and len(samples) > 1):
                     size -= len(samples.popleft().cdr)
+                if taken % PER_TURN == 0:
+                    await asyncio.sleep(0)
             now = self._loop.time()
             is_quiet = len(samples) >= publishers and now - last > QUIET_S
             is_late = now - begun > (AT_MOST_S if len(samples) >= publishers else PATIENCE_S)
-            if taken < PER_TURN and (is_quiet or is_late):
-                return sorted(samples, key=lambda sample: sample.sent_ns), arrived
+            if is_quiet or is_late:
+                return Kept(sorted(samples, key=lambda sample: sample.sent_ns), arrived)
 
     def _forget(self) -> None:
-        self._found, self._found_at = (), None
+        self._found = None
         if self._forgetting:
             self._forgetting.cancel()
             self._forgetting = None

@@ -241,10 +241,13 @@ class TopicSender:
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 
-    async def kept(self, served: ServedTopic) -> list[Frame]:
-        """Return the messages kept for late joiners, oldest first; then the latest value if others may have sent it."""
+    async def kept(self, served: ServedTopic) -> tuple[list[Frame], bool]:
+        """Return the messages kept for late joiners, oldest first; then the latest value if others may have sent it.
+
+        The second value says whether no other message has arrived since.
+        """
         topic = served.subscription
-        samples = list(await topic.kept.get())
+        samples, arrived = await topic.kept.get()
         if served.selection.is_mixed and (latest := topic.latest()):
             same = [each for each in samples if (each.sent_ns, each.cdr) != (latest.sent_ns, latest.cdr)]
             samples = [*same, latest]
@@ -261,7 +264,7 @@ class TopicSender:
                 self._counters.received(1)
                 self._checked(served, sample, is_new=True)
             served.refused_ns = max(served.refused_ns, sample.sent_ns)
-        return frames
+        return frames, arrived == topic.arrived
 
     def show(self, served: ServedTopic, frames: list[Frame]) -> None:
         """Append schema and latest value; only the schema if publishers keep messages.

@@ -91,7 +91,7 @@ class TopicSubscription:
         """
         if (wanted.is_reliable, wanted.keeps) != (self._is_reliable, self._keeps):
             self._take(self._depth)
-            self.close()
+            self._unsubscribe()
         if self._tap is None:
             self._tap = self._topics.tap(
                 self.topic,
@@ -117,6 +117,9 @@ class TopicSubscription:
     def close(self) -> None:
         """Unsubscribe; `latest` and `arrived` keep their values."""
         self.kept.close()
+        self._unsubscribe()
+
+    def _unsubscribe(self) -> None:
         if self._tap is None:
             return
         self._count()

@@ -241,12 +241,12 @@ class Topics:
         """Return the kept messages of a topic if it is still served, and whether no message has arrived since."""
         while (served := self._served.get(topic)) is not None and served.selection.keepers:
             try:
-                frames = await self._sender.kept(served)
+                kept = await self._sender.kept(served)
             except Exception as error:  # noqa: BLE001 reported; other messages are still sent
                 self._failed(error)
                 break
             if not served.has_ended:
-                return frames, served.subscription.kept.is_current
+                return kept
         return [], False
 
     def _introduce(self, served: ServedTopic) -> None:
@@ -292,7 +292,7 @@ class Topics:
         for served in topics:
             self._sender.show(served, frames)
         kept = [self._sender.kept(served) for served in topics if served.selection.keepers]
-        return frames + [frame for frames in await asyncio.gather(*kept) for frame in frames]
+        return frames + [frame for frames, _ in await asyncio.gather(*kept) for frame in frames]
 
     def rates(self, seconds: float) -> Iterator[tuple[str, str, float]]:
         """Yield every topic with its type and its rate over the `seconds` since the last call."""
