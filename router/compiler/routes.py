@@ -66,7 +66,7 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
 
 _NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' need `for_each`, which this route lacks"
 _NO_COLLECT = f"'{ITEMS}' and '{COUNT}' need `collect`, which this route lacks"
-_COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD}`"
+_COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD, timeout: 1s}`"
 
 
 def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:

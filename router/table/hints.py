@@ -379,6 +379,8 @@ def _for_collection(error: SchemaError, value: object) -> str:
         return f"write a list of mappings: [{_each(value, name)}]"
     if name == "topic":
         return f"write `topics: [{_in_flow(value) or '...'}]`"
+    if name == "rates":
+        return f"write each topic with its rate, as in `rates: {{{_in_flow(value[:1]) or 'TOPIC'}: 50 Hz}}`"
     return _for_fields(value) if name == "fields" else ""
 
 
