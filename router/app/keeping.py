@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
@@ -33,13 +32,15 @@ class Keeper:
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
         """Start to save the running program, compiled from `read`. `program` returns it with counters of its own."""
-        work = partial(self._keep, program, read.plain()) if read.plain() != self._kept else store.works
         try:
-            self._thread.submit(work)
+            self._thread.submit(self._keep, program, read.plain())
         except (RuntimeError, MemoryError) as error:  # no thread can be started
             self._failed(error)
 
     def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
+        if read == self._kept:
+            store.works()
+            return
         from router.carrier.image import image_of
 
         try:
