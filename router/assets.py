@@ -5,6 +5,7 @@ They are in `routes/`, `protos/` and `schemas/`, for example.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
@@ -24,7 +25,7 @@ def asset(relative: str) -> Path:
 
 def is_installed(path: Path) -> bool:
     """Return whether `path` is within the installed package: the next version overwrites what is changed there."""
-    return path.resolve().is_relative_to(_PACKAGE.resolve())
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(_PACKAGE))  # `resolve` raises for a link loop
 
 
 def page_policy(page: bytes) -> str:

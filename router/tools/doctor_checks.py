@@ -95,6 +95,10 @@ def recordings(program: Program) -> Iterator[CheckResult]:
     settings = program.table.record
     if settings is None:
         return
+    if os.path.islink(settings.directory) and not os.path.exists(settings.directory):  # noqa: PTH110, PTH114 - as below
+        what = f"{settings.directory} is a link that leads nowhere"
+        yield problem("recordings", what, "mount its disk, or correct the link")
+        return
     directory = settings.directory.resolve()
     # os.path, since Path.exists raises if a folder above is not readable.
     there = next(folder for folder in (directory, *directory.parents) if os.path.exists(folder))  # noqa: PTH110

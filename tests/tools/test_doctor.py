@@ -17,6 +17,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.errors import StartError
 from router.observe.problems import Kind, Problem
+from router.recording.writer import RecordingDirectory
 from router.table.addresses import Address
 from router.tools import doctor_checks
 from router.tools.doctor import before_start, examine
@@ -268,6 +269,17 @@ def test_recordings_need_a_folder_with_room(
     (tmp_path / "file").touch()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 100 << 20))
     assert gist(recordings(recorded(table, tmp_path / folder, keep)), text) == [(grade, True)]
+
+
+@pytest.mark.parametrize("target", ["recordings", "unmounted/recordings"])
+def test_a_link_that_leads_nowhere_is_a_problem_as_it_is_for_a_start(table: Path, tmp_path: Path, target: str) -> None:
+    link = tmp_path / "recordings"
+    link.symlink_to(target)
+    program = recorded(table, link, "1GiB")
+    assert gist(recordings(program), f"{link} is a link that leads nowhere") == [(Grade.PROBLEM, True)]
+    assert program.table.record is not None
+    with pytest.raises(StartError, match="cannot record"):
+        RecordingDirectory(program.table.record, "table")
 
 
 def test_only_our_recordings_make_room_for_new_ones(

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from router.cli import BAD_TABLE, OK, main
@@ -80,3 +81,10 @@ def test_all_that_is_said_of_each_change(write: Write) -> None:
 
 def compiles(change: Change) -> bool:
     return not any("error[bad-proto]" in finding for finding in change["says"])
+
+
+def test_a_lock_that_is_a_loop_of_links_is_a_finding(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    lock = Protos(write).root / "other.lock.json"
+    lock.symlink_to(lock.name)
+    assert main(["schema", "lock", "--protos", ".", "--lock", lock.name]) == BAD_TABLE
+    assert "error[bad-file]: not a lock file" in capsys.readouterr().err
