@@ -245,9 +245,9 @@ def test_what_matters_most_is_said_in_the_banner_and_the_rest_beside_it(running:
     page.until("document.querySelectorAll('#others li').length === 4")
     said = others(page)
     assert "Commands of manual_drive do not get through: its deadman sends in their place Check that they" in said
-    assert "The last reload failed; the old table is still running router validate says what is wrong" in said
+    assert "The last reload failed; the old table is still running Run router validate, correct" in said
     assert "arm_diag is received but has no route, 3 in " in said
-    assert "Nothing passes between imu_data and peers with another reliability, 1 of them ros2 topic info -v" in said
+    assert "Nothing passes between imu_data and peers with another reliability, 1 of them Compare their QoS" in said
 
 
 def test_a_listener_without_its_network_is_said_before_what_follows_from_it(running: FakeRunning, page: Page) -> None:
