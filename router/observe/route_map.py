@@ -86,13 +86,13 @@ def deadman_edges(program: Program) -> Iterator[Edge]:
     """
     for route in program.table.routes:
         if route.deadman is not None:
-            about = f"{route.deadman.case.value}, sent by the deadman"
+            about = f"the deadman sends {route.deadman.case.value}"
             for name in (to.value for to in route.deadman.to):
                 yield Edge(f"case:{route.case.value}", f"to:@{name}", route.name, name, about)
     for gateway in program.gateways:
         for topic, inbound in gateway.inbound.items():
             if inbound.deadman is not None:
-                about = "published by the deadman"
+                about = "the deadman publishes"
                 yield Edge(_key(gateway.settings), f"to:{topic}", inbound.deadman.route, topic, about)
 
 

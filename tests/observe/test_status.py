@@ -98,7 +98,7 @@ def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Statu
     assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
     [drive] = [each for each in drawn["deadmen"] if each["route"] == "manual_drive"]
     assert (drive["start"], drive["end"], drive["label"]) == ("case:manual_drive", "to:@driving_board", "driving_board")
-    assert drive["about"].startswith("manual_brake")
+    assert drive["about"] == "the deadman sends manual_brake"
     board = next(node for node in drawn["nodes"] if node["key"] == "from:@sensor_board")
     assert (board["address"], board["role"]) == ("127.0.0.30:25008", "board")
 

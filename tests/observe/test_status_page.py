@@ -299,7 +299,7 @@ def test_a_deadman_that_sends_is_drawn_from_its_commands_to_the_board(
     assert page.evaluate(f"getComputedStyle({drawn}.line).strokeDasharray") == "3px, 3px"
     page.until(f"/[0-9]\\/s/.test({box('to:@driving_board')}.textContent)")
     choose(page, "case:manual_drive")
-    assert "manual_brake, sent by the deadman" in page.text("#facts")
+    assert "the deadman sends manual_brake" in page.text("#facts")
     health.parked = 27 * 60
     page.until(f"{drawn}.state === 'calm' && {is_seen}")
     running.count("deadman_active", "manual_drive", to=0)
@@ -353,8 +353,8 @@ def test_a_deadman_of_a_client_is_drawn_from_its_gateway_to_its_topic(clients: F
         assert "geometry_msgs/msg/Twist" in shown
         assert "◆ subscribed" in shown
         choose(page, "gateway:phone")
-        assert "published by the deadman" in page.text("#facts")
-        assert "■ the deadman sends to /cmd_vel" in page.text("#facts")
+        assert "the deadman publishes" in page.text("#facts")
+        assert "■ the deadman publishes to /cmd_vel" in page.text("#facts")
         assert page.evaluate("nodes.get('gateway:phone').words.children.length") == 3
         choose(page, "clients:gateway:phone")
         assert page.evaluate(f"{drawn}.element.classList.contains('near')")
