@@ -173,7 +173,7 @@ class RosMessage(_Source):
         seconds, nanoseconds = moment.type.fields
         return moment.value(seconds), moment.value(nanoseconds)
 
-    def _for_each(self, node: tree.Node) -> lists.Stored:
+    def _for_each(self, node: tree.Node) -> lists.StoredList:
         """Lower the list of `for_each`, and make `item`, `index` and `count` available to expressions."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
@@ -187,7 +187,7 @@ class RosMessage(_Source):
         self.add(Slot(0, tree.INDEX), Slot(0, tree.COUNT))
         return of
 
-    def _elements(self, of: lists.Stored, targets: Iterable[LoweredTarget]) -> LoweredElements:
+    def _elements(self, of: lists.StoredList, targets: Iterable[LoweredTarget]) -> LoweredElements:
         item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
         section = item.index if isinstance(item, Section) and item.wanted else NONE
         return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
