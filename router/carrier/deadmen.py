@@ -60,13 +60,13 @@ class DeadmanGroup:
         self.names = names
         self.address = address
 
-    def kept(
+    def get_or_open(
         self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
     ) -> NativeDeadman:
         """Return the deadman of a route. Programs with the same plan and senders share it. Raises MemoryError."""
         endpoints = [endpoint for endpoint, _ in plan.datagrams]
         used = [senders[endpoint] for endpoint in endpoints]
-        return state.open(
+        return state.get_or_open(
             ("deadman", plan.route),
             (plan, *used),
             lambda address: NativeDeadman(self.library, self.address, address, endpoints, used),

@@ -102,7 +102,7 @@ class NativeSide:
         self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
-        return self.deadmen.kept(plan, self._counters, senders(self._outlets), State(self._library))
+        return self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
 
     def replace(self, later: NativeDeadman, earlier: NativeDeadman) -> None:
         later.succeeds(earlier)
