@@ -33,7 +33,7 @@ class Keeper:
 
     def keep(self, program: Callable[[], Program | None], read: Inputs) -> None:
         """Start to save the running program, compiled from `read`. `program` returns it with counters of its own."""
-        work = partial(self._keep, program, read.plain()) if read.plain() != self._kept else store.works
+        work = partial(self._keep, program, read.plain()) if read.plain() != self._kept else store.clear_tries
         try:
             self._thread.submit(work)
         except (RuntimeError, MemoryError) as error:  # no thread can be started
