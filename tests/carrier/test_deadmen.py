@@ -105,7 +105,7 @@ class NativeSide:
         return self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
 
     def replace(self, later: NativeDeadman, earlier: NativeDeadman) -> None:
-        later.succeeds(earlier)
+        later.replace(earlier)
         self._library.deadman_replace(self.deadmen.address, later.address, earlier.address)
 
     def remove(self, deadman: NativeDeadman) -> None:
