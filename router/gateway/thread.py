@@ -147,7 +147,7 @@ class GatewayThread:
                     opening.push_async_callback(self._open_again, service)
 
     async def _open_again(self, service: GatewayService) -> None:
-        again = service.anew()
+        again = service.replacement()
         await again.open()
         again.start()
         self._services[again.name] = again
