@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     hold_signals(arguments)
-    _open_what_is_closed()
+    _reopen_standard_streams()
     with ExitStack() as ending:
         try:
             if _verb(arguments) != "run":  # `run` sets up its process itself
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _open_what_is_closed() -> None:
+def _reopen_standard_streams() -> None:
     """Open /dev/null for each standard stream that the caller has closed, or the next socket would get its number."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:

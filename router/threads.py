@@ -181,11 +181,11 @@ class DaemonThread(Executor):
             del call  # else its arguments and result would live until the next call
 
 
-LEAVING_S = 1.0
+ABANDON_S = 1.0
 """How long, in seconds, a reload or a stop waits for a thread that may be stuck in the middleware."""
 
 
-def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
+def join_or_abandon(thread: threading.Thread, timeout: float = ABANDON_S) -> bool:
     """Wait for the end of a daemon thread. On timeout, log that and return False."""
     thread.join(timeout)
     if thread.is_alive():
@@ -206,7 +206,7 @@ class StopStack(ExitStack):
 
     def callback(self, callback: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[P, T]:
         name = getattr(callback, "__qualname__", repr(callback))
-        super().callback(self._steps.call_or_leave, name, lambda: callback(*args, **kwargs))
+        super().callback(self._steps.call_or_abandon, name, lambda: callback(*args, **kwargs))
         return callback
 
 
@@ -221,7 +221,7 @@ class _Steps:
         self._until: float | None = None
         self._has_threads = True
 
-    def call_or_leave(self, name: str, work: Callable[[], object]) -> None:
+    def call_or_abandon(self, name: str, work: Callable[[], object]) -> None:
         if self._until is None:
             self._until = monotonic() + STEPS_S
         call = _Call(Future(), work)

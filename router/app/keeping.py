@@ -39,7 +39,7 @@ class Keeper:
 
     def _keep(self, program: Callable[[], Program | None], read: Plain) -> None:
         if read == self._kept:
-            store.works()
+            store.clear_tries()
             return
         from router.carrier.image import image_of
 

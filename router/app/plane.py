@@ -149,7 +149,7 @@ class Plane:
         This needs only sockets, so it does not wait for ROS, which takes longer to open.
         """
         for plan in program.deadmen:
-            deadman = self._deadmen.kept(plan, program.counters, senders, state)
+            deadman = self._deadmen.get_or_open(plan, program.counters, senders, state)
             sent_to = self._head_start.sent[plan.route] if self._head_start else deadman.start(boottime_ns())
             if sent_to:
                 what = "the deadman has sent its payload at startup"
@@ -174,7 +174,7 @@ class Plane:
             arrays.keep(outlets)
         adopted = [*outlets.pacers(), *native.states.adopted, *from_ros.states.adopted]
         clients = {
-            plan.route: self._client_deadmen.kept(plan, counters, opened.publications, state)
+            plan.route: self._client_deadmen.get_or_open(plan, counters, opened.publications, state)
             for plan in program.client_deadmen
         }
         if self._head_start is not None and self.now is None:

@@ -68,13 +68,13 @@ class ClientDeadmen(NativeThread):
                 raise StartError(f"the thread for deadmen of clients cannot be started: {os.strerror(error)}")
             self._has_started = True
 
-    def kept(
+    def get_or_open(
         self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
     ) -> ClientDeadman:
         """Return the deadman of a topic. Programs with the same plan and publisher share it. Raises MemoryError."""
         topics = [topic for topic, _ in plan.datagrams]
         used = [publications[topic] for topic in topics]
-        return state.open(
+        return state.get_or_open(
             ("client deadman", plan.route),
             (plan, *used),
             lambda address: ClientDeadman(self._library, self._group, address, topics, used),

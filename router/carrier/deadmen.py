@@ -40,7 +40,7 @@ class NativeDeadman:
         reached = self._library.deadman_start(self._deadmen, self.address, now)
         return [endpoint for bit, endpoint in enumerate(self._endpoints) if reached >> bit & 1]
 
-    def succeeds(self, earlier: NativeDeadman) -> None:
+    def replace(self, earlier: NativeDeadman) -> None:
         """Live as long as `earlier`: once the carrier has replaced that, feeding it feeds this deadman."""
         earlier._successor = self
 
@@ -60,13 +60,13 @@ class DeadmanGroup:
         self.names = names
         self.address = address
 
-    def kept(
+    def get_or_open(
         self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, Addressed], state: State
     ) -> NativeDeadman:
         """Return the deadman of a route. Programs with the same plan and senders share it. Raises MemoryError."""
         endpoints = [endpoint for endpoint, _ in plan.datagrams]
         used = [senders[endpoint] for endpoint in endpoints]
-        return state.open(
+        return state.get_or_open(
             ("deadman", plan.route),
             (plan, *used),
             lambda address: NativeDeadman(self.library, self.address, address, endpoints, used),
@@ -99,7 +99,7 @@ def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[
     """
     pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
     for each, earlier in pairs:
-        each.succeeds(earlier)
+        each.replace(earlier)
     return pairs
 
 

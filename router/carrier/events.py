@@ -15,7 +15,7 @@ from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Mismatch, Report
 from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
-from router.threads import Thread, join_or_leave
+from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
 
@@ -126,7 +126,7 @@ class EventThread:
         self._stopping = True
         os.eventfd_write(self._wakes[0], 1)
         if self._thread.ident is not None:
-            join_or_leave(self._thread)
+            join_or_abandon(self._thread)
 
     def _run(self) -> None:
         poll = select.poll()

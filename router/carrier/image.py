@@ -124,14 +124,14 @@ class _Recorder(State):
         self.openings: list[tuple[tuple[str | None, ...], str, list[object]]] = []
         self._symbols = symbols
 
-    def open(
+    def get_or_open(
         self, place: tuple[str | None, ...], rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object
     ) -> T:
         def make() -> _Symbol:
             self.openings.append((place, function, [_plain(each) for each in arguments]))
             return self._symbols.of("opened", *place)
 
-        return cast("T", self.keep((place, rest), make))
+        return cast("T", self.get_or_make((place, rest), make))
 
 
 def _plain(argument: object) -> object:

@@ -7,7 +7,7 @@ from math import ceil
 from typing import NamedTuple
 
 from router import declared as c
-from router.carrier.state import opened
+from router.carrier.state import open_native
 
 _UNKNOWN = -(1 << 63)
 _NS = 1_000_000_000
@@ -42,7 +42,7 @@ class RateLimit:
     """`struct limit`, for one thread at a time: passes at most `hertz` messages per second."""
 
     def __init__(self, library: ctypes.CDLL, hertz: float) -> None:
-        self._at = opened(library, "limit_open", period(hertz))
+        self._at = open_native(library, "limit_open", period(hertz))
         self._close = library.limit_close
         self._passes = library.limit_passes
 

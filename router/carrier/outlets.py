@@ -72,7 +72,7 @@ class Outlets:
             listeners=listeners,
             senders=senders,
             publications=publications,
-            deadmen={plan.route: group.kept(plan, program.counters, senders, state) for plan in program.deadmen},
+            deadmen={plan.route: group.get_or_open(plan, program.counters, senders, state) for plan in program.deadmen},
             bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=boards,
         )
@@ -86,7 +86,7 @@ class Outlets:
         rate = target.max_rate
         assert rate is not None  # noqa: S101 - checked by the caller
         place = "limit", plan.route, plan.topic, source, target.label
-        return self.state.open(place, target, self._native("limit"), "limit_open", period(rate))
+        return self.state.get_or_open(place, target, self._native("limit"), "limit_open", period(rate))
 
     def pacers(self) -> list[Adoption]:
         """Return the pacers of all endpoints with a bandwidth."""
@@ -95,7 +95,7 @@ class Outlets:
     def _pacer(self, endpoint: str) -> Native:
         place, bandwidth = ("pacer", endpoint), self.bandwidths[endpoint]
         rest = bandwidth, self.senders[endpoint]
-        return self.state.open(place, rest, self._native("pacer"), "pacer_open", bandwidth)
+        return self.state.get_or_open(place, rest, self._native("pacer"), "pacer_open", bandwidth)
 
     def _native(self, kind: str, keep: object = None) -> Callable[[int], Native]:
         """Return a function that wraps the address of an opened structure."""
@@ -107,11 +107,13 @@ class Outlets:
         destination = pacer or (self.publications if target.is_topic else self.senders)[target.label]
         place = "deferral", plan.route, plan.topic, source, target.label
         address = pacer.address if pacer else None
-        return self.state.open(place, destination, self._native("deferral", pacer), "deferral_open", address)
+        return self.state.get_or_open(place, destination, self._native("deferral", pacer), "deferral_open", address)
 
     def collector(self, plan: RoutePlan) -> Native:
         """Return the collector that makes frames of the route's payload for its topics."""
         timeout, targets = plan.collect_timeout, tuple(target for target in plan.targets if target.is_topic)
         assert timeout is not None  # noqa: S101 - checked by the caller
         rest = timeout, plan.case.message_class, targets
-        return self.state.open(("collect", plan.route), rest, self._native("collector"), "collector_open", timeout)
+        return self.state.get_or_open(
+            ("collect", plan.route), rest, self._native("collector"), "collector_open", timeout
+        )

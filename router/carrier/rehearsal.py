@@ -175,7 +175,7 @@ class Stage:
 
     def _fixed(self, program: Program, state: State, boards: NativeBoards) -> _Fixed:
         publications = {
-            plan.label: state.keep(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
+            plan.label: state.get_or_make(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
             for plan in program.publishers
         }
         return _Fixed({each.name: self._sender(each, state) for each in program.senders}, publications, boards)
@@ -195,7 +195,7 @@ class Stage:
         return _Bound(outlets, outlets.pacers())
 
     def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
-        return state.keep(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
+        return state.get_or_make(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
 
 
 class _Opened:

@@ -29,21 +29,23 @@ class State:
         self._previous: dict[Hashable, object] = previous._kept if previous else {}
         self._kept: dict[Hashable, object] = {}
 
-    def keep(self, key: Hashable, make: Callable[[], T]) -> T:
+    def get_or_make(self, key: Hashable, make: Callable[[], T]) -> T:
         """Return the object with this key, of this program or the previous one; make it if there is none."""
         if key not in self._kept:
             self._kept[key] = self._previous[key] if key in self._previous else make()
         return self._kept[key]  # type: ignore[return-value]  # the key says what it is
 
-    def open(self, place: Place, rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object) -> T:
-        """Keep an object that a library function opens; `wrap` gets its address. Raises MemoryError.
+    def get_or_open(
+        self, place: Place, rest: Hashable, wrap: Callable[[int], T], function: str, *arguments: object
+    ) -> T:
+        """Like `get_or_make`, for an object that a library function opens; `wrap` gets its address. Raises MemoryError.
 
         `place` identifies the object within its program; the key is `place` with `rest`.
         """
-        return self.keep((place, rest), lambda: wrap(self._open(place, function, *arguments)))
+        return self.get_or_make((place, rest), lambda: wrap(self._open(place, function, *arguments)))
 
     def _open(self, place: Place, function: str, *arguments: object) -> int:
-        return self._opened.pop(place, 0) or opened(self._library, function, *arguments)
+        return self._opened.pop(place, 0) or open_native(self._library, function, *arguments)
 
     def forget_previous(self) -> None:
         self._previous = {}
@@ -65,7 +67,7 @@ class Native:
             self._close(self.address)
 
 
-def opened(library: ctypes.CDLL, function: str, *arguments: object) -> int:
+def open_native(library: ctypes.CDLL, function: str, *arguments: object) -> int:
     """Return the address that a library function returns. Raises MemoryError if it is 0."""
     address = int(getattr(library, function)(*arguments) or 0)
     if not address:

@@ -105,7 +105,7 @@ def _kept(table: Path) -> Iterator[str]:
 
     try:
         folder = store.folder()
-        files = [*store.every()] if Path(folder).is_dir() else []
+        files = [*store.list_files()] if Path(folder).is_dir() else []
     except OSError as error:
         yield f"kept programs cannot be read: {error}"
         return

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         written.write(site.schema.lock, locked(site))
         after = _check(path)
-        print_findings(_news(before, after), sys.stderr)
+        print_findings(_new_findings(before, after), sys.stderr)
     except BaseException:  # including Ctrl-C
         written.undo()
         raise
@@ -111,7 +111,7 @@ def _site(checked: Checked) -> Site:
     return site_of(checked, asset("schemas") / "comms" / "msg")
 
 
-def _news(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
+def _new_findings(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
     """Return the new findings, compared by message, because lines have moved."""
     known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
     found = {finding: None for checked in after for finding in checked.diagnostics}

@@ -32,7 +32,7 @@ from router.compiler.expressions.kinds import (
     length_of,
 )
 from router.compiler.expressions.lists import fitted, limited
-from router.compiler.expressions.scope import field_of, want_readable
+from router.compiler.expressions.scope import field_of, require_readable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -43,7 +43,7 @@ _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 
 def convert(value: tree.Node, target: Type, scope: Scope) -> Plan:
     """Return the plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
-    want_readable(value)
+    require_readable(value)
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
     if isinstance(target, List):
@@ -125,13 +125,13 @@ def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
 
 def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
     if isinstance(value, tree.Listed):
-        _want_length(value, target, len(value.items))
+        _require_length(value, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = element_of(value.kind), length_of(value.kind)
     if element_kind is None:
         raise mismatch(value, target, "write a list, [a, b]")
     if length is not None:
-        _want_length(value, target, length)
+        _require_length(value, target, length)
     if isinstance(value, tree.Each):
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
     element = tree.Variable(element_kind, value.span, scope.element_variable())
@@ -154,7 +154,7 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
         raise ExpressionError(found.span, found.code, f"list element: {found.message}", hint) from error
 
 
-def _want_length(value: tree.Node, target: List, length: int) -> None:
+def _require_length(value: tree.Node, target: List, length: int) -> None:
     if target.length is not None and length != target.length:
         raise ExpressionError(value.span, Code.TYPE_MISMATCH, f"{target} takes {target.length} elements, not {length}")
     if target.bound is not None and length > target.bound:
@@ -168,7 +168,7 @@ def _want_length(value: tree.Node, target: List, length: int) -> None:
 
 def converted(value: tree.Node, target: Type) -> tree.Node:
     """Return the expression that fills a scalar field. Raises ExpressionError if it does not fit."""
-    _want_finite(value, target)
+    _require_finite(value, target)
     match target:
         case Bool():
             return _to_bool(value, target)
@@ -186,7 +186,7 @@ def converted(value: tree.Node, target: Type) -> tree.Node:
             raise AssertionError(f"{target} is not a scalar")
 
 
-def _want_finite(value: tree.Node, target: Type) -> None:
+def _require_finite(value: tree.Node, target: Type) -> None:
     """Raise ExpressionError if `nan` or `inf` would fill a field that is not a float."""
     literal = tree.constant_of(value)
     if isinstance(literal, float) and not isinstance(target, Float) and not math.isfinite(literal):
@@ -294,14 +294,14 @@ def _to_string(value: tree.Node, target: String) -> tree.Node:
         raise ExpressionError(value.span, Code.FORBIDDEN_EXPRESSION, "expressions cannot fill a wstring", hint)
     literal = tree.constant_of(value)
     if isinstance(literal, str):
-        _want_text(value, literal, target)
+        _require_text(value, literal, target)
         return value
     if target.bound is None:
         return value
     return limited("fit_text", value, StringKind(), target.bound)
 
 
-def _want_text(value: tree.Node, text: str, target: String) -> None:
+def _require_text(value: tree.Node, text: str, target: String) -> None:
     """Raise ExpressionError if a text literal does not fit the field."""
     try:
         length = len(text.encode())

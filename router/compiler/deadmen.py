@@ -44,9 +44,9 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     """Check the deadman of a route. Return None if it has none, or if it is invalid."""
     deadman = route.deadman
     if deadman is None:
-        _want_deadman(lookup, route)
+        _require_deadman(lookup, route)
         return None
-    _want_commands(lookup, route, deadman)
+    _require_commands(lookup, route, deadman)
     case = lookup.case(deadman.case)
     if case is None:
         return None
@@ -64,7 +64,7 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     return deadman_plan(route.name, deadman, datagrams, disarmed_by)
 
 
-def _want_deadman(lookup: Lookup, route: Route) -> None:
+def _require_deadman(lookup: Lookup, route: Route) -> None:
     """Warn about the first board that gets commands from a route without a deadman."""
     for destination in route.destinations:
         name = destination.endpoint.value
@@ -75,7 +75,7 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
             return
 
 
-def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+def _require_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if not route.destinations:
         if route.topics:
             message = f"'{route.case.value}' has no destinations, so there are no commands to watch"
@@ -87,8 +87,8 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     are_late = _report_late_commands(lookup, route, deadman)
     lookup.findings += timing_findings(deadman, None if are_late else route.ttl, max_rate, "datagrams")
     if deadman.because is None:
-        _want_all_boards(lookup, route, deadman)
-        _want_hand_over(lookup, route, deadman)
+        _require_all_boards(lookup, route, deadman)
+        _require_hand_over(lookup, route, deadman)
 
 
 def timing_findings(
@@ -132,7 +132,7 @@ def _doubtful_times(
         yield ttl.span, message, f"set `ttl` to at most {time.replace(' ', '')}"
 
 
-def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+def _require_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     """Report the first board that receives commands from the route but is not stopped by the deadman."""
     stopped = {to.value for to in deadman.to}
     if not stopped <= lookup.table.endpoints.keys():
@@ -146,7 +146,7 @@ def _want_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
             return
 
 
-def _want_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+def _require_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     """Report routes with a deadman whose commands to a board this deadman would interrupt."""
     if deadman.disarmed_by == ():
         return

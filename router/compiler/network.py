@@ -16,7 +16,7 @@ LOOPBACK = "127."
 
 
 @dataclass(frozen=True, slots=True)
-class _Held:
+class _LocalAddress:
     """A local address, with the name of its owner for findings. UDP and TCP addresses do not clash."""
 
     owner: str
@@ -27,7 +27,7 @@ class _Held:
 
 def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for the addresses of a table and for its listeners."""
-    for first, second in combinations(_held(table), 2):
+    for first, second in combinations(_local_addresses(table), 2):
         if first.is_udp == second.is_udp and _overlap(first, second):
             message = f"{second.owner} uses the address of {first.owner}"
             hint = "use another port"
@@ -42,27 +42,27 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
             yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "remove `allow_non_finite`")
     yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}
-    blamed: set[str] = set()
+    reported: set[str] = set()
     for one, other in combinations(table.endpoints.values(), 2):
-        if other.name not in blamed and (clash := _clash(one, other, sources)):
-            blamed.add(other.name)
+        if other.name not in reported and (clash := _clash(one, other, sources)):
+            reported.add(other.name)
             yield clash
 
 
-def _held(table: RouteTable) -> Iterator[_Held]:
+def _local_addresses(table: RouteTable) -> Iterator[_LocalAddress]:
     for listener in table.listeners.values():
         interface = listener.interface
-        yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
+        yield _LocalAddress(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
     if table.http is not None:
-        yield _Held("'http'", table.http)
+        yield _LocalAddress("'http'", table.http)
     if table.foxglove is not None:
-        yield _Held("'foxglove'", table.foxglove)
+        yield _LocalAddress("'foxglove'", table.foxglove)
     for gateway in table.gateways.values():
         owner = f"gateway '{gateway.name}'"
         if gateway.receive is not None:
-            yield _Held(owner, gateway.receive, is_udp=True)
+            yield _LocalAddress(owner, gateway.receive, is_udp=True)
         if gateway.address is not None and gateway.transport.value is not Transport.UDP:
-            yield _Held(owner, gateway.address)
+            yield _LocalAddress(owner, gateway.address)
 
 
 def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
@@ -90,7 +90,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
             yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "write the address of its client")
 
 
-def _overlap(one: _Held, other: _Held) -> bool:
+def _overlap(one: _LocalAddress, other: _LocalAddress) -> bool:
     """Return whether two addresses overlap, so that the kernel cannot bind both. On two interfaces, they never do."""
     if one.interface and other.interface and one.interface != other.interface:
         return False

@@ -58,7 +58,7 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
     findings = lookup.findings
     before = len(findings)
     checked = _route(lookup, route)
-    findings[before:] = _said_once(findings[before:])
+    findings[before:] = _without_repeats(findings[before:])
     if f"routes/{route.case.value}" in lookup.table.broken:
         findings[before:] = [finding for finding in findings[before:] if finding.code not in _OF_GAPS]
     return checked
@@ -69,7 +69,7 @@ _NO_COLLECT = f"'{ITEMS}' and '{COUNT}' need `collect`, which this route lacks"
 _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD, timeout: 1s}`"
 
 
-def _said_once(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
+def _without_repeats(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
     """Yield the findings. A missing `for_each` or `collect` is reported once, not for each name that needs it."""
     said = set()
     for finding in findings:

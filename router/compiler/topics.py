@@ -151,9 +151,9 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
                 yield finding
         for publisher, subscriber in product(uses, uses):
             if publisher.publishes and not subscriber.publishes and publisher.route and subscriber.route:
-                yield from _echoes(name, publisher.route, subscriber.route)
+                yield from _loops(name, publisher.route, subscriber.route)
         for use in uses:
-            yield from _struggles(name, use, uses)
+            yield from _deadman_conflicts(name, use, uses)
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
@@ -175,7 +175,7 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
             yield _Use(inbound.topic, owner, True, qos_of(inbound.topic), deadman=inbound.deadman)
 
 
-def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
+def _loops(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
     """Yield findings for endpoints that would get their own messages back through a topic."""
     sources = {source.value for source in publisher.sources}
     for destination in subscriber.destinations:
@@ -186,7 +186,7 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
             yield Diagnostic(sender.span, Code.FORWARDING_LOOP, message, hint)
 
 
-def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
+def _deadman_conflicts(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
     """Yield a finding if a gateway's deadman publishes where others also publish, or feeds the deadman of a route."""
     if use.deadman is None:
         return
@@ -215,13 +215,13 @@ def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
         message = f"topic '{name}' has a different QoS in {first.owner}"
         return Diagnostic(span, Code.QOS_CONFLICT, message, f"use one QoS for the topic; see {first.topic.span}")
     publisher, subscriber = (use, first) if use.publishes else (first, use)
-    if reason := _unheard(publisher.qos, subscriber.qos):
+    if reason := _qos_mismatch(publisher.qos, subscriber.qos):
         message = f"{subscriber.owner} would not receive what {publisher.owner} publishes on"
         return Diagnostic(span, Code.QOS_CONFLICT, f"{message} '{name}': {reason}", "give both the same QoS")
     return None
 
 
-def _unheard(offered: QosPlan, requested: QosPlan) -> str:
+def _qos_mismatch(offered: QosPlan, requested: QosPlan) -> str:
     """Return why DDS would not match the two, or an empty string."""
     if offered.reliability == "best_effort" and requested.reliability == "reliable":
         return "it requests reliable, but best_effort is offered"

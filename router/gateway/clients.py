@@ -26,7 +26,7 @@ class ClientQueue:
         self.number = number
         self.sent = 0
         self.dropped = 0
-        self.lacking: set[str] = set()
+        self.missed_topics: set[str] = set()
         """Topics with a queued frame that a newer one replaced."""
         self._on_wire = on_wire
         self._behind_since: int | None = None
@@ -51,9 +51,9 @@ class ClientQueue:
         """Whether the kept messages of any topic are on their way."""
         return bool(self._held)
 
-    def lack(self, topic: str) -> None:
+    def record_miss(self, topic: str) -> None:
         """Record that the client missed a message of the topic, unless kept messages on their way include it."""
-        (self._held_incomplete if topic in self._held else self.lacking).add(topic)
+        (self._held_incomplete if topic in self._held else self.missed_topics).add(topic)
 
     @property
     def keeps_up(self) -> bool:
@@ -83,12 +83,12 @@ class ClientQueue:
         if topic in self._held_incomplete:
             self._held_incomplete.discard(topic)
             if not is_complete:
-                self.lacking.add(topic)
+                self.missed_topics.add(topic)
         frames = self._held.pop(topic, [])
         self._held_bytes -= sum(len(frame.data) for frame in frames)
         return frames
 
-    def unheld(self, frames: Sequence[Frame]) -> list[Frame]:
+    def hold_back(self, frames: Sequence[Frame]) -> list[Frame]:
         """Return the frames that can be sent now, and hold the others. If these get too large, release all."""
         passed: list[Frame] = []
         for frame in frames:
@@ -107,7 +107,7 @@ class ClientQueue:
         if self._behind_since is None:
             self._behind_since = now
         before = self.waiting
-        self.lacking |= self._values.keys() & values.keys()
+        self.missed_topics |= self._values.keys() & values.keys()
         self._schemas.update(schemas)
         self._values.update(values)
         superseded = before + frames - self.waiting
@@ -172,7 +172,7 @@ class Clients:
         behind: list[ClientQueue] = []
         for each in self.queues.values():
             if each.holds:
-                self.send_to(each, each.unheld(frames))
+                self.send_to(each, each.hold_back(frames))
             else:
                 (ready if each.keeps_up else behind).append(each)
         if behind:
@@ -184,10 +184,10 @@ class Clients:
         elif ready:
             ready[0].write(frames)
 
-    def lack(self, topic: str) -> None:
+    def record_miss(self, topic: str) -> None:
         """Record that all clients missed a message of the topic."""
         for queue in self.queues.values():
-            queue.lack(topic)
+            queue.record_miss(topic)
 
     def send_to(self, queue: ClientQueue, frames: Sequence[Frame]) -> None:
         """Send frames to one client."""
@@ -222,7 +222,7 @@ class Clients:
         for frame in (each for each in frames if not each.is_schema):
             if frame.topic in values:
                 for queue in queues:
-                    queue.lacking.add(frame.topic)
+                    queue.missed_topics.add(frame.topic)
             values[frame.topic] = frame
         now = self._clock_ns()
         self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))

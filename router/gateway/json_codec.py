@@ -207,11 +207,11 @@ def _text(data: bytes) -> str:
     try:
         return text.decode()
     except UnicodeDecodeError:
-        begin = text[:_MOST_SAID].decode(errors="backslashreplace") + "..." * (len(text) > _MOST_SAID)
+        begin = text[:_LONGEST_EXCERPT].decode(errors="backslashreplace") + "..." * (len(text) > _LONGEST_EXCERPT)
         raise UnreadableError(f"the text '{begin}' is not UTF-8: correct its publisher") from None
 
 
-_MOST_SAID = 48
+_LONGEST_EXCERPT = 48
 """Bytes of a text that an error quotes."""
 
 

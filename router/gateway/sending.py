@@ -119,7 +119,7 @@ class TopicSender:
         if new > is_new:
             self._counters.filtered(new - is_new)
             if served.selection.keepers:
-                self._clients.lack(served.subscription.topic)
+                self._clients.record_miss(served.subscription.topic)
         served.sample = sample
         if sample is not None and is_new:
             self._offer(served, sample, frames, is_new=True)
@@ -138,7 +138,7 @@ class TopicSender:
             served.unconverted.append(sample)
         else:
             self._counters.dropped("overloaded", sample.topic)
-            self._clients.lack(sample.topic)
+            self._clients.record_miss(sample.topic)
 
     def count_missed(self, served: ServedTopic) -> None:
         """Count messages that newer ones replaced before they were taken."""
@@ -147,7 +147,7 @@ class TopicSender:
         if served.period == EACH:
             self._counters.dropped("overloaded", served.subscription.topic, messages=new)
             if new:
-                self._clients.lack(served.subscription.topic)
+                self._clients.record_miss(served.subscription.topic)
         else:
             self._counters.filtered(new)
 

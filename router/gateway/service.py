@@ -52,7 +52,7 @@ class GatewayService:
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
-    def anew(self) -> GatewayService:
+    def replacement(self) -> GatewayService:
         """Return a new service to replace this closed one: with the same limits and counters, without clients."""
         return GatewayService(self.plan, self._context, self._counters, self._inbound, self._new_transport)
 
@@ -88,7 +88,7 @@ class GatewayService:
     def joined(self, client: Client) -> None:
         queue = self.clients.joined(client)
         is_alone = len(self.clients.queues) == 1
-        self.clients.send_to(queue, self._hello() + self._topics.snapshot(queue, is_for_all=is_alone))
+        self.clients.send_to(queue, self._inbound_frames() + self._topics.snapshot(queue, is_for_all=is_alone))
         if is_alone:
             self._topics.discover_now()
 
@@ -119,14 +119,14 @@ class GatewayService:
         try:
             wanted = self._inbound.receive(data, arrived_ns)
         except RefusedError as refused:
-            self._tell(client, refused)
+            self._send_refusal(client, refused)
         else:
             if wanted is not None:
                 self._show_schemas(client, wanted.type_name)
 
     # -- answers -------------------------------------------------------------------------------------------------
 
-    def _tell(self, client: Client, refused: RefusedError) -> None:
+    def _send_refusal(self, client: Client, refused: RefusedError) -> None:
         queue = self.clients.queues.get(client)
         if self._explains and queue is not None:
             document = rejected_document(refused.reason, str(refused), refused.topic)
@@ -137,12 +137,12 @@ class GatewayService:
         queue = self.clients.queues.get(client)
         if queue is None or now - self._answered < _ANSWER_NS:
             refused = self._inbound.refusal("rate_limited", "schemas are sent at most 10 times per second")
-            self._tell(client, refused)
+            self._send_refusal(client, refused)
             return
         self._answered = now
         self.clients.send_to(queue, self._topics.snapshot(queue, type_name))
 
-    def _hello(self) -> list[Frame]:
+    def _inbound_frames(self) -> list[Frame]:
         """Return the topics that a client may publish on, for clients with a page."""
         if not self._has_page:
             return []

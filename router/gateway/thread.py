@@ -32,7 +32,7 @@ from router.log import logger
 from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
-from router.threads import DaemonThread, StuckError, Thread, join_or_leave
+from router.threads import DaemonThread, StuckError, Thread, join_or_abandon
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -147,7 +147,7 @@ class GatewayThread:
                     opening.push_async_callback(self._open_again, service)
 
     async def _open_again(self, service: GatewayService) -> None:
-        again = service.anew()
+        again = service.replacement()
         await again.open()
         again.start()
         self._services[again.name] = again
@@ -203,7 +203,7 @@ class GatewayThread:
             self._loop.call_soon_threadsafe(self._subscriptions.close)
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._converting.shutdown()
-            if join_or_leave(self._thread):
+            if join_or_abandon(self._thread):
                 self._loop.close()
 
     def _call(self, work: Coroutine[Any, Any, T], patience: float = _PATIENCE_S) -> T:

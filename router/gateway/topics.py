@@ -30,7 +30,7 @@ default buffer lose some of a burst of two hundred.
 SHORTEST_PAUSE_S = 0.1
 """The minimum time between two discoveries, even if many clients join."""
 
-MEND_S = 0.5
+RESEND_S = 0.5
 """The interval of checks for clients that lack messages which publishers still keep."""
 
 SHORTEST_TURN = 10_000_000
@@ -69,17 +69,17 @@ class Topics:
         self._numbers = count()
         self._discover_now = asyncio.Event()
         self._is_udp = plan.settings.transport.value is Transport.UDP
-        self._spreads = self._is_udp and plan.settings.format is GatewayFormat.GATEWAY_V1
+        self._is_spread = self._is_udp and plan.settings.format is GatewayFormat.GATEWAY_V1
 
     def start(self) -> None:
         settings = self._plan.settings
         self._tasks.run(self._discover(settings.discovery_period / 1e9))
         periods = {settings.publish_period, *(rate.period for rate in settings.rates)} - {EACH}
         for period in sorted(periods):
-            self._in_turns(period, partial(self._publish, period))
+            self._schedule(period, partial(self._publish, period))
         if settings.transport.value in (Transport.UDP, Transport.ZENOH):
-            self._in_turns(settings.schema_period, self._repeat_schemas)
-        self._tasks.each(MEND_S, self._mend)
+            self._schedule(settings.schema_period, self._repeat_schemas)
+        self._tasks.each(RESEND_S, self._resend_missed)
 
     def close(self) -> None:
         for topic in list(self._served):
@@ -142,7 +142,7 @@ class Topics:
         if before and before.subscription is subscription:
             self._subscriptions.leave(subscription, callback)  # it was already joined
             if selection.is_mixed and selection.keepers - before.selection.keepers:
-                self._clients.lack(topic)  # this subscription does not get their kept messages
+                self._clients.record_miss(topic)  # this subscription does not get their kept messages
             if before.selection.keepers - selection.keepers:
                 before.readable = None  # its publisher may be gone
             before.selection = selection
@@ -169,9 +169,9 @@ class Topics:
 
     # -- when they are served ------------------------------------------------------------------------------------
 
-    def _in_turns(self, period: int, serve: Callable[[Sequence[ServedTopic]], Awaitable[None]]) -> None:
+    def _schedule(self, period: int, serve: Callable[[Sequence[ServedTopic]], Awaitable[None]]) -> None:
         """Serve each topic once in a `period` (ns), spread over the period or all at once."""
-        number = max(1, min(MOST_TURNS, period // SHORTEST_TURN)) if self._spreads else 1
+        number = max(1, min(MOST_TURNS, period // SHORTEST_TURN)) if self._is_spread else 1
         turn_s = period / number / 1e9
         clock = asyncio.get_running_loop().time
         begin, done = clock(), -1
@@ -225,13 +225,13 @@ class Topics:
                 self._tasks.run(self._show(queue, topic, holds=holds))
 
     async def _show(self, queue: ClientQueue, topic: str, *, holds: bool) -> None:
-        queue.lacking.discard(topic)
+        queue.missed_topics.discard(topic)
         frames, is_complete = await self._kept(topic)
         held = queue.release(topic, is_complete=is_complete) if holds else []
         if queue.client not in self._clients.queues:
             return
         if frames and not queue.keeps_up:
-            queue.lacking.add(topic)
+            queue.missed_topics.add(topic)
             frames = []
         known = {frame.sent_ns for frame in frames}
         missing = [frame for frame in held if frame.sent_ns not in known]
@@ -257,16 +257,16 @@ class Topics:
         for queue in self._clients.queues.values():
             self._show_kept(queue, [served])
 
-    async def _mend(self) -> None:
+    async def _resend_missed(self) -> None:
         """Send clients the messages of a topic that they lack, once it is quiet and they keep up."""
-        lacking = [queue for queue in self._clients.queues.values() if queue.lacking and queue.keeps_up]
-        for topic in {topic for queue in lacking for topic in queue.lacking}:
+        behind = [queue for queue in self._clients.queues.values() if queue.missed_topics and queue.keeps_up]
+        for topic in {topic for queue in behind for topic in queue.missed_topics}:
             served = self._served.get(topic)
             if served and served.selection.keepers and not served.is_quiet():
                 continue
-            for queue in lacking:
-                if topic in queue.lacking:
-                    queue.lacking.discard(topic)
+            for queue in behind:
+                if topic in queue.missed_topics:
+                    queue.missed_topics.discard(topic)
                     self._show_kept(queue, [served] if served else [])
 
     # -- answers -----------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding
 from router.carrier.library import library
 from router.carrier.sender import NativeSender
-from router.carrier.state import opened
+from router.carrier.state import open_native
 from router.clock import boottime_ns
 from router.kept import store
 from router.net.sockets import ListeningSocket, open_sending, placed
@@ -35,7 +35,7 @@ _WORD = 8
 class HeadStart:
     """A running kept program, which was compiled from `inputs`.
 
-    `listening` and `senders` are by name; `opened` has addresses by place, as in `State.open`; `sent` has the
+    `listening` and `senders` are by name; `opened` has addresses by place, as in `State.get_or_open`; `sent` has the
     endpoints that deadmen have sent to, by route.
     """
 
@@ -54,7 +54,7 @@ class HeadStart:
             undo.callback(self._close_sockets)
             undo.callback(self.forwarding.carrier.close)
             self._open_sockets(parts)
-            self._open_what_is_kept(parts)
+            self._open_objects(parts)
             self._image = _Image(kept.image, parts, self._symbols(parts))
             self.topics = c.PublishChange(timers=self._timers(parts, of_topics=True), generation=KEPT_GENERATION)
             self._change = c.Change(program=self._image.at(c.Program, parts["program"]))
@@ -96,11 +96,11 @@ class HeadStart:
                 source, to_send = None, open_sending(None, is_board=is_board)
             self.senders[name] = NativeSender(self.library, address, to_send, source)
 
-    def _open_what_is_kept(self, parts: Mapping[str, Any]) -> None:
+    def _open_objects(self, parts: Mapping[str, Any]) -> None:
         """Open limits, pacers, deferrals, collectors and deadmen in this order: each refers to earlier ones."""
         for place, function, arguments in parts["openings"]:
             plain = [self._argument(each, parts) for each in arguments]
-            self.opened[tuple(place)] = opened(self.library, function, *plain)
+            self.opened[tuple(place)] = open_native(self.library, function, *plain)
 
     def _argument(self, argument: object, parts: Mapping[str, Any]) -> object:
         """Decode an argument from the form that `image._plain` gives it."""

@@ -72,7 +72,7 @@ _OF_ANOTHER = "it belongs to another command line, folder or Python"
 def find() -> tuple[Kept | None, str]:
     """Return the kept program of this command line, folder and Python, or why it is not used ("" if there is none)."""
     try:
-        kept, why = _judged(_path(_identity()))
+        kept, why = _inspect(_path(_identity()))
         if kept is not None and kept.identity != _identity():
             return None, _OF_ANOTHER
     except FileNotFoundError:
@@ -82,20 +82,20 @@ def find() -> tuple[Kept | None, str]:
     return (None, why) if why else (kept, "")
 
 
-def every() -> Iterator[tuple[str, Kept | None, str]]:
+def list_files() -> Iterator[tuple[str, Kept | None, str]]:
     """Yield, newest first, each file's path, its content if complete, and why a start does not use it, or "".
 
     Raises OSError.
     """
     for _, path in sorted(_files(folder(), _ENDING), reverse=True):
         try:
-            judged = _judged(path)
+            content = _inspect(path)
         except FileNotFoundError:  # a router has just removed it
             continue
-        yield path, *judged
+        yield path, *content
 
 
-def _judged(path: str) -> tuple[Kept | None, str]:
+def _inspect(path: str) -> tuple[Kept | None, str]:
     """Return the content of a complete file, and why a start does not use it, or "". Raises OSError."""
     try:
         kept = _read(path)
@@ -133,7 +133,7 @@ def write(read: Plain, parts: object, image: bytes) -> None:
         with suppress(OSError):
             os.unlink(unfinished)
         raise
-    works()
+    clear_tries()
     _remove_oldest(place, path)
 
 
@@ -154,7 +154,7 @@ def count_try() -> str:
     return ""
 
 
-def works() -> None:
+def clear_tries() -> None:
     """Reset the count of failed starts: a router has started."""
     with suppress(OSError):
         os.unlink(_path(_identity()) + _TRIES)

@@ -20,7 +20,7 @@ from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
 from router.observe.watch import LAST_SEEN, Health
 from router.table.model import Endpoint, Route
-from router.threads import Thread, background_threads, join_or_leave
+from router.threads import Thread, background_threads, join_or_abandon
 from router.values import age_text
 
 
@@ -67,7 +67,7 @@ class Diagnostics:
 
     def close(self) -> None:
         self._stopping.set()
-        join_or_leave(self._thread)
+        join_or_abandon(self._thread)
 
     def _run(self) -> None:
         has_failed = False

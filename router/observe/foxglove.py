@@ -25,7 +25,7 @@ from router.observe.running import Running
 from router.recording.channels import descriptor_set
 from router.recording.mirror import Classifier, Mirrored, first_field
 from router.table.addresses import Address
-from router.threads import Thread, background_threads, join_or_leave
+from router.threads import Thread, background_threads, join_or_abandon
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0
@@ -82,7 +82,7 @@ class FoxgloveServer(ServerListener):
     def close(self) -> None:
         self._is_closing = True
         self._changed.set()
-        join_or_leave(self._thread)
+        join_or_abandon(self._thread)
         self._server.stop()
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:

@@ -45,7 +45,7 @@ from router.observe.status import Status
 from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
 from router.observe.watch import Health
 from router.table.addresses import Address
-from router.threads import REST_S, Thread, join_or_leave
+from router.threads import REST_S, Thread, join_or_abandon
 
 MAX_PER_HOST = 16
 """Maximum connections. The router's own computer, with all its addresses, counts as one host."""
@@ -108,7 +108,7 @@ class HttpServer:
 
     def close(self) -> None:
         self._server.end()
-        join_or_leave(self._thread)
+        join_or_abandon(self._thread)
         self._server.connections.end_all()
         self._server.socket.close()
         self._status.close()

@@ -11,7 +11,7 @@ from router.compiler.program import DeadmanPlan
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import why_not_sent
 from router.table.addresses import Address
-from router.threads import Thread, join_or_leave
+from router.threads import Thread, join_or_abandon
 
 MOST_MISMATCHES = 64
 """Maximum mismatches remembered, the latest ones: any stranger can cause them."""
@@ -35,7 +35,7 @@ class Reporter:
     def close(self) -> None:
         """Log the remaining reports."""
         self._stopped.set()
-        join_or_leave(self._thread)
+        join_or_abandon(self._thread)
         self._floods.flush(final=True)
 
     def mismatches(self) -> Mapping[Mismatch, int]:

@@ -11,7 +11,7 @@ from router.observe.health import PERIOD, WINDOW, Look
 from router.observe.problems import Kind
 from router.observe.running import Running
 from router.observe.snapshot import DELIVERED, Snapshot, snapshot
-from router.threads import Thread, background_threads, join_or_leave
+from router.threads import Thread, background_threads, join_or_abandon
 
 LAST_SEEN = Kind.ENDPOINT_SILENT.metric
 METRICS = {kind.metric for kind in Kind} | {
@@ -96,7 +96,7 @@ class Health:
 
     def close(self) -> None:
         self._stopping.set()
-        join_or_leave(self._thread)
+        join_or_abandon(self._thread)
 
     def look(self) -> Look:
         return self._watch.look(boottime_ns(), wall_ns())

@@ -16,7 +16,7 @@ from router.compiler.network import recognisers
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.table.model import Framing, RouteTable
-from router.threads import Thread, join_or_leave
+from router.threads import Thread, join_or_abandon
 from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import LEN, varint
@@ -122,7 +122,7 @@ class Mirror:
     def _end(self) -> None:
         assert self._thread is not None  # noqa: S101 - there is one while there are consumers
         self._stopping.set()
-        if join_or_leave(self._thread):
+        if join_or_abandon(self._thread):
             self._deliver()
 
     def _run(self, stopping: threading.Event) -> None:

@@ -86,7 +86,7 @@ class Recorder:
         )
         self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
         self._overflow = self._lost_by_faults = 0
-        self._is_well = True
+        self._is_writing = True
         self._due = boottime_ns() + PERIOD
         self._trips: deque[str] = deque()
         self._trips_saved_at: int | None = None
@@ -206,7 +206,7 @@ class Recorder:
             except Exception as error:  # noqa: BLE001 as in `_take`
                 self._report(error)
             else:
-                self._is_well = True
+                self._is_writing = True
         if self._continuous is not None:
             self._continuous.close_if_old(boottime_ns())
 
@@ -223,9 +223,9 @@ class Recorder:
 
     def _report(self, error: Exception) -> None:
         """Log the first of several faults."""
-        if self._is_well:
+        if self._is_writing:
             fault(error, "lost datagrams", "the recorder").log()
-        self._is_well = False
+        self._is_writing = False
 
     def _save_requested(self) -> None:
         while self._requests:

@@ -63,11 +63,11 @@ class Comparison:
         yield from _routes(expected, events)
         explained = bool(rejected and unexpected)
         for kind, deliveries in ((Sent, expected.sent), (Published, expected.published)):
-            came: dict[str, list[Sent | Published]] = {}
+            actual: dict[str, list[Sent | Published]] = {}
             for event in events:
                 if isinstance(event, kind):
-                    came.setdefault(event.target, []).append(event)
-            yield from self._delivered(deliveries, came, outcome, explained=explained)
+                    actual.setdefault(event.target, []).append(event)
+            yield from self._delivered(deliveries, actual, outcome, explained=explained)
         yield from self._dropped(outcome)
         yield from _filtered(expected, events)
 
@@ -84,11 +84,11 @@ class Comparison:
     # what is delivered
 
     def _delivered(
-        self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
+        self, expected: Deliveries, actual: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
         """Yield the failures. `explained`: an already reported rejection explains why targets got nothing."""
-        for target in dict.fromkeys((*expected, *came)):
-            deliveries, events = expected.get(target, ()), came.get(target, [])
+        for target in dict.fromkeys((*expected, *actual)):
+            deliveries, events = expected.get(target, ()), actual.get(target, [])
             if deliveries and not events:
                 if not explained:
                     yield self._missing(target, deliveries[0].span, outcome)
@@ -161,15 +161,15 @@ class Comparison:
     def _dropped(self, outcome: Outcome) -> Iterator[Failure]:
         expected = outcome.step.expected
         nothing: Located[Counts] = Located({}, expected.span)
-        came: dict[str, list[Dropped]] = {}
+        actual: dict[str, list[Dropped]] = {}
         for event in outcome.events:
             if isinstance(event, Dropped):
-                came.setdefault(event.target, []).append(event)
+                actual.setdefault(event.target, []).append(event)
         served = {event.target for event in outcome.events if isinstance(event, (Sent, Published))}
         missing = {target for target in (*expected.sent, *expected.published) if target not in served}
-        for target in dict.fromkeys((*expected.dropped, *came)):
+        for target in dict.fromkeys((*expected.dropped, *actual)):
             wanted = expected.dropped.get(target, nothing)
-            dropped = came.get(target, [])
+            dropped = actual.get(target, [])
             counts = Counter(event.reason for event in dropped)
             is_reported = target not in expected.dropped and target in missing  # as the reason why it is missing
             if counts != Counter(wanted.value) and not is_reported:
@@ -186,11 +186,11 @@ class Comparison:
 
 
 def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
-    came = Counter(event.reason for event in events)
+    actual = Counter(event.reason for event in events)
     wanted = expected.rejected or Located({}, expected.span)
-    if came != Counter(wanted.value):
+    if actual != Counter(wanted.value):
         detail = in_brackets(events[0].detail) if events else ""
-        message = f"rejected: {_listed(came)}, not {_listed(wanted.value)}{detail}"
+        message = f"rejected: {_listed(actual)}, not {_listed(wanted.value)}{detail}"
         yield Failure(wanted.span, message)
 
 
@@ -202,9 +202,9 @@ def _routes(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
 
 
 def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
-    came = Counter(event.target for event in events if isinstance(event, Filtered))
-    if expected.filtered is not None and came != Counter(expected.filtered.value):
-        message = f"withheld from: {_listed(came)}, not {_listed(expected.filtered.value)}"
+    actual = Counter(event.target for event in events if isinstance(event, Filtered))
+    if expected.filtered is not None and actual != Counter(expected.filtered.value):
+        message = f"withheld from: {_listed(actual)}, not {_listed(expected.filtered.value)}"
         yield Failure(expected.filtered.span, message)
 
 

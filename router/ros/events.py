@@ -19,7 +19,7 @@ from router.compiler.metrics import QOS_POLICIES
 from router.compiler.program import TopicPlan
 from router.log import fault, logger
 from router.ros.qos import ActualQos, incompatible_policies
-from router.threads import Thread, join_or_leave
+from router.threads import Thread, join_or_abandon
 
 if TYPE_CHECKING:
     from router.ros.endpoints import Publication, Subscription
@@ -195,7 +195,7 @@ class EventThread:
     def stop(self) -> None:
         self._stopping = True
         self._waited_for.wake()
-        if join_or_leave(self._thread):
+        if join_or_abandon(self._thread):
             self._waited_for.close()
             self._polled.close()
 

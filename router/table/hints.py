@@ -53,7 +53,7 @@ _ELSEWHERE = {
 }
 """Our keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
-_IN_OTHER_WORDS = (
+_COMMON_MISTAKES = (
     ("address", ADDRESS_PARTS, "write the IP address and port together: `address: 192.168.0.30:8`"),
     ("ignore", ("enabled", "enable", "disabled", "active"), "to disable it, write only `ignore: why`"),
     ("endpoint", ("topic", "topics"), "write a ROS topic as a key of the route: `topic: NAME`"),
@@ -75,13 +75,13 @@ CLOSE = 0.7
 def meant(name: str, known: Iterable[str]) -> str | None:
     """Return the key among `known` that a misspelt one stands for, or None."""
     known = list(known)
-    if ":" in name or in_other_words(name, known):
+    if ":" in name or for_common_mistake(name, known):
         return None
     return next((key for key in known if name in _ELSEWHERE.get(key, ())), None) or nearest(name, known, CLOSE)
 
 
-def in_other_words(name: str, known: Iterable[str]) -> str:
-    return next((hint for key, names, hint in _IN_OTHER_WORDS if key in known and name in names), "")
+def for_common_mistake(name: str, known: Iterable[str]) -> str:
+    return next((hint for key, names, hint in _COMMON_MISTAKES if key in known and name in names), "")
 
 
 _IN_WORDS = ("none", "ignore", "because")
@@ -108,7 +108,7 @@ _NAMED = {"topics": "topic", "destinations": "endpoint"}
 
 def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
     """Return a hint for an unknown key, with this value, of the mapping at `path`."""
-    if words := in_other_words(name, known):
+    if words := for_common_mistake(name, known):
         return words
     if is_topics_of_source(name, path):
         return _topics_of_source(value)

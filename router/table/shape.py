@@ -66,8 +66,10 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
         found = schema_errors(tree, SCHEMA)
     rests = {error.path for error in found if _is_rest(tree, error.path)}
     found = [error for error in found if error.path not in rests]
-    said = _said_elsewhere(found)
-    findings.extend(finding(error, tree) for error in found if error not in said and not _is_broken(tree, error.path))
+    implied = _consequences(found)
+    findings.extend(
+        finding(error, tree) for error in found if error not in implied and not _is_broken(tree, error.path)
+    )
     tree = rewritten(tree, {error.path: _as_broken for error in found})
     return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
 
@@ -107,7 +109,7 @@ def _above(entry: Entry, entries: Mapping[str, Entry]) -> str | None:
     return above[max(lines)] if (lines := [line for line in above if line < span.line]) else None
 
 
-def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
+def _consequences(found: list[SchemaError]) -> list[SchemaError]:
     """Return errors that are consequences of another one, which is reported.
 
     These are all but the first of several lists in a list, and errors below `send` if it has several payload cases or
@@ -115,13 +117,13 @@ def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
     """
     empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
-    said = [error for error in found if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
+    consequences = [error for error in found if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
     several = [error.path for error in found if error.keyword == "maxProperties" and error.path[-1] == "send"]
-    said += [error for error in found if error.path[:-1] in several and error.path[:-1] not in groups]
+    consequences += [error for error in found if error.path[:-1] in several and error.path[:-1] not in groups]
     rows: dict[Path, SchemaError] = {}
     lists = [error for error in found if error.is_list_in_list]
-    said += [error for error in lists if rows.setdefault(error.path[:-1], error) is not error]
-    return said
+    consequences += [error for error in lists if rows.setdefault(error.path[:-1], error) is not error]
+    return consequences
 
 
 def _as_broken(node: Node) -> Node:
@@ -167,11 +169,11 @@ def unknown_keys(
             continue
         written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
         free = [key for key in known if key not in written]
-        said_otherwise = hints.behind(name, entry, before) or hints.in_other_words(name, known)
-        hint = said_otherwise or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known)
+        advice = hints.behind(name, entry, before) or hints.for_common_mistake(name, known)
+        hint = advice or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
-        said.add(hints.in_other_words(name, known) or None)
+        said.add(hints.for_common_mistake(name, known) or None)
 
 
 def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
@@ -179,7 +181,7 @@ def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
     entries: dict[str, Entry] = {}
     broken = written.broken
     for name, entry in written.entries.items():
-        free = [] if hints.in_other_words(name, known) else [key for key in known if key not in written.entries]
+        free = [] if hints.for_common_mistake(name, known) else [key for key in known if key not in written.entries]
         meant = name if name in known else hints.meant(name, free)
         is_part = hints.is_topics_of_source(name, path) and not isinstance(entry.value, ScalarNode)
         if meant is None or (meant != name and meant in entries) or is_part:
@@ -201,7 +203,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     name = subject(path)
     if error.about_name:
         return _bad_name(error, key.span if key else _first_line(tree))
-    span = _blamed(tree, path)
+    span = _span_of(tree, path)
     if keyword == "required":
         return _missing_key(error, tree)
     if keyword == "type":
@@ -301,7 +303,7 @@ def _repeated(error: SchemaError, tree: Node) -> Diagnostic:
     return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what, "remove one of the two")
 
 
-def _blamed(tree: Node, path: Path) -> SourceSpan:
+def _span_of(tree: Node, path: Path) -> SourceSpan:
     """Return the span of the value if it is on one line, else that of its key."""
     node = node_at(tree, path)
     key = key_at(tree, path)

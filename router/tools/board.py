@@ -100,16 +100,16 @@ class Board:
         if stop is not None:
             self._commanded_at, self._halted_until = now, now + stop.hold
             self._halt = f"{case.name} {compact(message, case.type)}"
-            self._become(now, State.HALTED)
+            self._enter(now, State.HALTED)
         elif case.name in self._commands:
             self._commanded_at = now
             if self.state is not State.HALTED or now >= self._halted_until:
-                self._become(now, State.OBEYING)
+                self._enter(now, State.OBEYING)
 
     def advance(self, now: float) -> None:
         """Check for missing commands."""
         if self.state in (State.OBEYING, State.HALTED) and now - self._commanded_at >= TIMEOUT:
-            self._become(now, State.STOPPED)
+            self._enter(now, State.STOPPED)
 
     def status(self, now: float) -> str:
         """Return the state as text for people."""
@@ -121,7 +121,7 @@ class Board:
             return f"halted by a deadman for {now - self._since:.1f} s: {self._halt}"
         return "obeys commands"
 
-    def _become(self, now: float, state: State) -> None:
+    def _enter(self, now: float, state: State) -> None:
         if state is self.state:
             return
         was, lasted = self.state, now - self._since

@@ -13,7 +13,7 @@ from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.limits import period
 from router.carrier.reasons import LOSSES
-from router.carrier.state import Native, opened
+from router.carrier.state import Native, open_native
 from router.table.model import Priority
 from tests.carrier.building import MEMORY, sanitizing
 
@@ -67,7 +67,7 @@ class Deferring:
         self.now = 0
         self._library, self._functions = library, functions
         self._address: int = functions.seam_open()
-        self._pacer = Native(library.pacer_close, opened(library, "pacer_open", bandwidth)) if bandwidth else None
+        self._pacer = Native(library.pacer_close, open_native(library, "pacer_open", bandwidth)) if bandwidth else None
         self._deferrals: list[Native] = []
         self._are_topics: list[bool] = []
         self._error = 0
@@ -80,7 +80,7 @@ class Deferring:
         if self._pacer is not None and not self._deferrals:
             self._functions.seam_adopt(self._address, self._pacer.address, 0)
         pacer = None if is_topic else self._pacer
-        address = opened(self._library, "deferral_open", pacer.address if pacer else None)
+        address = open_native(self._library, "deferral_open", pacer.address if pacer else None)
         self._deferrals.append(Native(self._library.deferral_close, address, pacer))
         return self._add(self._deferrals[-1], hertz, priority, is_topic=is_topic)
 

@@ -16,7 +16,7 @@ from router.carrier.collectors import native_collect
 from router.carrier.lowered import Routines, native_values
 from router.carrier.reasons import LOSSES
 from router.carrier.ros_routes import native_for_each
-from router.carrier.state import Native, opened
+from router.carrier.state import Native, open_native
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.declared import NONE
 from tests.carrier.building import MEMORY, sanitizing
@@ -124,7 +124,7 @@ class Delivering:
             )
         self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.pointer(self._targets)))
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
-            address = opened(functions, "collector_open", timeout)
+            address = open_native(functions, "collector_open", timeout)
             collector = Native(functions.collector_close, address)
             self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
             collect = native_collect(lowered.collect, routines, range(1 + len(others)))

@@ -56,7 +56,7 @@ class Clients:
             self.publishers[topic] = Publisher(self._functions)
         payload = (topic, b"stop " + topic.encode())
         plan = DeadmanPlan(f"gateway:{topic}", timeout_ms * MS, repeat_ms * MS, (payload,), at_start)
-        return self.deadmen.kept(plan, self._counters, self.publishers, State(self._library))
+        return self.deadmen.get_or_open(plan, self._counters, self.publishers, State(self._library))
 
     def count(self, metric: str, topic: str = "/word") -> int:
         labels = (topic,) if metric in {"datagrams_sent", "send_errors"} else ()

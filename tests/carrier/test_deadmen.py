@@ -102,10 +102,10 @@ class NativeSide:
         self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
-        return self.deadmen.kept(plan, self._counters, senders(self._outlets), State(self._library))
+        return self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
 
     def replace(self, later: NativeDeadman, earlier: NativeDeadman) -> None:
-        later.succeeds(earlier)
+        later.replace(earlier)
         self._library.deadman_replace(self.deadmen.address, later.address, earlier.address)
 
     def remove(self, deadman: NativeDeadman) -> None:

@@ -101,7 +101,9 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
             listeners={},
             senders=senders,
             publications={},
-            deadmen={plan.route: deadmen.kept(plan, made.counters, senders, State(library)) for plan in made.deadmen},
+            deadmen={
+                plan.route: deadmen.get_or_open(plan, made.counters, senders, State(library)) for plan in made.deadmen
+            },
             bandwidths={},
         )
         (plan,) = made.subscriptions

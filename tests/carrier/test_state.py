@@ -8,12 +8,12 @@ from router.carrier.state import State
 
 def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:
     first = State(load())
-    limit = first.keep(("limit", 1), object)
-    assert first.keep(("limit", 1), object) is limit
-    gone = first.keep(("limit", 2), object)
+    limit = first.get_or_make(("limit", 1), object)
+    assert first.get_or_make(("limit", 1), object) is limit
+    gone = first.get_or_make(("limit", 2), object)
     then = State(load(), first)
-    assert then.keep(("limit", 1), object) is limit
-    then.keep(("limit", 3), object)
+    assert then.get_or_make(("limit", 1), object) is limit
+    then.get_or_make(("limit", 3), object)
     then.forget_previous()
-    assert then.keep(("limit", 1), object) is limit
-    assert then.keep(("limit", 2), object) is not gone
+    assert then.get_or_make(("limit", 1), object) is limit
+    assert then.get_or_make(("limit", 2), object) is not gone

@@ -119,20 +119,20 @@ def test_values_wait_for_the_kept_messages_of_their_topic() -> None:
     assert one.hold("/map")
     assert not one.hold("/map")
     frames = [schema("T"), data("/map", b"1"), data("/imu", b"2"), data("/map", b"3")]
-    assert one.unheld(frames) == [frames[0], frames[2]]
-    one.lack("/map")
-    one.lack("/imu")
-    assert (one.held, one.lacking) == (2, {"/imu"})
+    assert one.hold_back(frames) == [frames[0], frames[2]]
+    one.record_miss("/map")
+    one.record_miss("/imu")
+    assert (one.held, one.missed_topics) == (2, {"/imu"})
     assert one.release("/map") == [frames[1], frames[3]]
-    assert (one.held, one.holds, one.lacking) == (0, False, {"/imu", "/map"})
+    assert (one.held, one.holds, one.missed_topics) == (0, False, {"/imu", "/map"})
 
 
 def test_a_client_that_has_all_kept_messages_lacks_none() -> None:
     one = new_queue(Client())
     one.hold("/map")
-    one.lack("/map")
+    one.record_miss("/map")
     assert one.release("/map", is_complete=True) == []
-    assert one.lacking == set()
+    assert one.missed_topics == set()
 
 
 def test_values_that_wait_are_bounded() -> None:
@@ -141,10 +141,10 @@ def test_values_that_wait_are_bounded() -> None:
     one.hold("/imu")
     large = data("/map", bytes(MOST_KEPT_BYTES // 2))
     small = data("/imu", b"1")
-    assert one.unheld([large, small]) == []
-    assert one.unheld([large]) == [large, large, small]
+    assert one.hold_back([large, small]) == []
+    assert one.hold_back([large]) == [large, large, small]
     assert not one.holds
-    assert one.unheld([small]) == [small]
+    assert one.hold_back([small]) == [small]
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 3)), max_size=40))

@@ -245,7 +245,7 @@ def test_one_that_no_router_has_started_with_is_tried_a_few_times_a_minute(cache
     keep()
     path = only(cache)
     try_too_often()
-    store.works()
+    store.clear_tries()
     try_too_often()
     os.utime(f"{path}{store._TRIES}", (0, 0))
     try_too_often()
@@ -275,7 +275,7 @@ def test_a_file_that_is_removed_while_all_are_read_is_left_out(cache: Path, monk
     os.utime(oldest, (0, 0))
     monkeypatch.setattr(sys, "argv", ["router", "run", "other.yaml"])
     keep()
-    found = store.every()
+    found = store.list_files()
     assert next(found)[1] is not None
     oldest.unlink()
     assert list(found) == []

@@ -49,7 +49,7 @@ def call_of(
     if function.optional and len(arguments) == len(function.parameters) - function.optional:
         filled = expected.element if isinstance(expected, List) and is_list(arguments[0].kind) else expected
         arguments = [*arguments, *_bounds(function, span, filled)]
-    _want_count(function, len(arguments), span)
+    _require_count(function, len(arguments), span)
     return elementwise(lambda parts: _call_of_scalars(function, parts, span, scope), arguments, span, scope)
 
 
@@ -63,7 +63,7 @@ def _whole_list(function: Function, argument: Node, span: SourceSpan, scope: Sco
 
 
 def _call_of_scalars(function: Function, arguments: Sequence[Node], span: SourceSpan, scope: Scope) -> Call:
-    _want_accepted(function, arguments)
+    _require_accepted(function, arguments)
     try:
         kind = function.result(arguments)
     except ValueError as error:
@@ -87,7 +87,7 @@ def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list
     return [whole(expected.low, span), whole(expected.high, span)]
 
 
-def _want_count(function: Function, count: int, span: SourceSpan) -> None:
+def _require_count(function: Function, count: int, span: SourceSpan) -> None:
     takes = len(function.parameters)
     if count < takes or (count > takes and not function.variadic):
         wanted = plural(takes, "argument") + " or more, or one list" * function.variadic
@@ -100,7 +100,7 @@ _OF_MORE = {"round": "write round(x * 100) / 100 for two decimals, text(x, 2) fo
 _OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS, "wrap": spellings.WRAPPED}
 
 
-def _want_accepted(function: Function, arguments: Sequence[Node]) -> None:
+def _require_accepted(function: Function, arguments: Sequence[Node]) -> None:
     for parameter, argument in zip(_parameters(function, len(arguments)), arguments, strict=True):
         if not isinstance(argument.kind, parameter.accepts):
             message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"

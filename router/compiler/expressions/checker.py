@@ -23,7 +23,7 @@ from router.compiler.expressions.names import (
     named,
     no_null,
     presence,
-    want_senders,
+    require_senders,
     whole_message,
 )
 from router.compiler.expressions.operators import constant
@@ -69,12 +69,12 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
         raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
     subject = check(choices.subject, scope)
     keys: list[Node] = [_key(name, subject, choices, scope) for name, _ in choices.values]
-    _want_different(choices, keys)
+    _require_different(choices, keys)
     values = [check(value, scope, expected) for _, value in choices.values]
     if choices.otherwise is not None:
         made = check(choices.otherwise, scope, expected)
     else:
-        _want_all(subject, keys, span, scope)
+        _require_all(subject, keys, span, scope)
         made, last = values[-1], keys[-1]
         if isinstance(subject.kind, EnumKind):
             keys[-1] = Call(last.kind, last.span, "fit", (subject, last, last))
@@ -95,7 +95,7 @@ def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> N
         raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, free))
     if isinstance(subject.kind, StringKind):
         key = Constant(StringKind(), name.span, name.value)
-        want_senders([subject, key], scope)
+        require_senders([subject, key], scope)
         return key
     if name.value in scope.message.constants:
         return constant(scope.message.constants[name.value], name.span)
@@ -115,7 +115,7 @@ def _key_hint(name: str, values: Mapping[str, int]) -> str:
     return "write `else` for all other values" if name in ("default", "_", "*", "other") else did_you_mean(name, values)
 
 
-def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
+def _require_different(choices: Choices, keys: Sequence[Node]) -> None:
     """Reject a map in which two keys have the same value, such as two names of one enum number."""
     names: dict[object, str] = {}
     for (name, _), key in zip(choices.values, keys, strict=True):
@@ -125,7 +125,7 @@ def _want_different(choices: Choices, keys: Sequence[Node]) -> None:
             raise ExpressionError(name.span, Code.DUPLICATE_KEY, message, "remove one of the two")
 
 
-def _want_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
+def _require_all(subject: Node, keys: Sequence[Node], span: SourceSpan, scope: Scope) -> None:
     """Reject a map without `else` that does not cover all values, or whose subject has no list of values."""
     covered = {constant_of(key) for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
@@ -183,7 +183,7 @@ class _Checker:
             case ast.UnaryOp():
                 return self._unary(node.op, self.check(node.operand), span)
             case ast.BinOp():
-                return self._binary(operators.want_binary(node.op, span), node, span)
+                return self._binary(operators.require_binary(node.op, span), node, span)
             case ast.BoolOp():
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
             case ast.Compare() if (other := self._beside_null(node)) is not None:
@@ -191,11 +191,11 @@ class _Checker:
                 raise no_null(self.check(other), ast.unparse(other), span, is_equal=is_equal)
             case ast.Compare():
                 operands = [self.check(operand) for operand in (node.left, *node.comparators)]
-                want_senders(operands, self.scope)
+                require_senders(operands, self.scope)
                 return operators.comparison(node.ops, operands, span, self.scope)
             case ast.IfExp():
                 test = self.check(node.test)
-                operators.want_bool(test, "if")
+                operators.require_bool(test, "if")
                 body, orelse = self.check(node.body, expected), self.check(node.orelse, expected)
                 return operators.choice(test, body, orelse, span, self.scope)
             case ast.Call():

@@ -218,7 +218,7 @@ def _sum_of_list(kind: Kind) -> Kind | None:
 def _clamped(nodes: Sequence[Node]) -> Kind:
     integers, (_, low, high) = _integers(nodes), nodes
     if integers is not None:
-        _want_ordered(integers[1], integers[2])
+        _require_ordered(integers[1], integers[2])
         return _between(integers[1:])
     ends = [constant_of(low), constant_of(high)]
     if not all(isinstance(end, (int, float)) and math.isfinite(end) for end in ends):
@@ -233,7 +233,7 @@ def _wrapped(nodes: Sequence[Node]) -> Kind:
     integers = _integers(nodes)
     assert integers is not None  # noqa: S101 - checked before
     _, low, high = integers
-    _want_ordered(low, high)
+    _require_ordered(low, high)
     return _between([IntKind(low.low, low.low), IntKind(high.high, high.high)])
 
 
@@ -245,7 +245,7 @@ def _between(bounds: Sequence[IntKind]) -> IntKind:
     return IntKind(low, high)
 
 
-def _want_ordered(low: IntKind, high: IntKind) -> None:
+def _require_ordered(low: IntKind, high: IntKind) -> None:
     if low.low > high.high:
         raise ValueError(f"the low bound {low.low} is above the high bound {high.high}")
 

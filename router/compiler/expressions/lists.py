@@ -58,7 +58,7 @@ def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: S
         return make(operands)
     length = _common_length(lists, span)
     if any(isinstance(operand, Listed) for operand in lists):
-        _want_known_lengths(lists)
+        _require_known_lengths(lists)
         assert length is not None  # noqa: S101 - that of the literal
         return list_of([make([_pick(operand, index) for operand in operands]) for index in range(length)], span)
     pairs: list[tuple[str, Node]] = []
@@ -87,7 +87,7 @@ def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
     return lengths[0] if lengths else None
 
 
-def _want_known_lengths(lists: Sequence[Node]) -> None:
+def _require_known_lengths(lists: Sequence[Node]) -> None:
     """Reject a list of unknown length beside a literal."""
     for each in lists:
         if length_of(each.kind) is None:

@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
     TimeKind,
 )
 from router.compiler.expressions.operators import constant
-from router.compiler.expressions.scope import ExpressionError, Scope, field_of, want_readable
+from router.compiler.expressions.scope import ExpressionError, Scope, field_of, require_readable
 from router.compiler.expressions.syntax import Parsed, dotted
 from router.compiler.expressions.tree import (
     MESSAGE,
@@ -140,7 +140,7 @@ def is_source(operand: Node) -> bool:
     return isinstance(operand, Variable) and operand.name == SOURCE
 
 
-def want_senders(operands: Sequence[Node], scope: Scope) -> None:
+def require_senders(operands: Sequence[Node], scope: Scope) -> None:
     """Reject a comparison of the sender's name with a text that is not the name of a possible sender."""
     if not scope.sources or not any(map(is_source, operands)):
         return
@@ -233,7 +233,7 @@ def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str
 
 
 def _readable(field: Read) -> Read:
-    want_readable(field)
+    require_readable(field)
     return field
 
 

@@ -122,11 +122,11 @@ _DIVISIONS = (Operator.DIVIDE, Operator.FLOOR_DIVIDE, Operator.MODULO)
 
 def unary(op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
     if isinstance(op, ast.Not):
-        want_bool(operand, "not")
+        require_bool(operand, "not")
         return Unary(BoolKind(), span, Operator.NOT, operand)
     if not isinstance(op, (ast.USub, ast.UAdd)):
         raise forbidden(op, span)
-    _want_number(operand)
+    _require_number(operand)
     value, number = constant_of(operand), as_int(operand.kind)
     if isinstance(op, ast.UAdd):
         if number is None or number == operand.kind:
@@ -141,7 +141,7 @@ def unary(op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:
     return Unary(kind, span, Operator.NEGATE, operand, is_checked)
 
 
-def want_binary(op: ast.operator, span: SourceSpan) -> Operator:
+def require_binary(op: ast.operator, span: SourceSpan) -> Operator:
     """Return an operator. Raises ExpressionError if the language does not have it."""
     if type(op) not in _OPERATORS:
         raise forbidden(op, span)
@@ -158,8 +158,8 @@ def binary(op: Operator, left: Node, right: Node, span: SourceSpan) -> Node:
             "arithmetic does not take times",
             "convert with seconds(x) and time_from_seconds(x)",
         )
-    _want_number(left)
-    _want_number(right)
+    _require_number(left)
+    _require_number(right)
     if op in _DIVISIONS and constant_of(right) == 0:
         raise _division_by_zero(span)
     a, b = as_int(left.kind), _exponent(right) if op is Operator.POWER else as_int(right.kind)
@@ -222,7 +222,7 @@ def _division_by_zero(span: SourceSpan) -> ExpressionError:
     return ExpressionError(span, Code.OUT_OF_RANGE, "division by zero")
 
 
-def _want_number(operand: Node) -> None:
+def _require_number(operand: Node) -> None:
     if not isinstance(operand.kind, Number):
         hint = {BoolKind: "convert a bool with int()", StringKind: "convert a number to text with str(x) or text(x, 2)"}
         raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
@@ -237,14 +237,14 @@ _OF_LISTS = "compare an element, len(x), min(x) or max(x), or write `value in x`
 def boolean(op: ast.boolop, operands: Sequence[Node], span: SourceSpan) -> Logic:
     is_all = isinstance(op, ast.And)
     for operand in operands:
-        want_bool(operand, "and" if is_all else "or")
+        require_bool(operand, "and" if is_all else "or")
     return Logic(BoolKind(), span, is_all, tuple(operands))
 
 
 def comparison(ops: Sequence[ast.cmpop], operands: Sequence[Node], span: SourceSpan, scope: Scope) -> Node:
     """Return a comparison: `a < b < c` has two operators and three operands."""
     for op, (left, right) in zip(ops, pairwise(operands), strict=True):
-        _want_comparable(op, left, right, span)
+        _require_comparable(op, left, right, span)
     if not any(isinstance(op, (ast.In, ast.NotIn)) for op in ops):
         return Compare(BoolKind(), span, tuple(_RELATIONS[type(op)] for op in ops), tuple(operands))
     tests = [_test(op, left, right, span, scope) for op, (left, right) in zip(ops, pairwise(operands), strict=True)]
@@ -259,7 +259,7 @@ def _test(op: ast.cmpop, left: Node, right: Node, span: SourceSpan, scope: Scope
 
 def equality(left: Node, right: Node, span: SourceSpan) -> Node:
     """Return `left == right`."""
-    _want_comparable(ast.Eq(), left, right, span)
+    _require_comparable(ast.Eq(), left, right, span)
     return Compare(BoolKind(), span, (Relation.EQUAL,), (left, right))
 
 
@@ -283,7 +283,7 @@ def _comparable_value(held: Node, written: Node) -> str:
     return f"did you mean {enum}.{value} without quotes?" if value in dict(enum.values) else ""
 
 
-def _want_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -> None:
+def _require_comparable(op: ast.cmpop, left: Node, right: Node, span: SourceSpan) -> None:
     if isinstance(op, (ast.Is, ast.IsNot)):
         raise forbidden(op, span)
     if any(value != value for value in map(constant_of, (left, right))):  # noqa: PLR0124 - NaN
@@ -329,7 +329,7 @@ def presence_hint(operand: Node) -> str:
     return f"write `has({'.'.join(names)})`"
 
 
-def want_bool(operand: Node, word: str) -> None:
+def require_bool(operand: Node, word: str) -> None:
     if not isinstance(operand.kind, BoolKind):
         hint = _OF_LISTS if is_list(operand.kind) else ""
         hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else hint or presence_hint(operand)

@@ -73,11 +73,11 @@ def field_of(holder: Node, member: Field, span: SourceSpan) -> Read:
     return Read(kind_of(member.type), span, holder, member)
 
 
-def want_readable(node: Node) -> None:
+def require_readable(node: Node) -> None:
     """Raise ExpressionError if expressions cannot read the field, or a field around it."""
     if not isinstance(node, Read):
         return
-    want_readable(node.holder)
+    require_readable(node.holder)
     what = _unreadable(node.field)
     if what is not None:
         kind, hint = what

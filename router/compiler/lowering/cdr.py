@@ -9,8 +9,8 @@ from itertools import starmap
 from router.compiler.cdr import HEADER, NO_FIELDS, known_default, known_length, known_value
 from router.compiler.expressions.tree import Variable
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.lists import Taken
-from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
+from router.compiler.lowering.lists import LoopList
+from router.compiler.lowering.messages import Place, Placed, at, loop, lower_lists, merged
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
 from router.compiler.lowering.operations import Operation, keep, known, load
@@ -65,26 +65,29 @@ class _Writer:
                 return at(place, value, Operation(Op.PUT, size_of(made.type)))
 
     def _each(self, made: Each, place: Place) -> list[Placed]:
-        count, taken = counted(self.lowering, made)
+        count, inputs = lower_lists(self.lowering, made)
         slot = self.lowering.names.temporary()
         number = at(place, count)
         if made.type.length is None:
             number += at(place, keep(slot), Operation(Op.PUT, 4), load(slot))
-        if _are_copied(made, taken):
-            (_, _, octets), *_ = taken
+        if _are_copied(made, inputs):
+            (_, _, octets), *_ = inputs
             return [*number, *at(place, Operation(Op.DROP), load(octets), Operation(Op.PUT_BYTES))]
-        body = each(
-            self.lowering, taken, place, lambda: list(merged(_padded(self.plan(made.element, place.field), Offset())))
+        body = loop(
+            self.lowering,
+            inputs,
+            place,
+            lambda: list(merged(_padded(self.plan(made.element, place.field), Offset()))),
         )
         return [*number, *body]
 
 
-def _are_copied(made: Each, taken: list[Taken]) -> bool:
+def _are_copied(made: Each, inputs: list[LoopList]) -> bool:
     """Return whether bytes are copied to a list of bytes unchanged."""
     element = made.element
-    if len(taken) > 1 or not isinstance(element, Leaf) or element.type != Int(8, signed=False):
+    if len(inputs) > 1 or not isinstance(element, Leaf) or element.type != Int(8, signed=False):
         return False
-    variable, of, _ = taken[0]
+    variable, of, _ = inputs[0]
     return of.scalar is Scalar.UINT8 and isinstance(element.node, Variable) and element.node.name == variable
 
 

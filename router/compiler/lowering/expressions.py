@@ -93,7 +93,7 @@ class Lowering:
 
     def _value(self, node: tree.Node) -> Routine:  # noqa: C901, PLR0912 - one case per node
         if isinstance(node.kind, ListKind):
-            return lists.stored(self, node).routine
+            return lists.lower_list(self, node).routine
         match node:
             case tree.Constant():
                 return _constant(node)
@@ -141,7 +141,7 @@ class Lowering:
                 before, holder = self.message(node.holder)
                 return before, holder.message(node.field)
             case tree.Element():
-                return lists.entered(self, node)
+                return lists.enter_element(self, node)
             case _:
                 raise AssertionError(f"no message is computed, as by {type(node).__name__}")
 
@@ -166,7 +166,7 @@ class Lowering:
 
     def _element(self, node: tree.Element) -> Routine:
         if isinstance(node.kind, TimeKind) and lists.are_messages(node.values):
-            return self.time(*lists.entered(self, node))
+            return self.time(*lists.enter_element(self, node))
         return lists.element(self, node)
 
     # operators

@@ -199,7 +199,7 @@ def _octets(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     if (known := tree.constant_bytes(node)) is not None:
         return (text(known),)
-    made = lists.stored(lowering, first)
+    made = lists.lower_list(lowering, first)
     return made.routine if made.is_octets else routine(made.routine, Operation(Op.OCTETS, flag=made.scalar))
 
 

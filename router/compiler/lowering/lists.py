@@ -50,7 +50,7 @@ _MOST_STACKED = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class StoredList:
     """A list that `routine` pushes, stored as `scalar` specifies.
 
     `element` is the kind of its elements. Messages, which include ROS times, are read into sections like `message`.
@@ -68,7 +68,7 @@ class Stored:
         return self.scalar is Scalar.UINT8
 
 
-def stored(lowering: Lowering, node: tree.Node) -> Stored:
+def lower_list(lowering: Lowering, node: tree.Node) -> StoredList:
     """Lower a list, or bytes."""
     match node:
         case tree.Read() if isinstance(node.kind, ListKind):
@@ -83,7 +83,7 @@ def stored(lowering: Lowering, node: tree.Node) -> Stored:
             return _chosen(lowering, node)
         case _:
             assert isinstance(node.kind, BytesKind)  # noqa: S101 - nothing else gives a list
-            return Stored(lowering.value(node), Scalar.UINT8, OCTET)
+            return StoredList(lowering.value(node), Scalar.UINT8, OCTET)
 
 
 def are_messages(node: tree.Node) -> bool:
@@ -97,40 +97,40 @@ def are_messages(node: tree.Node) -> bool:
             return False
 
 
-def _read(lowering: Lowering, node: tree.Read) -> Stored:
+def _read(lowering: Lowering, node: tree.Read) -> StoredList:
     before, holder = lowering.message(node.holder)
     assert isinstance(node.kind, ListKind)  # noqa: S101 - the caller ensures it
     element = node.kind.element
     message = holder.inner(node.field) if isinstance(element, (MessageKind, TimeKind)) else None
     is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
     made = routine(before, load(holder.value(node.field)))
-    return Stored(made, holder.stored(node.field), element, message, is_unchecked)
+    return StoredList(made, holder.stored(node.field), element, message, is_unchecked)
 
 
-def _payloads(lowering: Lowering, node: tree.Variable) -> Stored:
+def _payloads(lowering: Lowering, node: tree.Variable) -> StoredList:
     """Lower `items` of `collect`, the only variable that is a list: its messages are like the source message."""
     items, payload = lowering.names.variables[node.name], lowering.names.variables[tree.MESSAGE]
     assert isinstance(items, Slot)  # noqa: S101 - made by `Datagram.collect`
     assert isinstance(payload, Section)  # noqa: S101
     assert isinstance(node.kind, ListKind)  # noqa: S101 - the caller ensures it
     message = Section(payload.type, payload.descriptor, f"{node.name}[].")
-    return Stored((load(items),), Scalar.IN_CELLS, node.kind.element, message)
+    return StoredList((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
 
-def _listed(lowering: Lowering, node: tree.Listed) -> Stored:
+def _listed(lowering: Lowering, node: tree.Listed) -> StoredList:
     element = node.kind.element
     items = [routine(lowering.value(item), *_as(item.kind, element)) for item in node.items]
     message: Section | None = None
     if isinstance(element, MessageKind):
         message = Section(element.type, None, "[].")  # only ROS messages are values
     if len(items) <= _MOST_STACKED:
-        return Stored(routine(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
+        return StoredList(routine(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
     made = lowering.names.temporary()
     appended = (routine(item, Operation(Op.APPEND, made)) for item in items)
-    return Stored(routine(_begun(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
+    return StoredList(routine(_empty_list(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
 
 
-def _begun(made: Slot) -> Routine:
+def _empty_list(made: Slot) -> Routine:
     """Return the operations that put an empty list into a slot."""
     return Operation(Op.LIST, size=0), keep(made), DROP
 
@@ -139,7 +139,7 @@ def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
     return coerced((), kind, element) if element is not None else ()
 
 
-def _computed(lowering: Lowering, node: tree.Each) -> Stored:
+def _computed(lowering: Lowering, node: tree.Each) -> StoredList:
     made = lowering.names.temporary()
 
     def append() -> Routine:
@@ -147,13 +147,13 @@ def _computed(lowering: Lowering, node: tree.Each) -> Stored:
         assert element is not None  # noqa: S101 - it is computed
         return routine(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
 
-    filled = routine(_begun(made), looped(lowering, node.lists, append, keeps=True), load(made))
-    return Stored(filled, Scalar.IN_CELLS, node.kind.element)
+    filled = routine(_empty_list(made), lower_loop(lowering, node.lists, append, keeps=True), load(made))
+    return StoredList(filled, Scalar.IN_CELLS, node.kind.element)
 
 
-def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
+def _chosen(lowering: Lowering, node: tree.Choice) -> StoredList:
     """Lower a choice between two lists. Both are converted to the same storage and kind of elements."""
-    body, orelse = (stored(lowering, each) for each in (node.body, node.orelse))
+    body, orelse = (lower_list(lowering, each) for each in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
         body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
     if body.scalar is not orelse.scalar:
@@ -161,76 +161,76 @@ def _chosen(lowering: Lowering, node: tree.Choice) -> Stored:
     return replace(body, routine=choice(lowering.value(node.test), body.routine, orelse.routine))
 
 
-def _in_cells(values: Stored) -> Stored:
+def _in_cells(values: StoredList) -> StoredList:
     if values.scalar is Scalar.IN_CELLS:
         return values
     unpacked = routine(values.routine, Operation(Op.UNPACK, flag=values.scalar))
     return replace(values, routine=unpacked, scalar=Scalar.IN_CELLS)
 
 
-def _with_elements(lowering: Lowering, values: Stored, element: Kind) -> Stored:
+def _with_elements(lowering: Lowering, values: StoredList, element: Kind) -> StoredList:
     """Convert the elements of a list to the kind `element`, even if the storage is the same."""
     kind = values.element
     is_moment = isinstance(element, TimeKind) and values.message is not None
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
         return replace(values, element=element)
     made, each = lowering.names.temporary(), lowering.names.temporary()
-    start = routine(_begun(made), values.routine, keep(each), SIZE)
-    taken, meaning = _taken(lowering, values, each)
+    start = routine(_empty_list(made), values.routine, keep(each), SIZE)
+    taken, meaning = _take_element(lowering, values, each)
     one = lowering.time((), meaning) if isinstance(meaning, Section) else ()
     body = routine(taken, one, *_as(kind, element), Operation(Op.APPEND, made))
-    return Stored(routine(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
+    return StoredList(routine(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
 
 
 # ---- loops
 
 
-def looped(
+def lower_loop(
     lowering: Lowering, lists: Sequence[tuple[str, tree.Node]], body: Callable[[], Routine], *, keeps: bool = False
 ) -> Routine:
     """Return a loop that repeats `body`, which uses the variables of `lists`, for each index of these parallel lists.
 
     `body` may change the top of the stack, but nothing below.
     """
-    counted, each = gone_through(lowering, lists)
-    before, turn = routine_of_each(lowering, each, body)
-    return routine(counted, before, repeat(turn, keeps=keeps))
+    length, inputs = lower_lists(lowering, lists)
+    before, turn = loop_body(lowering, inputs, body)
+    return routine(length, before, repeat(turn, keeps=keeps))
 
 
-Taken = tuple[str, Stored, Slot]
+LoopList = tuple[str, StoredList, Slot]
 """A variable, its list, and the slot with the remaining elements."""
 
 
-def gone_through(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[Taken]]:
+def lower_lists(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[LoopList]]:
     """Lower the lists of a loop: copy them to slots, and push their length, which must be the same."""
     made: Routine = ()
-    taken: list[Taken] = []
+    inputs: list[LoopList] = []
     for variable, values in lists:
-        of = stored(lowering, values)
+        of = lower_list(lowering, values)
         slot = lowering.names.temporary()
         made = routine(made, of.routine, keep(slot), SIZE)
-        if taken:
+        if inputs:
             made = routine(made, Operation(Op.SAME_COUNT))
-        taken.append((variable, of, slot))
-    return made, taken
+        inputs.append((variable, of, slot))
+    return made, inputs
 
 
-def routine_of_each(lowering: Lowering, taken: Sequence[Taken], body: Callable[[], Routine]) -> tuple[Routine, Routine]:
+def loop_body(lowering: Lowering, inputs: Sequence[LoopList], body: Callable[[], Routine]) -> tuple[Routine, Routine]:
     """Return the operations before a loop, and its body, which handles the next element of each list."""
     before: Routine = ()
-    for variable, of, slot in taken:
-        one, section = _taken(lowering, of, slot)
+    for variable, of, slot in inputs:
+        one, section = _take_element(lowering, of, slot)
         meaning = section or lowering.names.temporary()
         lowering.names.variables[variable] = meaning
         before = routine(before, one) if isinstance(meaning, Section) else routine(before, one, keep(meaning), DROP)
-    loop = Loop(frozenset(variable for variable, _, _ in taken))
+    loop = Loop(frozenset(variable for variable, _, _ in inputs))
     lowering.names.loops.append(loop)
-    turn = _without_a_detour(routine(before, body()))
+    turn = _elide_slot(routine(before, body()))
     lowering.names.loops.pop()
     return routine(*((integer(0), keep(flag), DROP) for flag in loop.flags)), turn
 
 
-def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section | None]:
+def _take_element(lowering: Lowering, of: StoredList, slot: Slot) -> tuple[Routine, Section | None]:
     """Lower the removal of an element from a list. It is pushed, or read into a section if it is a message."""
     taken = Operation(Op.NEXT, slot, flag=of.scalar)
     if of.message is not None:
@@ -239,7 +239,7 @@ def _taken(lowering: Lowering, of: Stored, slot: Slot) -> tuple[Routine, Section
     return ((taken, Operation(Op.UTF8)) if of.is_unchecked else (taken,)), None
 
 
-def _without_a_detour(made: Routine) -> Routine:
+def _elide_slot(made: Routine) -> Routine:
     """Leave an element on the stack instead of storing, dropping and loading it, if it is used only once."""
     for index, operation in enumerate(made[:-2]):
         if operation.kind is Op.KEEP:
@@ -261,9 +261,9 @@ def element(lowering: Lowering, node: tree.Element) -> Routine:
     return routine(of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index))
 
 
-def entered(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
+def enter_element(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
     """Lower a message in a list. Return the operations that read it into a section, and the section."""
-    of = stored(lowering, node.values)
+    of = lower_list(lowering, node.values)
     assert of.message is not None  # noqa: S101 - the caller ensures it
     made = lowering.names.element(of.message)
     return routine(
@@ -271,9 +271,9 @@ def entered(lowering: Lowering, node: tree.Element) -> tuple[Routine, Section]:
     ), made
 
 
-def checked_list(lowering: Lowering, node: tree.Node) -> Stored:
+def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
     """Lower a list, and check that all its texts are UTF-8."""
-    of = stored(lowering, node)
+    of = lower_list(lowering, node)
     if not of.is_unchecked:
         return of
     slot = lowering.names.temporary()
@@ -323,7 +323,7 @@ def total(lowering: Lowering, node: tree.Call) -> Routine:
 
 def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) -> Routine:
     """Lower min() or max() of a list: the loop begins with the first element. An empty list is rejected."""
-    of = stored(lowering, node.arguments[0])
+    of = lower_list(lowering, node.arguments[0])
     kind = of.element
     assert kind is not None  # noqa: S101 - a number
     whole, left = lowering.names.temporary(), lowering.names.temporary()
@@ -344,4 +344,4 @@ def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Routine, Kind
         name = f"element {len(lowering.names.temporaries)}"
         listed = values.kind if isinstance(values.kind, ListKind) else ListKind(kind)
         each = tree.Each(listed, values.span, ((name, values),), tree.Variable(kind, values.span, name))
-    return looped(lowering, each.lists, lambda: step(lowering.value(each.element), each.element.kind))
+    return lower_loop(lowering, each.lists, lambda: step(lowering.value(each.element), each.element.kind))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from router.compiler.lowering import lists
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.lists import Taken
+from router.compiler.lowering.lists import LoopList
 from router.compiler.lowering.operations import Operation, Routine, known, repeat, routine
 from router.compiler.plan import Each
 from router.declared import Op
@@ -51,19 +51,19 @@ def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
         yield last
 
 
-def counted(lowering: Lowering, made: Each) -> tuple[Routine, list[Taken]]:
-    """Lower the lists that fill a field, as `gone_through`. A length that the field cannot hold is rejected."""
-    count, taken = lists.gone_through(lowering, made.lists)
+def lower_lists(lowering: Lowering, made: Each) -> tuple[Routine, list[LoopList]]:
+    """Lower the lists that fill a field, as `lists.lower_lists`. A length that the field cannot hold is rejected."""
+    count, inputs = lists.lower_lists(lowering, made.lists)
     declared = made.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
     if declared.length is not None:
-        return routine(count, Operation(Op.FIT_COUNT, number=declared.length)), taken
+        return routine(count, Operation(Op.FIT_COUNT, number=declared.length)), inputs
     if declared.bound is not None:
-        return routine(count, Operation(Op.FIT_COUNT, flag=True, number=declared.bound)), taken
-    return count, taken
+        return routine(count, Operation(Op.FIT_COUNT, flag=True, number=declared.bound)), inputs
+    return count, inputs
 
 
-def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
+def loop(lowering: Lowering, inputs: list[LoopList], place: Place, body: Callable[[], list[Placed]]) -> list[Placed]:
     """Return a loop over `body`; the number of iterations is on the stack. `place` is that of the loop itself."""
     placed: list[Placed] = []
 
@@ -71,7 +71,7 @@ def each(lowering: Lowering, taken: list[Taken], place: Place, body: Callable[[]
         placed.extend(body())
         return tuple(operation for operation, _ in placed)
 
-    before, made = lists.routine_of_each(lowering, taken, lowered)
+    before, made = lists.loop_body(lowering, inputs, lowered)
     front = len(made) - len(placed)
     places = [place] * front + [own for _, own in placed]
     opening, *_, closing = repeat(made)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.compiler.lowering.expressions import Lowering
-from router.compiler.lowering.messages import Place, Placed, at, counted, each, merged
+from router.compiler.lowering.messages import Place, Placed, at, loop, lower_lists, merged
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.operations import Operation, Routine, known
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
@@ -72,9 +72,9 @@ class _Writer:
             yield from elements
 
     def _each(self, made: Each, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
-        count, taken = counted(self.lowering, made)
-        loop = each(self.lowering, taken, place, lambda: list(merged(self._element(made.element, to, place.field))))
-        elements = [*at(place, count), *loop]
+        count, inputs = lower_lists(self.lowering, made)
+        body = loop(self.lowering, inputs, place, lambda: list(merged(self._element(made.element, to, place.field))))
+        elements = [*at(place, count), *body]
         yield from _packed(to, elements, place) if to.is_packed else elements
 
     def _element(self, made: Plan, to: FieldDescriptor, path: str) -> Iterable[Placed]:

@@ -76,7 +76,7 @@ class _Source:
         if not given:
             return (), ""
         routine = chained(Op.AND, [lowering.value(each) for each in given])
-        _want_small([(operation, given[-1].span) for operation in routine])
+        _require_small([(operation, given[-1].span) for operation in routine])
         if is_bounded and (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
             limit = f"the limit for a destination's `when` is {MOST_CONDITION_OPERATIONS:,}"
             message = f"this could take {most:,} operations on the longest datagram; {limit}"
@@ -117,7 +117,7 @@ class Datagram(_Source):
 
     def _number(self, node: tree.Node) -> Routine:
         routine = self.lowering().value(node)
-        _want_small([(operation, node.span) for operation in routine])
+        _require_small([(operation, node.span) for operation in routine])
         return routine
 
     def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
@@ -173,11 +173,11 @@ class RosMessage(_Source):
         seconds, nanoseconds = moment.type.fields
         return moment.value(seconds), moment.value(nanoseconds)
 
-    def _for_each(self, node: tree.Node) -> lists.Stored:
+    def _for_each(self, node: tree.Node) -> lists.StoredList:
         """Lower the list of `for_each`, and make `item`, `index` and `count` available to expressions."""
         lowering = self.lowering()
         of = lists.checked_list(lowering, node)
-        _want_small([(operation, node.span) for operation in of.routine])
+        _require_small([(operation, node.span) for operation in of.routine])
         if of.message is None:
             self.add(Slot(0, tree.ITEM))
         else:
@@ -187,7 +187,7 @@ class RosMessage(_Source):
         self.add(Slot(0, tree.INDEX), Slot(0, tree.COUNT))
         return of
 
-    def _elements(self, of: lists.Stored, targets: Iterable[LoweredTarget]) -> LoweredElements:
+    def _elements(self, of: lists.StoredList, targets: Iterable[LoweredTarget]) -> LoweredElements:
         item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
         section = item.index if isinstance(item, Section) and item.wanted else NONE
         return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
@@ -211,7 +211,7 @@ def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Ite
 
 
 def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
-    _want_small([(operation, place.span) for operation, place in placed])
+    _require_small([(operation, place.span) for operation, place in placed])
     texts = {id(place): str(place) for place in {id(place): place for _, place in placed}.values()}
     return tuple(operation for operation, _ in placed), tuple(texts[id(place)] for _, place in placed)
 
@@ -219,7 +219,7 @@ def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:
 # ---- limits
 
 
-def _want_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
+def _require_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
     """Raise TooLargeError if a routine is nested too deeply."""
     operations = [operation for operation, _ in placed]
     kinds = [operation.kind for operation in operations]

@@ -165,8 +165,8 @@ class UdpClient:
         if failure is not None:
             self._events.failed(self, failure, lost)
         if has_waited and self._backlog < LOW_WATER:
-            self._loop.call_soon(self._tell_drained)
+            self._loop.call_soon(self._report_drained)
 
-    def _tell_drained(self) -> None:
+    def _report_drained(self) -> None:
         if self._is_open:
             self._events.drained(self)

@@ -79,7 +79,7 @@ class ZenohTransport:
         self._client: ZenohClient | None = None
         self._owner: Owner | None = None  # this gateway, while it owns the key
         self._others: set[Owner] = set()
-        self._met: set[Owner] = set()  # since they were last reported
+        self._seen: set[Owner] = set()  # since they were last reported
         self._reported: set[Owner] = set()
         self._others_changed = asyncio.Event()
         self._declared: list[Declared] = []
@@ -125,7 +125,7 @@ class ZenohTransport:
         """Open the session, and start the tasks that use it. Raises ZError."""
         self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
         if self._session is not None:
-            for task in (self._mind_key, self._mind_connections):
+            for task in (self._manage_key, self._watch_connections):
                 self._tasks.append(self._loop.create_task(task(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
@@ -146,7 +146,7 @@ class ZenohTransport:
             else:
                 logger.info("connected to Zenoh", key=self._key)
 
-    async def _mind_connections(self, session: zenoh.Session) -> None:
+    async def _watch_connections(self, session: zenoh.Session) -> None:
         """Report each change of the number of connected routers and peers. Zenoh reconnects automatically."""
         reported, was_lost = None, False
         while True:
@@ -167,15 +167,15 @@ class ZenohTransport:
     def _on_token(self, owner: Owner, is_there: bool) -> None:
         if not is_there:
             self._others.discard(owner)
-        elif len(self._others | self._met) < MOST_OTHERS:
-            self._meet({owner})
+        elif len(self._others | self._seen) < MOST_OTHERS:
+            self._add_owners({owner})
         self._others_changed.set()
 
-    def _meet(self, others: set[Owner]) -> None:
+    def _add_owners(self, others: set[Owner]) -> None:
         self._others |= others
-        self._met |= others
+        self._seen |= others
 
-    async def _mind_key(self, session: zenoh.Session) -> None:
+    async def _manage_key(self, session: zenoh.Session) -> None:
         """Find the owners, and decide at each change who owns the key; look again while waiting for it."""
         look: Callable[[zenoh.Session], set[Owner] | None] = self._watch
         while True:
@@ -185,9 +185,9 @@ class ZenohTransport:
                     look = partial(owners, key=self._key)
                     if others is not None:
                         self._others.clear()
-                        self._meet(others)
+                        self._add_owners(others)
                 self._others_changed.clear()
-                await self._settle(session)
+                await self._decide_owner(session)
             except zenoh.ZError as error:
                 self._events.failed(None, error, 0)
             await asyncio.sleep(PAUSE_SECONDS)
@@ -209,7 +209,7 @@ class ZenohTransport:
         session.liveliness().declare_subscriber(all_tokens(self._key), on_sample, history=True)
         return others
 
-    async def _settle(self, session: zenoh.Session) -> None:
+    async def _decide_owner(self, session: zenoh.Session) -> None:
         """Take the key if it is free, give it up to an earlier owner, report other owners. Raises ZError."""
         first = min(self._others, default=None)
         if self._owner is None and first is None:
@@ -217,7 +217,7 @@ class ZenohTransport:
         has_to_wait = first is not None and (self._owner is None or first < self._owner)
         if self._owner is not None and has_to_wait:
             await self._give_up()
-        if new := self._met - self._reported:
+        if new := self._seen - self._reported:
             what = (
                 "this gateway waits until the key is free"
                 if has_to_wait
@@ -228,7 +228,7 @@ class ZenohTransport:
         elif self._reported and not self._others:
             logger.info("no other gateway uses the Zenoh key any more", key=self._key)
         self._reported = set(self._others)
-        self._met.clear()
+        self._seen.clear()
 
     async def _take(self, session: zenoh.Session) -> Owner | None:
         """Take the key, and serve unless another gateway took it at the same time and was first.
@@ -240,7 +240,7 @@ class ZenohTransport:
         owner = this_owner(session)
         others = await self._loop.run_in_executor(self._session_thread, self._declare, session, owner)
         self._owner = owner
-        self._meet(others)
+        self._add_owners(others)
         first = min(self._others, default=owner)
         if first < owner:
             return first
@@ -282,8 +282,8 @@ class ZenohTransport:
     async def _answer_queries(self, queries: Queries) -> None:
         """Answer queries from now on, all pending ones from one snapshot."""
         while True:
-            await queries.came.wait()
-            queries.came.clear()
+            await queries.arrived.wait()
+            queries.arrived.clear()
             try:
                 waiting = queries.take()
                 frames = await self._events.snapshot()
@@ -305,7 +305,7 @@ class Inbox:
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[tuple[bytes, int]] = deque()
         # Only one thread writes each counter.
-        self._received_bytes = self._handed_bytes = 0
+        self._received_bytes = self._delivered_bytes = 0
         self._lost = self._reported_lost = 0
         self._clock = LoopClock()
 
@@ -313,7 +313,7 @@ class Inbox:
         """Start to deliver samples, as if `client` sent them."""
         self._client = client
         self._clock.start()
-        self._hand_on()
+        self._deliver()
 
     def stop(self) -> None:
         self._client = None
@@ -324,38 +324,38 @@ class Inbox:
         if sample.kind != zenoh.SampleKind.PUT:  # not `is`: each is a new object
             return
         size = len(sample.payload)
-        waiting_bytes = self._received_bytes - self._handed_bytes
+        waiting_bytes = self._received_bytes - self._delivered_bytes
         if size > self._most:
             self._loop.call_soon_threadsafe(self._events.refused, "too_large")
         elif len(self._waiting) >= MOST_RECEIVED or waiting_bytes + size > MOST_RECEIVED_BYTES:
-            self._lost += 1  # reported by `_hand_on`
+            self._lost += 1  # reported by `_deliver`
         else:
             self._received_bytes += size
             self._waiting.append((sample.payload.to_bytes(), self._clock.stamp()))
             if len(self._waiting) == 1:
-                self._loop.call_soon_threadsafe(self._hand_on)
+                self._loop.call_soon_threadsafe(self._deliver)
 
-    def _hand_on(self) -> None:
+    def _deliver(self) -> None:
         if self._client is None:
             return
         try:
             for _ in range(min(len(self._waiting), PER_TURN)):
                 data, arrived = self._waiting.popleft()
-                self._handed_bytes += len(data)
+                self._delivered_bytes += len(data)
                 self._events.received(self._client, data, arrived)
         finally:
             if self._waiting:  # otherwise `on_sample` schedules the next call
-                self._loop.call_soon(self._hand_on)
+                self._loop.call_soon(self._deliver)
         for _ in range(self._lost - self._reported_lost):
             self._reported_lost += 1
             self._events.refused("rate_limited")
 
 
 class Queries:
-    """Pending queries. `came` is set when the first one is added."""
+    """Pending queries. `arrived` is set when the first one is added."""
 
     def __init__(self) -> None:
-        self.came = asyncio.Event()
+        self.arrived = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[zenoh.Query] = deque()
 
@@ -367,7 +367,7 @@ class Queries:
             return
         self._waiting.append(query)
         if len(self._waiting) == 1:
-            self._loop.call_soon_threadsafe(self.came.set)
+            self._loop.call_soon_threadsafe(self.arrived.set)
 
     def take(self) -> list[zenoh.Query]:
         """Remove and return all pending queries."""
