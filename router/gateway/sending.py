@@ -13,6 +13,7 @@ from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import LARGE, Encoding, Sample
 from router.gateway.json_codec import UnreadableError
+from router.gateway.kept import MOST_KEPT
 from router.gateway.publishers import Selection
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import PER_TURN, Frame
@@ -33,7 +34,8 @@ class ServedTopic:
     messages of `subscription.arrived` are already in the counters (of `subscription.missed` if every message is sent),
     `reported` how many are in the rates for clients. `sample` is the latest message taken, `readable` the latest that
     could be converted. `is_busy` is set while a large message is being converted; `unconverted` ones wait. Kept
-    messages that were published up to `refused_ns` and cannot be sent have already been counted.
+    messages that were published up to `refused_ns` and cannot be sent have already been counted. `counted_early` has
+    the times of publication (ns) of those that were counted for a late client, and may still arrive on the topic.
     """
 
     subscription: TopicSubscription
@@ -47,6 +49,7 @@ class ServedTopic:
     is_busy: bool = False
     has_ended: bool = False
     refused_ns: int = 0
+    counted_early: deque[int] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
     seen: int = -1
     looks: int = 0
     unconverted: deque[Sample] = field(default_factory=deque)
@@ -199,6 +202,10 @@ class TopicSender:
 
     def _encode(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
         """Append the value, preceded by the schema if it is the first of its kind."""
+        if is_new and sample.sent_ns in served.counted_early:
+            served.counted_early.remove(sample.sent_ns)
+            self._counters.filtered(1)
+            return
         if is_new:
             served.refused_ns = max(served.refused_ns, sample.sent_ns)
         if (data := self._checked(served, sample, is_new=is_new)) is None:
@@ -263,6 +270,7 @@ class TopicSender:
             elif is_new:
                 self._counters.received(1)
                 self._checked(served, sample, is_new=True)
+                served.counted_early.append(sample.sent_ns)
             served.refused_ns = max(served.refused_ns, sample.sent_ns)
         return frames, arrived == topic.arrived
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing, contextmanager
 from functools import partial
@@ -13,10 +15,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.gateway.kept import FRESH_S
+from router.gateway.kept import FRESH_S, MOST_KEPT
 from router.gateway.transport.base import HIGH_WATER
+from router.ros.topics import DiscoveredPublisher
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.stage import Played, PlayedClient, Stage, program
+from tests.gateway.stage import Graph, Played, PlayedClient, Stage, Tap, program
 from tests.ros.opening import STRING, cdr, open_ros
 from tests.ros.peers import Publisher
 
@@ -254,6 +257,61 @@ async def test_large_messages_that_are_kept_go_to_a_late_client_only(
             late = LateClient(played)
             await until(lambda: {*late.texts} == {*large})
             assert len(texts(played)) == 2
+
+
+class DatedTap(Tap):
+    """A tap whose messages come with their times of publication (ns)."""
+
+    def __init__(self, depth: int, *messages: tuple[bytes, int]) -> None:
+        super().__init__(depth)
+        self._dated = deque[tuple[bytes, int]]()
+        self.publish(*messages)
+
+    def publish(self, *messages: tuple[bytes, int]) -> None:
+        self._dated.extend(messages)
+        os.eventfd_write(self.fd, len(messages))
+
+    def take(self) -> tuple[bytes, int] | None:
+        return self._dated.popleft() if self._dated else None
+
+
+class TwoPublishers(Graph):
+    """Each keeps a message of /greeting; the large one reaches the subscription for a late client first."""
+
+    small, large = (cdr("x"), 1000), (cdr("x" * 20_000_000), 2000)
+
+    def publishers(self, topic: str) -> list[DiscoveredPublisher]:
+        seen = DiscoveredPublisher(STRING, is_reliable=True, keeps=True, is_ours=False, gid=b"one")
+        return [seen, seen._replace(gid=b"two")]
+
+    def tap(self, topic: str, message_class: object, *, is_reliable: bool, keeps: bool, depth: int) -> Tap:
+        if depth == MOST_KEPT:
+            return DatedTap(depth, self.small, self.large)
+        self.taps[topic] = DatedTap(depth, self.small)
+        return self.taps[topic]
+
+    def deliver(self) -> None:
+        tap = self.taps["/greeting"]
+        assert isinstance(tap, DatedTap)
+        tap.publish(self.large)
+
+
+@pytest.mark.parametrize("period", ["20ms", "each"])
+@asynchronous
+async def test_what_is_too_large_is_counted_once_if_it_arrives_after_a_late_client(tmp_path: Path, period: str) -> None:
+    graph = TwoPublishers({"/greeting": STRING})
+    async with Stage(program(tmp_path, f"it: {GATEWAY.format(port=8600, period=period)}"), graph) as stage:
+        played = stage.played["it"]
+        await played.start()
+        await until(partial(has_come, played, "x"))
+        late = LateClient(played)
+        await until(lambda: late.texts == ["x"])
+        await until(lambda: stage.count("messages_dropped", "it", "clients", "too_large") == 1)
+        received = stage.count("messages_received", "it", "ros")
+        graph.deliver()
+        await until(lambda: stage.count("messages_received", "it", "ros") == received + 1)
+        await until(lambda: 1 + sum(stage.count(outcome, "it", "clients") for outcome in OUTCOMES) == received + 1)
+        assert stage.count("messages_dropped", "it", "clients", "too_large") == 1
 
 
 @asynchronous
