@@ -56,9 +56,10 @@ class Reloader:
         drop_idle_code()
 
     def close(self) -> None:
-        """Wait for a running reload; reject later ones."""
+        """Wait for a running reload, which changes nothing if it is still compiling; reject later ones."""
+        self._is_open = False
         with self._one_at_a_time:
-            self._is_open = False
+            pass
 
     def reload(self) -> ReloadResult:
         """Reload the table. If it is invalid or cannot be opened, nothing changes, and the result says why."""
@@ -105,6 +106,8 @@ class Reloader:
             if refused := _unchangeable(now.table, then.table):
                 return "invalid", _refused([*findings, *refused])
             text = _changes(now, then)
+            if not self._is_open:
+                raise StartError("the router is stopping")
             self._runtime.take_over(self._runtime.prepare(then))
             if moved := _all_moved(now.table, then.table):
                 logger.warning("the reload has changed the address of every endpoint", endpoints=moved)

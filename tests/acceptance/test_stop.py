@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
 
 from tests.acceptance.payloads import generated
-from tests.acceptance.site import ROVER, RouterProcess, Site, arrived, site, wait_until
+from tests.acceptance.site import BARE, ROVER, RouterProcess, Site, arrived, site, wait_until
+from tests.tables import PROTOS
 
 RATE = 2000
 """Datagrams per second."""
@@ -84,3 +87,46 @@ def test_what_has_arrived_when_the_signal_comes_is_still_routed(tmp_path: Path) 
         totals = assert_in_order(router, router.wait())
         assert totals["datagrams_received"] + totals["kernel_drops"] == WAITING
         assert totals["datagrams_received"] == totals["datagrams_sent"] == arrived(place.endpoints["basestation"])
+
+
+DRIVEN = (
+    BARE.replace("{root}/tests/rover/protos", "protos")
+    + """\
+routes:
+  manual_drive:
+    source: basestation
+    destinations: [driving_board]
+    ttl: 1h
+    deadman: {{timeout: 1h, at_start: silent, send: {{manual_brake: {{brake: true}}}}}}
+"""
+)
+
+
+@contextmanager
+def stuck(path: Path, begin: Callable[[], None]) -> Iterator[None]:
+    """A file that never ends to whoever reads it after `begin`, as on a computer that does not answer."""
+    os.mkfifo(path)
+    opened: list[int] = []
+
+    def is_read() -> bool:
+        with suppress(OSError):  # nobody reads it yet
+            opened.append(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+        return bool(opened)
+
+    begin()
+    wait_until(is_read, "that it is read")
+    yield
+    os.close(opened[0])
+
+
+def test_a_reload_that_is_stuck_delays_no_brake(tmp_path: Path) -> None:
+    shutil.copytree(PROTOS, tmp_path / "protos")
+    drive = next(generated("manual_drive")).datagram
+    with site(tmp_path) as place, RouterProcess(tmp_path, place.table(DRIVEN)) as router:
+        place.send("basestation", drive)
+        assert place.receive("driving_board") == drive
+        with stuck(tmp_path / "protos" / "stuck.proto", lambda: router.process.send_signal(signal.SIGHUP)):
+            begin = monotonic()
+            assert router.stop(signal.SIGTERM) == 0
+            assert monotonic() - begin < KILLED_AFTER
+        assert len(place.waiting()["driving_board"]) == 1
