@@ -13,8 +13,8 @@ _UNKNOWN = -(1 << 63)
 _NS = 1_000_000_000
 
 
-class Born(NamedTuple):
-    """`struct born` in freshness.h: the earliest and the latest possible time of a stamp, in ns of the boot clock."""
+class TimeRange(NamedTuple):
+    """`struct time_range` in freshness.h: the earliest and latest possible time of a stamp, in ns of the boot clock."""
 
     oldest: int
     youngest: int
@@ -26,16 +26,16 @@ class Freshness:
     def __init__(self, library: ctypes.CDLL) -> None:
         self._structure = c.Freshness()
         self._at = ctypes.addressof(self._structure)
-        self._born = library.freshness_born
+        self._times = library.freshness_times
 
-    def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
+    def times(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> TimeRange:
         """Return the possible times of an event with the wall-clock stamp `stamp`, never after `now`.
 
         `now` (boot clock) and `received_at` (wall clock) are the present time in ns, read in this order. The event did
         not happen before `not_before` (boot clock); None if that is not known.
         """
-        found = self._born(self._at, stamp, received_at, now, _UNKNOWN if not_before is None else not_before)
-        return Born(found.oldest, found.youngest)
+        found = self._times(self._at, stamp, received_at, now, _UNKNOWN if not_before is None else not_before)
+        return TimeRange(found.oldest, found.youngest)
 
 
 class RateLimit:

@@ -29,7 +29,7 @@ from router.cli.tool_options import (
 from router.errors import StartError, TransportError, UsageError
 
 if TYPE_CHECKING:
-    from router.tools.gateway_messages import Heard
+    from router.tools.gateway_messages import Received
 
 FORMATS = ("gateway_v1", "json_lines")
 GATEWAYS = ("udp", "tcp", "ws", "zenoh")
@@ -120,10 +120,10 @@ def _listen_to_gateway(args: argparse.Namespace) -> None:
         rest = args.count
         try:
             with until_interrupted():
-                for heard in client.hear(source, args.seconds or math.inf):
-                    record(heard)
-                    show(heard)
-                    if rest and isinstance(heard, Message):
+                for received in client.receive(source, args.seconds or math.inf):
+                    record(received)
+                    show(received)
+                    if rest and isinstance(received, Message):
                         rest -= 1
                         if not rest:
                             break
@@ -171,7 +171,7 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
+def _recorder(path: Path | None) -> Iterator[Callable[[Received], None]]:
     """Yield a function that appends a line to the file, unbuffered. Raises UsageError."""
     from router.tools.gateway_messages import json_line
 
@@ -185,9 +185,9 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
     except OSError as error:
         raise UsageError(f"--record {path}: {error.strerror}") from error
 
-    def record(heard: Heard) -> None:
+    def record(received: Received) -> None:
         try:
-            file.write(f"{json_line(heard)}\n".encode())
+            file.write(f"{json_line(received)}\n".encode())
         except OSError as error:
             raise TransportError(f"--record {path}: {error.strerror}") from error
 
@@ -195,21 +195,21 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
         yield record
 
 
-def _printer(as_json: bool) -> Callable[[Heard], None]:
+def _printer(as_json: bool) -> Callable[[Received], None]:
     """Return a function that prints one line: on a terminal, in colour and cut to its width."""
     from router.tools.gateway_messages import json_line, pieces
 
     if as_json:
-        return lambda heard: print(json_line(heard), flush=True)
+        return lambda received: print(json_line(received), flush=True)
     if not sys.stdout.isatty():
-        return lambda heard: print(" ".join(text for text, _ in pieces(heard)), flush=True)
+        return lambda received: print(" ".join(text for text, _ in pieces(received)), flush=True)
     from rich.console import Console
     from rich.text import Text
 
     console = Console(highlight=False)
 
-    def show(heard: Heard) -> None:
-        line = Text(" ").join(Text(text, style) for text, style in pieces(heard))
+    def show(received: Received) -> None:
+        line = Text(" ").join(Text(text, style) for text, style in pieces(received))
         console.print(line, no_wrap=True, overflow="ellipsis", crop=True)
 
     return show

@@ -113,7 +113,9 @@ def _computed(plan: Plan, variables: _Variables) -> Plan:
 def _constant(value: Any, plan: Leaf) -> tree.Node:
     if not isinstance(value, bytes):
         return tree.Constant(plan.node.kind, plan.span, value)
-    octets = tree.Listed(ListKind(OCTET, len(value)), plan.span, tuple(tree.whole(each, plan.span) for each in value))
+    octets = tree.ListLiteral(
+        ListKind(OCTET, len(value)), plan.span, tuple(tree.whole(each, plan.span) for each in value)
+    )
     return tree.Call(plan.node.kind, plan.span, "octets", (octets,))
 
 
@@ -135,7 +137,7 @@ def _value(node: tree.Node, variables: _Variables) -> Any:  # noqa: C901, PLR091
             return variables[node.name]
         case tree.Element():
             return _value(node.values, variables)[node.index]
-        case tree.Listed():
+        case tree.ListLiteral():
             return [_value(item, variables) for item in node.items]
         case tree.Each():
             return [_value(node.element, each) for each in _turns(node.lists, variables)]

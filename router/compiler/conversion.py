@@ -124,7 +124,7 @@ def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
 
 
 def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
-    if isinstance(value, tree.Listed):
+    if isinstance(value, tree.ListLiteral):
         _require_length(value, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = element_of(value.kind), length_of(value.kind)

@@ -42,9 +42,9 @@ class Tasks:
         self._running.add(task)
         task.add_done_callback(self._done)
 
-    def each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
+    def every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         """Call `work` now and then every `period_s`, on a fixed grid; missed points are skipped."""
-        self.run(self._each(period_s, work))
+        self.run(self._every(period_s, work))
 
     async def attempt(self, work: Callable[[], Awaitable[None]]) -> None:
         """Call `work` once, and report its exceptions."""
@@ -60,7 +60,7 @@ class Tasks:
                 task.cancel()
             await asyncio.wait(running, timeout=_CANCEL_AGAIN_S)
 
-    async def _each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
+    async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         clock = asyncio.get_running_loop().time
         due = clock()
         while True:

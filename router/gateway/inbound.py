@@ -160,7 +160,7 @@ class InboundPublisher:
         """
         wall = self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
-        age = now - self._freshness.born(stamp, wall, now).youngest
+        age = now - self._freshness.times(stamp, wall, now).youngest
         if age > ttl:
             detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
             raise self._dropped(topic, "stale", detail)

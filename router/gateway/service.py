@@ -63,9 +63,9 @@ class GatewayService:
     def start(self) -> None:
         """Start to discover and serve topics."""
         self._topics.start()
-        self._tasks.each(_LOG_S, self._flush_logs)
+        self._tasks.every(_LOG_S, self._flush_logs)
         if self._has_page:
-            self._tasks.each(_TOPICS_S, self._send_topics)
+            self._tasks.every(_TOPICS_S, self._send_topics)
 
     async def close(self) -> None:
         """Stop sending and receiving. Idempotent."""

@@ -79,7 +79,7 @@ class Topics:
             self._schedule(period, partial(self._publish, period))
         if settings.transport.value in (Transport.UDP, Transport.ZENOH):
             self._schedule(settings.schema_period, self._repeat_schemas)
-        self._tasks.each(RESEND_S, self._resend_missed)
+        self._tasks.every(RESEND_S, self._resend_missed)
 
     def close(self) -> None:
         for topic in list(self._served):
@@ -184,7 +184,7 @@ class Topics:
             done = now
             await serve([served for served in self._served.values() if served.number % number in turns])
 
-        self._tasks.each(turn_s, turn)
+        self._tasks.every(turn_s, turn)
 
     async def _publish(self, period: int, due: Sequence[ServedTopic]) -> None:
         frames: list[Frame] = []

@@ -49,7 +49,7 @@ class RouterNode:
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._is_stuck = False
-        self._is_left = False  # a stuck thread uses subscriptions or publishers
+        self._is_abandoned = False  # a stuck thread uses subscriptions or publishers
         self._peers = PeerEvents(incompatible, subscriber_joined)
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
@@ -66,7 +66,7 @@ class RouterNode:
 
     def leave_open(self) -> None:
         """Have `close` leave everything open, because a thread is stuck while it takes or publishes messages."""
-        self._is_left = self._is_stuck = True
+        self._is_abandoned = self._is_stuck = True
 
     def close(self) -> None:
         """Close the node, when no thread publishes or takes messages."""
@@ -154,7 +154,7 @@ class RouterNode:
             self._close_one(subscription)
 
     def _close_one(self, endpoint: Publication | Subscription) -> None:
-        if self._is_left:
+        if self._is_abandoned:
             return
         if isinstance(endpoint, Subscription):
             endpoint.close()

@@ -10,7 +10,7 @@ from router.compiler.selection import matcher, pattern_problem
 from router.errors import SourceSpan, UsageError
 from router.gateway.packets import PacketError, unbatched
 from router.table.model import TopicPattern
-from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schema, Shape, read
+from router.tools.gateway_messages import Message, Problem, Received, Remark, Schema, Shape, read
 from router.tools.gateway_sources import Arrival, Source
 
 PATIENCE = 0.2
@@ -54,7 +54,7 @@ class GatewayClient:
         self._tally.lost = source.lost
         return self._tally
 
-    def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
+    def receive(self, source: Source, seconds: float) -> Iterator[Received]:
         """Decode what the source delivers within `seconds`, and yield the wanted part."""
         ends, asks = time.monotonic() + seconds, 0.0
         while (now := time.monotonic()) < ends:
@@ -64,7 +64,7 @@ class GatewayClient:
             for arrival in source.arrivals(min(PATIENCE, ends - now)):
                 yield from self.take(arrival)
 
-    def take(self, arrival: Arrival) -> Iterator[Heard]:
+    def take(self, arrival: Arrival) -> Iterator[Received]:
         """Decode one arrival, and yield the wanted part."""
         try:
             packets = unbatched(arrival.data)
@@ -73,27 +73,27 @@ class GatewayClient:
             return
         for packet in packets:
             try:
-                heard = read(packet)
+                received = read(packet)
             except PacketError as error:
                 yield self._problem(error, packet)
             else:
-                yield from self._counted(heard, arrival.sender)
+                yield from self._counted(received, arrival.sender)
 
-    def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Iterator[Heard]:
+    def _counted(self, received: Message | Schema | Remark, sender: Hashable) -> Iterator[Received]:
         """Count a message or schema, and yield it if it is wanted, after its schema."""
-        if isinstance(heard, Remark):
-            yield heard
-        elif isinstance(heard, Schema):
-            yield from self._schema(heard, sender)
-        elif not self._wants(heard.topic):
+        if isinstance(received, Remark):
+            yield received
+        elif isinstance(received, Schema):
+            yield from self._schema(received, sender)
+        elif not self._wants(received.topic):
             self._tally.unwanted += 1
         else:
-            if (held := self._held.pop((sender, heard.type_name), None)) is not None:
+            if (held := self._held.pop((sender, received.type_name), None)) is not None:
                 yield held
-            shape = self._shapes.get((sender, heard.type_name))
+            shape = self._shapes.get((sender, received.type_name))
             self._tally.messages += 1
             self._tally.early += shape is None
-            yield heard._replace(shape=shape)
+            yield received._replace(shape=shape)
 
     def _schema(self, schema: Schema, sender: Hashable) -> Iterator[Schema]:
         self._tally.schemas += 1

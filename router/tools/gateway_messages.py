@@ -62,7 +62,7 @@ class Problem(NamedTuple):
     data: bytes
 
 
-Heard = Union[Message, Schema, Remark, Problem]
+Received = Union[Message, Schema, Remark, Problem]
 
 
 def read(data: bytes) -> Message | Schema | Remark:
@@ -151,34 +151,39 @@ _MOST_BYTES = 60
 _NO_SHAPE: Mapping[str, Shape] = {}
 
 
-def json_line(heard: Heard) -> str:
+def json_line(received: Received) -> str:
     """Return one JSON object with the data as received."""
-    return json.dumps(_as_json(heard), separators=(",", ":"))
+    return json.dumps(_as_json(received), separators=(",", ":"))
 
 
-def _as_json(heard: Heard) -> Mapping[str, object]:
-    if isinstance(heard, Remark):
-        return heard.document
-    if isinstance(heard, Problem):
-        return {"problem": heard.reason, "bytes": len(heard.data), "hex": heard.data.hex()}
-    if isinstance(heard, Message):
-        return {"time": heard.time, "topic": heard.topic, "type": heard.type_name, "data": heard.data}
-    topic = {"topic": heard.topic} if heard.topic else {}
-    return {"time": heard.time, **topic, "type": heard.type_name, "schema": heard.schema}
+def _as_json(received: Received) -> Mapping[str, object]:
+    if isinstance(received, Remark):
+        return received.document
+    if isinstance(received, Problem):
+        return {"problem": received.reason, "bytes": len(received.data), "hex": received.data.hex()}
+    if isinstance(received, Message):
+        return {"time": received.time, "topic": received.topic, "type": received.type_name, "data": received.data}
+    topic = {"topic": received.topic} if received.topic else {}
+    return {"time": received.time, **topic, "type": received.type_name, "schema": received.schema}
 
 
-def pieces(heard: Heard) -> list[Piece]:
+def pieces(received: Received) -> list[Piece]:
     """Return one line in styled pieces: `12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
-    if isinstance(heard, Message):
-        values = _line(words(_tree(heard.data, heard.shape or _NO_SHAPE, heard.is_wrapped)))
-        return [(_clock(heard.time), "dim"), _name(heard.topic, "green"), _name(heard.type_name, "dim"), (values, "")]
-    if isinstance(heard, Schema):
-        fields = _line(f"{name}:{_type_text(shape)}" for name, shape in heard.shape.items())
-        where = [_name(heard.topic, "green")] if heard.topic else []
-        return [(_clock(heard.time), "dim"), *where, _name(heard.type_name, "dim"), (f"schema {fields}", "cyan")]
-    if isinstance(heard, Problem):
-        return [("undecodable", "red"), (f"({heard.reason}):", ""), (_bytes_text(heard.data), "")]
-    return [(_line(_remark(heard.document)), "yellow" if heard.document["op"] == "rejected" else "dim")]
+    if isinstance(received, Message):
+        values = _line(words(_tree(received.data, received.shape or _NO_SHAPE, received.is_wrapped)))
+        return [
+            (_clock(received.time), "dim"),
+            _name(received.topic, "green"),
+            _name(received.type_name, "dim"),
+            (values, ""),
+        ]
+    if isinstance(received, Schema):
+        fields = _line(f"{name}:{_type_text(shape)}" for name, shape in received.shape.items())
+        where = [_name(received.topic, "green")] if received.topic else []
+        return [(_clock(received.time), "dim"), *where, _name(received.type_name, "dim"), (f"schema {fields}", "cyan")]
+    if isinstance(received, Problem):
+        return [("undecodable", "red"), (f"({received.reason}):", ""), (_bytes_text(received.data), "")]
+    return [(_line(_remark(received.document)), "yellow" if received.document["op"] == "rejected" else "dim")]
 
 
 def _remark(document: Mapping[str, Any]) -> Iterable[str]:

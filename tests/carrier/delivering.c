@@ -151,7 +151,7 @@ size_t seam_part(struct delivering *of, const struct targets *to, const void *da
     void *copy = exactly(data, size);
     struct datagram datagram = {.data = copy, .size = size, .start = start, .length = length, .is_single = is_single,
                                 .column = column, .received_at = received_at};
-    struct message message = {.datagram = &datagram, .now = now, .born = {now, now}};
+    struct message message = {.datagram = &datagram, .now = now, .times = {now, now}};
     of->now = now;
     of->notes.size = 0;
     bool is_complete = collect(&of->routing.stage, to, &message);

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier.library import load
-from router.carrier.limits import Born, Freshness
+from router.carrier.limits import Freshness, TimeRange
 from tests.oracles import ages_and_rates as oracle
 from tests.oracles.ages_and_rates import MEMORY, TOLERANCE
 
@@ -62,12 +62,12 @@ class Computer:
     def jump(self, by: int) -> None:
         self.settings.append((self.now, self.settings[-1][1] + by))
 
-    def born(self, event: int) -> int:
+    def youngest(self, event: int) -> int:
         """The youngest reading of a message that was stamped at `event` and is looked at now."""
         return self.readings(event).youngest
 
-    def readings(self, event: int, not_before: int | None = None) -> Born:
-        return self.freshness.born(self.wall(event), self.wall(self.now), self.now, not_before)
+    def readings(self, event: int, not_before: int | None = None) -> TimeRange:
+        return self.freshness.times(self.wall(event), self.wall(self.now), self.now, not_before)
 
     def find_empty(self) -> None:
         """As the receive thread when there is nothing to receive."""
@@ -78,14 +78,14 @@ class Computer:
         """Fresh commands, each of them found to be so."""
         for _ in range(duration * rate // SECOND):
             self.now += SECOND // rate
-            assert abs(self.born(self.now - 5 * MS) - (self.now - 5 * MS)) <= TOLERANCE
+            assert abs(self.youngest(self.now - 5 * MS) - (self.now - 5 * MS)) <= TOLERANCE
 
 
 def test_without_jumps_the_age_is_exact() -> None:
     computer = Computer()
     for age in (0, 1, MS, HOUR, 2 * MS):
         computer.now += SECOND
-        assert computer.born(computer.now - age) == computer.now - age
+        assert computer.youngest(computer.now - age) == computer.now - age
 
 
 @pytest.mark.parametrize("jump", JUMPS)
@@ -103,7 +103,7 @@ def test_a_command_that_was_on_its_way_during_a_jump_stays_fresh(jump: int) -> N
     event = computer.now
     computer.jump(jump)
     computer.now += 10 * MS
-    assert abs(computer.born(event) - event) <= TOLERANCE
+    assert abs(computer.youngest(event) - event) <= TOLERANCE
 
 
 @pytest.mark.parametrize("jump", [jump for jump in JUMPS if jump not in (-2 * SECOND, -SECOND, -50 * MS)])
@@ -116,7 +116,7 @@ def test_commands_that_waited_for_2_s_are_stale_although_the_clock_was_set_meanw
     computer.jump(jump)
     computer.now += SECOND
     for event in range(first, computer.now - SECOND, 20 * MS):
-        assert abs(computer.born(event) - event) <= TOLERANCE
+        assert abs(computer.youngest(event) - event) <= TOLERANCE
 
 
 @pytest.mark.parametrize("jump", JUMPS)
@@ -125,9 +125,9 @@ def test_a_jump_of_before_makes_no_stale_command_fresh(jump: int) -> None:
     computer.command_for(SECOND)
     computer.jump(jump)
     computer.command_for(3 * SECOND)
-    assert computer.born(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
+    assert computer.youngest(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
     computer.now += HOUR
-    assert computer.born(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
+    assert computer.youngest(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
 
 
 def test_a_setting_that_the_stamp_cannot_be_of_is_not_considered() -> None:
@@ -136,7 +136,7 @@ def test_a_setting_that_the_stamp_cannot_be_of_is_not_considered() -> None:
     computer.command_for(5 * SECOND)
     computer.jump(-2 * SECOND)
     computer.command_for(400 * MS)
-    assert abs(computer.born(computer.now - 2500 * MS) - (computer.now - 2500 * MS)) <= TOLERANCE
+    assert abs(computer.youngest(computer.now - 2500 * MS) - (computer.now - 2500 * MS)) <= TOLERANCE
 
 
 def test_a_stamp_from_before_everything_that_is_remembered_is_stale() -> None:
@@ -146,21 +146,21 @@ def test_a_stamp_from_before_everything_that_is_remembered_is_stale() -> None:
         computer.command_for(11 * SECOND)
         computer.jump(SECOND)
     computer.command_for(SECOND)
-    assert computer.born(start - HOUR) < start
+    assert computer.youngest(start - HOUR) < start
 
 
 def test_the_clock_of_a_computer_that_is_ahead_counts_as_now() -> None:
     computer = Computer()
-    assert computer.born(computer.now + SECOND) == computer.now
+    assert computer.youngest(computer.now + SECOND) == computer.now
     computer.command_for(SECOND)
-    assert computer.born(computer.now + HOUR) == computer.now
+    assert computer.youngest(computer.now + HOUR) == computer.now
 
 
 def test_a_pause_between_reading_the_clocks_is_no_lasting_jump() -> None:
     computer = Computer()
     computer.command_for(SECOND)
     read, computer.now = computer.now, computer.now + 2 * SECOND
-    assert computer.freshness.born(computer.wall(read), computer.wall(computer.now), read).youngest == read
+    assert computer.freshness.times(computer.wall(read), computer.wall(computer.now), read).youngest == read
     computer.command_for(SECOND)
 
 
@@ -169,10 +169,10 @@ def test_settings_are_remembered_within_bounds() -> None:
     for _ in range(1_000):
         computer.now += MS
         computer.jump(SECOND)
-        computer.born(computer.now)
+        computer.youngest(computer.now)
     assert computer.freshness.remembered < 100
     computer.now += MEMORY + 1
-    computer.born(computer.now)
+    computer.youngest(computer.now)
     assert computer.freshness.remembered == 0
 
 
@@ -248,7 +248,7 @@ def test_with_any_jumps_the_truth_or_what_a_jump_at_that_time_made_of_it_is_foun
     """Between two messages passes a gap, in which the clock may be set once; each comes after a delay of its own."""
     computer = Computer(slew)
     looks = [computer.now]
-    computer.born(computer.now)
+    computer.youngest(computer.now)
     for gap, jump, share, delay in turns:
         before = round(gap * share)
         computer.now += before
@@ -290,7 +290,7 @@ def test_the_age_of_messages_while_the_wall_clock_jumps(
             continue
         for not_before in (None, now - known):
             event = received_at - age, received_at, now, not_before
-            assert native.born(*event) == plain.born(*event)
+            assert native.times(*event) == plain.times(*event)
 
 
 @given(
@@ -303,4 +303,4 @@ def test_more_jumps_than_are_remembered(library: ctypes.CDLL, ages: list[int], a
         now += passed
         received_at = now + number * TOLERANCE
         for stamp in (received_at - passed, received_at - age, now):
-            assert native.born(stamp, received_at, now) == plain.born(stamp, received_at, now)
+            assert native.times(stamp, received_at, now) == plain.times(stamp, received_at, now)

@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
     element_of,
 )
 from router.compiler.expressions.tree import Each as Computed
-from router.compiler.expressions.tree import Listed, Node, Variable
+from router.compiler.expressions.tree import ListLiteral, Node, Variable
 from router.compiler.mapping import build
 from router.compiler.plan import Each, Items, Leaf, Record
 from router.errors import Diagnostic, Located, SourceSpan
@@ -97,7 +97,7 @@ def _planned(node: Node) -> Leaf | Items | Each:
     if element is None and not isinstance(node.kind, ListKind):
         return Leaf(_type_of(node.kind), node, SPAN)
     declared = List(_type_of(element) if element is not None else Float(64))
-    if isinstance(node, Listed):
+    if isinstance(node, ListLiteral):
         return Items(declared, tuple(Leaf(declared.element, item, SPAN) for item in node.items), SPAN)
     assert element is not None
     if isinstance(node, Computed):

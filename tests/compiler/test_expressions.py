@@ -30,7 +30,7 @@ from router.compiler.expressions.tree import (
     MESSAGE,
     Binary,
     Each,
-    Listed,
+    ListLiteral,
     Node,
     Read,
     Unary,
@@ -196,10 +196,10 @@ def test_operations_on_lists_are_one_loop() -> None:
 
 def test_a_list_literal_is_computed_item_by_item() -> None:
     node = check(written("[i8, 4, 3.0] * three / 2"), scope_of(SOURCE))
-    assert isinstance(node, Listed)
+    assert isinstance(node, ListLiteral)
     assert [type(item) for item in node.items] == [Binary] * 3
     folded = check(written("[1, 2] / 2"), scope_of(SOURCE))
-    assert isinstance(folded, Listed)
+    assert isinstance(folded, ListLiteral)
     assert [constant_of(item) for item in folded.items] == [0.5, 1.0]
 
 

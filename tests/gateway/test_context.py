@@ -22,7 +22,7 @@ async def test_a_fault_is_told_and_the_next_turn_comes() -> None:
         raise RuntimeError("other")
 
     tasks = Tasks(lambda fault: faults.append(str(fault)))
-    tasks.each(0.001, turn)
+    tasks.every(0.001, turn)
     tasks.run(other())
     await until(lambda: len(faults) > 3)
     await tasks.close()

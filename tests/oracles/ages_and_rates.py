@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import ceil
 
-from router.carrier.limits import Born
+from router.carrier.limits import TimeRange
 
 TOLERANCE, MEMORY, MOST_SETTINGS = 10_000_000, 10_000_000_000, 32
 
@@ -29,7 +29,7 @@ class Freshness:
             before, since = offset, seen
         self.now = before, since, now
 
-    def born(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> Born:
+    def times(self, stamp: int, received_at: int, now: int, not_before: int | None = None) -> TimeRange:
         self.look(received_at, now)
         assert self.now is not None
         while self.settings and now - self.settings[0][2] > MEMORY:
@@ -41,7 +41,7 @@ class Freshness:
         if not possible or not self.settings:
             possible = [event]
         in_order = [at for at in possible if not_before is not None and at >= not_before - TOLERANCE]
-        return Born(min(*(in_order or possible), now), min(max(possible), now))
+        return TimeRange(min(*(in_order or possible), now), min(max(possible), now))
 
 
 class RateLimit:

@@ -158,29 +158,29 @@ class Model:
         self, route: str, source: str | None, data: bytes, number: int, arrived: int, topics: Mapping[str, bytes]
     ) -> None:
         """Serve a datagram; `topics` are the messages that topics get."""
-        born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
+        times = self._of_datagrams.times(arrived, self.now + self.ahead, self.now)
         for target in self.table.of(route):
-            oldest = born.oldest if target.is_board else born.youngest
+            oldest = times.oldest if target.is_board else times.youngest
             self._deliver(target, source, topics[target.label] if target.is_topic else data, number, oldest)
 
     def part(self, route: str, part: Part, arrived: int) -> None:
         """Serve a datagram of a route with `collect`, one source and one topic, which gets the payloads."""
-        born = self._of_datagrams.born(arrived, self.now + self.ahead, self.now)
+        times = self._of_datagrams.times(arrived, self.now + self.ahead, self.now)
         (target,), (source,) = self.table.of(route), self.table.sources[route]
         timer: _FramesTimer = self._kept[_frames_key(self.table, route)]
         made = timer.frames.offer(self.now, part)
         timer.tell(timer.frames)
         if made is not None:
-            self._deliver(target, source, b"|".join(made), 0, born.youngest)
+            self._deliver(target, source, b"|".join(made), 0, times.youngest)
 
     def ros(self, route: str, data: bytes, number: int, sent: int) -> None:
-        born = self._of_ros.born(sent, self.now + self.ahead, self.now)
+        times = self._of_ros.times(sent, self.now + self.ahead, self.now)
         for target in self.table.of(route):
-            self._deliver(target, None, data, number, born.oldest if target.is_board else born.youngest)
+            self._deliver(target, None, data, number, times.oldest if target.is_board else times.youngest)
 
-    def _deliver(self, target: Target, source: str | None, data: bytes, number: int, born: int) -> None:
+    def _deliver(self, target: Target, source: str | None, data: bytes, number: int, event: int) -> None:
         ttl = self.table.ttl.get(target.route)
-        expires = None if ttl is None else born + ttl
+        expires = None if ttl is None else event + ttl
         self._messages.append((target, data))
         message = Message(len(self._messages) - 1, (target.place, source), len(data), expires, target.rank)
         limit: RateLimit | None = self._kept.get(_limit_key(self.table, target, source))

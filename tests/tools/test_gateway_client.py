@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from router.gateway.documents import data_document, schema_document
 from router.gateway.packets import Packet, pack
 from router.tools.gateway_client import GatewayClient, topic_filter
-from router.tools.gateway_messages import Heard, Message, Schema, Shape, json_line, pieces
+from router.tools.gateway_messages import Message, Received, Schema, Shape, json_line, pieces
 from router.tools.gateway_sources import Arrival, Source, open_source
 from tests.ports import free_port
 
@@ -50,10 +50,10 @@ class Played:
     def close(self) -> None: ...
 
 
-def heard(listening: GatewayClient, source: Source) -> list[Heard]:
-    found: list[Heard] = []
+def heard(listening: GatewayClient, source: Source) -> list[Received]:
+    found: list[Received] = []
     try:
-        found.extend(listening.hear(source, 100.0))
+        found.extend(listening.receive(source, 100.0))
     except KeyboardInterrupt:
         return found
     raise AssertionError("the time was not over")

@@ -8,7 +8,7 @@ import pytest
 
 from router.gateway.documents import data_document, rejected_document, schema_document
 from router.gateway.packets import Packet, PacketError, compress, pack
-from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schema, Shape, json_line, pieces, read
+from router.tools.gateway_messages import Message, Problem, Received, Remark, Schema, Shape, json_line, pieces, read
 
 HEADER = {
     "name": "Header",
@@ -91,7 +91,7 @@ FIELDS = {
 }
 
 
-def line(heard: Heard) -> str:
+def line(heard: Received) -> str:
     return " ".join(text for text, _ in pieces(heard))
 
 

@@ -110,8 +110,8 @@ static bool meets_condition(const struct delivery *of) {
 
 /* The age of a message is uncertain: the oldest reading counts for a command to a board, the youngest for others. */
 static int64_t expiry(const struct delivery *of) {
-    struct born born = of->message->born;
-    return of->to->ttl ? (of->target->board ? born.oldest : born.youngest) + of->to->ttl : NEVER;
+    struct time_range times = of->message->times;
+    return of->to->ttl ? (of->target->board ? times.oldest : times.youngest) + of->to->ttl : NEVER;
 }
 
 static bool is_fresh(const struct delivery *of) {

@@ -91,8 +91,8 @@ struct datagram {
 struct message {
     const struct datagram *datagram; /* NULL for a message from ROS, whose fields are already read */
     int64_t now;                     /* boot clock: when it was received */
-    struct born born;
-    enum refused since; /* the event that its age counts from */
+    struct time_range times;         /* of the event `since` */
+    enum refused since;              /* the event that its age counts from */
     bool is_read;
     int outcome;    /* result of reading: EVALUATED, or an enum loss */
     uint32_t place; /* where it was refused: enum place */

@@ -28,14 +28,14 @@ static int64_t earlier(int64_t one, int64_t other) { return one < other ? one : 
 
 /* The possible times found so far. */
 struct found {
-    struct born born;
+    struct time_range times;
     int64_t oldest_in_order; /* not before `not_before` */
     bool is_any, is_in_order;
 };
 
 static void find(struct found *found, int64_t time, int64_t not_before) {
-    if (!found->is_any || time < found->born.oldest) found->born.oldest = time;
-    if (!found->is_any || time > found->born.youngest) found->born.youngest = time;
+    if (!found->is_any || time < found->times.oldest) found->times.oldest = time;
+    if (!found->is_any || time > found->times.youngest) found->times.youngest = time;
     found->is_any = true;
     if (not_before == INT64_MIN || time < not_before - FRESHNESS_TOLERANCE) return;
     if (!found->is_in_order || time < found->oldest_in_order) found->oldest_in_order = time;
@@ -43,8 +43,8 @@ static void find(struct found *found, int64_t time, int64_t not_before) {
 }
 
 /* `event` is the time of the stamp under the present setting. */
-static struct born possible(const struct freshness *freshness, int64_t stamp, int64_t event, int64_t now,
-                            int64_t not_before) {
+static struct time_range possible(const struct freshness *freshness, int64_t stamp, int64_t event, int64_t now,
+                                  int64_t not_before) {
     struct found found = {0};
     if (is_possible(event, freshness->since, now)) find(&found, event, not_before);
     for (uint32_t index = 0; index < freshness->count; index++) {
@@ -52,8 +52,8 @@ static struct born possible(const struct freshness *freshness, int64_t stamp, in
         int64_t time = stamp - past->offset;
         if (is_possible(time, past->since, past->until)) find(&found, time, not_before);
     }
-    if (!found.is_any) return (struct born){event, event};
-    return (struct born){found.is_in_order ? found.oldest_in_order : found.born.oldest, found.born.youngest};
+    if (!found.is_any) return (struct time_range){event, event};
+    return (struct time_range){found.is_in_order ? found.oldest_in_order : found.times.oldest, found.times.youngest};
 }
 
 void freshness_look(struct freshness *freshness, int64_t received_at, int64_t now) {
@@ -69,14 +69,14 @@ void freshness_look(struct freshness *freshness, int64_t received_at, int64_t no
     freshness->seen = now;
 }
 
-struct born freshness_born(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
-                           int64_t not_before) {
+struct time_range freshness_times(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
+                                  int64_t not_before) {
     freshness_look(freshness, received_at, now);
     int64_t event = stamp - (received_at - now);
-    struct born born = {event, event};
+    struct time_range times = {event, event};
     if (freshness->count) {
         forget_old(freshness, now);
-        born = possible(freshness, stamp, event, now, not_before);
+        times = possible(freshness, stamp, event, now, not_before);
     }
-    return (struct born){earlier(born.oldest, now), earlier(born.youngest, now)};
+    return (struct time_range){earlier(times.oldest, now), earlier(times.youngest, now)};
 }

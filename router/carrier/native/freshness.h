@@ -41,7 +41,7 @@ struct freshness {
 };
 
 /* The earliest and the latest possible time of a stamp (boot clock, ns). */
-struct born {
+struct time_range {
     int64_t oldest, youngest;
 };
 
@@ -54,7 +54,7 @@ static inline void freshness_forget_past(struct freshness *freshness) { freshnes
 
 /* Look, and return the possible times of an event with the wall-clock stamp `stamp`, never after `now`. The event did not
  * happen before `not_before` (boot clock), if that is known; else INT64_MIN. */
-struct born freshness_born(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
-                           int64_t not_before);
+struct time_range freshness_times(struct freshness *freshness, int64_t stamp, int64_t received_at, int64_t now,
+                                  int64_t not_before);
 
 #endif

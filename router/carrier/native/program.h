@@ -76,7 +76,7 @@ struct message_record {
     uint32_t size, generation;
     const struct targets *to;
     int64_t received_at;  /* wall clock */
-    int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct born */
+    int64_t now, oldest, youngest; /* boot clock: when it was received, and when it arrived, as in struct time_range */
     uint32_t column;      /* of the sender */
     uint32_t is_single;   /* the payload is in one piece */
     uint32_t length;      /* of the datagram */

@@ -32,7 +32,7 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
     struct datagram datagram = {.data = routing->datagram, .size = envelope->size, .start = envelope->start,
                                 .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
                                 .received_at = received->received_at};
-    struct message message = {.datagram = &datagram, .now = received->now, .born = received->born,
+    struct message message = {.datagram = &datagram, .now = received->now, .times = received->times,
                               .since = REFUSED_ARRIVAL};
     deliver_to_all(&routing->stage, to, &message);
 }
@@ -67,8 +67,8 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
                                       .to = to,
                                       .received_at = received->received_at,
                                       .now = received->now,
-                                      .oldest = received->born.oldest,
-                                      .youngest = received->born.youngest,
+                                      .oldest = received->times.oldest,
+                                      .youngest = received->times.youngest,
                                       .column = received->column,
                                       .is_single = received->envelope.is_single,
                                       .length = received->envelope.size,
@@ -129,8 +129,8 @@ static int route(struct routing *routing, const struct payload_case *found, stru
 
 int route_datagram(struct routing *routing, struct received *received) {
     const struct listener *listener = received->listener;
-    received->born = freshness_born(&routing->freshness, received->arrived_at ? received->arrived_at : received->received_at,
-                                    received->received_at, received->now, INT64_MIN);
+    int64_t arrived_at = received->arrived_at ? received->arrived_at : received->received_at;
+    received->times = freshness_times(&routing->freshness, arrived_at, received->received_at, received->now, INT64_MIN);
     stage_count(&routing->stage, listener->received, 1);
     stage_count(&routing->stage, listener->received_bytes, (int64_t)received->length);
     received->peer = find_peer(listener, received->address, received->port);
@@ -158,7 +158,7 @@ bool route_to_topics(struct stage *stage, const struct message_record *record) {
     struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};
-    struct message message = {.datagram = &datagram, .now = record->now, .born = {record->oldest, record->youngest},
+    struct message message = {.datagram = &datagram, .now = record->now, .times = {record->oldest, record->youngest},
                               .since = REFUSED_ARRIVAL};
     bool is_delivered = !to->collect || collect(stage, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {

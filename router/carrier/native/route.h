@@ -38,7 +38,7 @@ struct received {
     const struct peer *peer; /* NULL for a stranger */
     uint32_t column;
     const struct route *route; /* NULL if no route matches */
-    struct born born;
+    struct time_range times;
     struct envelope envelope;
 };
 

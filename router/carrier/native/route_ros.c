@@ -9,7 +9,7 @@ enum { MOST_ELEMENTS = 1 << 16 /* of one message for `for_each`, as the lock is 
 
 /* ---- the age of a message ---- */
 
-static struct born earlier_of(struct born one, struct born other) {
+static struct time_range earlier_of(struct time_range one, struct time_range other) {
     if (other.oldest < one.oldest) one.oldest = other.oldest;
     if (other.youngest < one.youngest) one.youngest = other.youngest;
     return one;
@@ -17,15 +17,16 @@ static struct born earlier_of(struct born one, struct born other) {
 
 /* The time of sending on the sender's clock, or of arrival if that is earlier because the sender's clock is ahead. Messages
  * may arrive out of order, so no reading of the arrival is excluded and the youngest one counts. */
-static struct born sent(struct ros_routing *routing, const struct taken *taken) {
+static struct time_range sent(struct ros_routing *routing, const struct taken *taken) {
     int64_t stamp = taken->published_at ? taken->published_at : taken->arrived_at;
     if (!stamp) stamp = taken->received_at;
-    struct born sent = freshness_born(&routing->freshness, stamp, taken->received_at, taken->now, taken->publisher->sent);
+    struct time_range sent = freshness_times(&routing->freshness, stamp, taken->received_at, taken->now,
+                                             taken->publisher->sent);
     taken->publisher->sent = sent.oldest;
     if (!taken->published_at || !taken->arrived_at) return sent;
-    int64_t arrived = freshness_born(&routing->freshness, taken->arrived_at, taken->received_at, taken->now,
-                                     INT64_MIN).youngest;
-    return earlier_of(sent, (struct born){arrived, arrived});
+    int64_t arrived = freshness_times(&routing->freshness, taken->arrived_at, taken->received_at, taken->now,
+                                      INT64_MIN).youngest;
+    return earlier_of(sent, (struct time_range){arrived, arrived});
 }
 
 /* If the stamp of a message is before its sending, its age counts from the stamp. */
@@ -35,11 +36,11 @@ static void date_by_stamp(struct ros_routing *routing, const struct ros_route *r
     const struct value *slots = routing->stage.machine.slots;
     int64_t stamp = slots[route->seconds].integer * 1000000000 + slots[route->nanoseconds].integer;
     if (!stamp) return;
-    struct born stamped = freshness_born(&routing->freshness, stamp, taken->received_at, taken->now,
-                                         taken->publisher->stamped);
+    struct time_range stamped = freshness_times(&routing->freshness, stamp, taken->received_at, taken->now,
+                                                taken->publisher->stamped);
     taken->publisher->stamped = stamped.oldest;
-    if (stamped.oldest < message->born.oldest) message->since = REFUSED_STAMP;
-    message->born = earlier_of(message->born, stamped);
+    if (stamped.oldest < message->times.oldest) message->since = REFUSED_STAMP;
+    message->times = earlier_of(message->times, stamped);
 }
 
 /* ---- messages ---- */
@@ -112,7 +113,7 @@ void route_ros(struct ros_routing *routing, const struct ros_route *route, const
                               .since = taken->published_at ? REFUSED_SENDING : REFUSED_ARRIVAL};
     struct machine *machine = &routing->stage.machine;
     int64_t count = 1;
-    if (route->targets.ttl) message.born = sent(routing, taken);
+    if (route->targets.ttl) message.times = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
     machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
     if (!machine_read(machine, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;

@@ -17,21 +17,31 @@ from router.compiler.expressions.kinds import (
     length_of,
 )
 from router.compiler.expressions.scope import ExpressionError, Scope
-from router.compiler.expressions.tree import Call, Constant, Each, Element, Listed, Node, Variable, constant_of, whole
+from router.compiler.expressions.tree import (
+    Call,
+    Constant,
+    Each,
+    Element,
+    ListLiteral,
+    Node,
+    Variable,
+    constant_of,
+    whole,
+)
 from router.errors import Code, SourceSpan
 
 Make = Callable[[Sequence[Node]], Node]
 """Makes a node from scalar operands. Raises ExpressionError."""
 
 
-def list_of(items: Sequence[Node], span: SourceSpan) -> Listed:
+def list_of(items: Sequence[Node], span: SourceSpan) -> ListLiteral:
     """Return a list literal. Its elements have a common kind, but each keeps its own."""
     element: Kind | None = items[0].kind if items else None
     for item in items[1:]:
         element = join(element, item.kind) if element else None
         if element is None:
             raise ExpressionError(item.span, Code.TYPE_MISMATCH, f"a list of {items[0].kind} cannot hold {item.kind}")
-    return Listed(ListKind(element, len(items)), span, tuple(items))
+    return ListLiteral(ListKind(element, len(items)), span, tuple(items))
 
 
 def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
@@ -43,7 +53,7 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
         raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index must be a literal integer, 0 or greater")
     if length is not None and position >= length:
         raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} is out of range for {length} elements")
-    if isinstance(holder, Listed) and isinstance(element, MessageKind):
+    if isinstance(holder, ListLiteral) and isinstance(element, MessageKind):
         return holder.items[position]
     return Element(element, span, as_value(holder, scope), position)
 
@@ -57,7 +67,7 @@ def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: S
     if not lists:
         return make(operands)
     length = _common_length(lists, span)
-    if any(isinstance(operand, Listed) for operand in lists):
+    if any(isinstance(operand, ListLiteral) for operand in lists):
         _require_known_lengths(lists)
         assert length is not None  # noqa: S101 - that of the literal
         return list_of([make([_pick(operand, index) for operand in operands]) for index in range(length)], span)
@@ -98,7 +108,7 @@ def _require_known_lengths(lists: Sequence[Node]) -> None:
 
 def _pick(operand: Node, index: int) -> Node:
     """Return an element of a list of known length, or a scalar, which is the same for every element."""
-    if isinstance(operand, Listed):
+    if isinstance(operand, ListLiteral):
         return operand.items[index]
     kind = element_of(operand.kind)
     return operand if kind is None else Element(kind, operand.span, operand, index)
@@ -109,14 +119,16 @@ def _pick(operand: Node, index: int) -> Node:
 
 def as_value(operand: Node, scope: Scope) -> Node:
     """Convert the elements of a list literal that is used as one value to their common kind."""
-    return as_kind(operand, operand.kind, scope) if isinstance(operand, Listed) else operand
+    return as_kind(operand, operand.kind, scope) if isinstance(operand, ListLiteral) else operand
 
 
 def as_kind(operand: Node, kind: Kind, scope: Scope) -> Node:
     """Convert an operand to `kind`: an integer to a float, or to a narrower integer with a check."""
     wanted = element_of(kind) if is_list(kind) else None
     if wanted is not None:
-        kinds = [item.kind for item in operand.items] if isinstance(operand, Listed) else [element_of(operand.kind)]
+        kinds = (
+            [item.kind for item in operand.items] if isinstance(operand, ListLiteral) else [element_of(operand.kind)]
+        )
         if not any(_has_to_be_converted(each, wanted) for each in kinds):
             return operand
         return elementwise(lambda parts: as_kind(parts[0], wanted, scope), [operand], operand.span, scope)

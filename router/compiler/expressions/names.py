@@ -25,7 +25,7 @@ from router.compiler.expressions.tree import (
     MESSAGE,
     SOURCE,
     Constant,
-    Listed,
+    ListLiteral,
     Node,
     Present,
     Read,
@@ -145,7 +145,7 @@ def require_senders(operands: Sequence[Node], scope: Scope) -> None:
     if not scope.sources or not any(map(is_source, operands)):
         return
     for each in (
-        each for operand in operands for each in (operand.items if isinstance(operand, Listed) else (operand,))
+        each for operand in operands for each in (operand.items if isinstance(operand, ListLiteral) else (operand,))
     ):
         name = constant_of(each)
         if isinstance(name, str) and name not in scope.sources:

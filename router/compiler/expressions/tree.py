@@ -94,7 +94,7 @@ class Element:
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ListLiteral:
     """A list literal."""
 
     kind: ListKind
@@ -199,7 +199,7 @@ class Call:
 
 
 Node = Union[
-    Constant, Variable, Read, Present, Element, Listed, Each, Unary, Binary, Compare, Contains, Logic, Choice, Call
+    Constant, Variable, Read, Present, Element, ListLiteral, Each, Unary, Binary, Compare, Contains, Logic, Choice, Call
 ]
 _NODES = get_args(Node)
 
@@ -212,7 +212,7 @@ def constant_of(node: Node) -> bool | int | float | str | None:
 def constant_bytes(octets: Call) -> bytes | None:
     """Return the result of a call of `octets`, if all its integers are Constants."""
     (values,) = octets.arguments
-    if not isinstance(values, Listed) or not all(isinstance(item, Constant) for item in values.items):
+    if not isinstance(values, ListLiteral) or not all(isinstance(item, Constant) for item in values.items):
         return None
     return bytes(int(item.value) for item in values.items if isinstance(item, Constant))
 

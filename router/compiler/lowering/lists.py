@@ -75,7 +75,7 @@ def lower_list(lowering: Lowering, node: tree.Node) -> StoredList:
             return _read(lowering, node)
         case tree.Variable():
             return _payloads(lowering, node)
-        case tree.Listed():
+        case tree.ListLiteral():
             return _listed(lowering, node)
         case tree.Each():
             return _computed(lowering, node)
@@ -91,7 +91,7 @@ def are_messages(node: tree.Node) -> bool:
     match node:
         case tree.Read():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, (MessageKind, TimeKind))
-        case tree.Variable() | tree.Listed() | tree.Choice():
+        case tree.Variable() | tree.ListLiteral() | tree.Choice():
             return isinstance(node.kind, ListKind) and isinstance(node.kind.element, MessageKind)
         case _:
             return False
@@ -117,7 +117,7 @@ def _payloads(lowering: Lowering, node: tree.Variable) -> StoredList:
     return StoredList((load(items),), Scalar.IN_CELLS, node.kind.element, message)
 
 
-def _listed(lowering: Lowering, node: tree.Listed) -> StoredList:
+def _listed(lowering: Lowering, node: tree.ListLiteral) -> StoredList:
     element = node.kind.element
     items = [routine(lowering.value(item), *_as(item.kind, element)) for item in node.items]
     message: Section | None = None
@@ -286,7 +286,7 @@ def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
 
 def length(lowering: Lowering, node: tree.Node) -> Routine:
     """Lower len() of a list. The messages of a literal are not values, but must exist."""
-    if isinstance(node, tree.Listed) and are_messages(node):
+    if isinstance(node, tree.ListLiteral) and are_messages(node):
         return routine(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
     return routine(checked_list(lowering, node).routine, SIZE)
 
@@ -301,7 +301,7 @@ def contains(lowering: Lowering, node: tree.Contains) -> Routine:
         is_it = compare(tree.Relation.EQUAL, one, again, kind, node.sought.kind)
         return routine(is_it, Operation(Op.EITHER))
 
-    if isinstance(node.values, tree.Listed):
+    if isinstance(node.values, tree.ListLiteral):
         found = routine(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
     else:
         found = routine(found, _folded(lowering, node.values, look))

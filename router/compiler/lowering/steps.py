@@ -25,7 +25,7 @@ def cdr_layout(slots: Sequence[Slot], message: Section, elements: Sequence[Secti
         first = len(maker.defaults)
         steps = _Steps(maker, span, Offset(HIGHEST) if root is message else Offset())
         steps.message(root.type, root)
-        maker.sections[index] = PlacedSection(steps.up_to_the_last_wanted(), first, len(maker.defaults) - first)
+        maker.sections[index] = PlacedSection(steps.without_trailing_skips(), first, len(maker.defaults) - first)
     return maker.made(is_cdr=True)
 
 
@@ -45,7 +45,7 @@ class _Steps:
         self._skipped: tuple[int, int] | None = None  # an alignment, and a number of bytes
         self._wanted = 0  # steps up to the last wanted one
 
-    def up_to_the_last_wanted(self) -> tuple[ReadOperation, ...]:
+    def without_trailing_skips(self) -> tuple[ReadOperation, ...]:
         return tuple(self.made[: self._wanted])
 
     def message(self, declared: MessageType, section: Section | None) -> None:

@@ -178,7 +178,7 @@ class Page:
     def answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None continues with the websocket handshake."""
         if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
-            if _is_from_elsewhere(request.headers):
+            if _is_cross_origin(request.headers):
                 return connection.respond(
                     HTTPStatus.FORBIDDEN,
                     "pages of other hosts may not connect; open the page at this computer's address\n",
@@ -208,7 +208,7 @@ _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan
 """IP addresses, and names that nobody can register on the internet."""
 
 
-def _is_from_elsewhere(headers: Headers) -> bool:
+def _is_cross_origin(headers: Headers) -> bool:
     """Return whether a page of another host connects: otherwise any page that is open in a browser could publish.
 
     Names that anybody can register are not trusted (DNS rebinding).
