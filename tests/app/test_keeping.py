@@ -33,7 +33,7 @@ def test_a_table_that_is_restored_while_the_other_is_being_written_is_kept(monke
         written.append(read)
 
     monkeypatch.setattr(store, "write", write)
-    monkeypatch.setattr(store, "works", has_ended.set)
+    monkeypatch.setattr(store, "clear_tries", has_ended.set)
     monkeypatch.setattr("router.carrier.image.image_of", lambda *_: ((), b""))
     keeper = Keeper(library(), Inputs(), first, first.plain())
     keeper.keep(lambda: PROGRAM, first)  # as after a head start
