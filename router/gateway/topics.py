@@ -69,6 +69,7 @@ class Topics:
         self._numbers = count()
         self._discover_now = asyncio.Event()
         self._is_udp = plan.settings.transport.value is Transport.UDP
+        self._is_shared = plan.settings.transport.value is Transport.ZENOH  # its one client is the network
         self._is_spread = self._is_udp and plan.settings.format is GatewayFormat.GATEWAY_V1
 
     def start(self) -> None:
@@ -282,7 +283,7 @@ class Topics:
             self._sender.show(served, frames)
         if is_for_all:
             self._sender.introduced(frames)
-        self._show_kept(queue, topics)
+        self._show_kept(queue, topics, is_repetition=self._is_shared)
         return frames
 
     async def everything(self) -> list[Frame]:
