@@ -19,6 +19,7 @@ from router.cli.tool_options import add_table, good_table, table_path
 from router.errors import UsageError
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log, logger
+from router.tools.udp import reachable
 
 if TYPE_CHECKING:
     from router.app import Router
@@ -170,8 +171,6 @@ def _show_places(router: Router) -> None:
 
 
 def _places(router: Router) -> Iterator[tuple[str, str]]:
-    from router.tools.udp import reachable
-
     table = router.program.table
     if router.metrics_address is not None:
         yield "status page", f"http://{reachable(router.metrics_address)}/"
@@ -183,7 +182,6 @@ def _places(router: Router) -> Iterator[tuple[str, str]]:
 
 def _place(gateway: Gateway) -> str:
     from router.table.model import Transport
-    from router.tools.udp import reachable
 
     if gateway.zenoh is not None:
         return f"zenoh://{gateway.zenoh.key.value}"
