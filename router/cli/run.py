@@ -19,13 +19,13 @@ from router.cli.tool_options import add_table, good_table, table_path
 from router.errors import UsageError
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log, logger
-from router.tools.udp import reachable
 
 if TYPE_CHECKING:
     from router.app import Router
     from router.app.keeping import Keeper
     from router.compiler.program import Program
     from router.kept.head_start import HeadStartAttempt
+    from router.table.addresses import Address
     from router.table.model import Gateway
 
 _DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
@@ -143,6 +143,7 @@ def route(
     """
     from router.app import Router, tune_interpreter
     from router.app.process import supervised
+    from router.tools.udp import reachable  # before the router runs: then, there may be no free descriptor
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_ENDING, signal.SIGHUP, signal.SIGUSR1})
     head_start = attempt.head_start if attempt is not None else None
@@ -151,7 +152,7 @@ def route(
         attempt.pass_on()
     with router:
         tune_interpreter()
-        _show_places(router)
+        _show_places(router, reachable)
         started()
         with supervised(router.feed_watchdog):
             _serve_signals(router, _ENDING)
@@ -160,9 +161,9 @@ def route(
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
 
 
-def _show_places(router: Router) -> None:
+def _show_places(router: Router, reachable: Callable[[Address], Address]) -> None:
     """Log the addresses of pages and gateways: on a terminal one per line, elsewhere as one record."""
-    found = dict(_places(router))
+    found = dict(_places(router, reachable))
     if found and not sys.stderr.isatty():
         logger.info("where to look", **found)
     elif found:
@@ -170,17 +171,17 @@ def _show_places(router: Router) -> None:
         logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
 
 
-def _places(router: Router) -> Iterator[tuple[str, str]]:
+def _places(router: Router, reachable: Callable[[Address], Address]) -> Iterator[tuple[str, str]]:
     table = router.program.table
     if router.metrics_address is not None:
         yield "status page", f"http://{reachable(router.metrics_address)}/"
     for name, gateway in table.gateways.items():
-        yield f"gateway {name}", _place(gateway)
+        yield f"gateway {name}", _place(gateway, reachable)
     if table.foxglove is not None:
         yield "Foxglove", f"ws://{reachable(table.foxglove.value)}"
 
 
-def _place(gateway: Gateway) -> str:
+def _place(gateway: Gateway, reachable: Callable[[Address], Address]) -> str:
     from router.table.model import Transport
 
     if gateway.zenoh is not None:
