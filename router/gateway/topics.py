@@ -209,19 +209,18 @@ class Topics:
         self._clients.send([self._sender.schema(served) for served in is_known])
         if self._is_udp:  # a new client goes unnoticed
             for queue in self._clients.queues.values():
-                self._show_kept(queue, is_known, is_repetition=True)
+                self._show_kept(queue, is_known, may_hold=False)
 
     # -- messages kept for late joiners ------------------------------------------------------------------------
 
-    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, is_repetition: bool = False) -> None:
+    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, may_hold: bool = True) -> None:
         """Send a client the kept messages of these topics, a little later.
 
-        Newer messages are held until then, except in a repetition, and on topics of which some publishers keep no
-        messages.
+        Newer messages are held until then, if they may be and all publishers of their topic keep messages.
         """
         for served in topics:
             topic = served.subscription.topic
-            holds = served.selection.keeps and not is_repetition
+            holds = served.selection.keeps and may_hold
             if served.selection.keepers and (not holds or queue.hold(topic)):
                 self._tasks.run(self._show(queue, topic, holds=holds))
 
@@ -283,7 +282,7 @@ class Topics:
             self._sender.show(served, frames)
         if is_for_all:
             self._sender.introduced(frames)
-        self._show_kept(queue, topics, is_repetition=self._is_shared)
+        self._show_kept(queue, topics, may_hold=not self._is_shared)
         return frames
 
     async def everything(self) -> list[Frame]:
