@@ -150,6 +150,10 @@ class DaemonThread(Executor):
         self._is_shut_down = False
         self._lock = threading.Lock()
 
+    def has_waiting(self) -> bool:
+        """Return whether a call waits for an earlier one to end."""
+        return not self._is_shut_down and not self._calls.empty()
+
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Queue a call.
 

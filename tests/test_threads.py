@@ -69,6 +69,25 @@ def test_calls_run_one_after_the_other_and_give_what_they_return_or_raise() -> N
     thread.shutdown()
 
 
+def test_a_running_call_does_not_count_as_waiting() -> None:
+    thread, begun, may_end = DaemonThread("calls"), threading.Event(), threading.Event()
+
+    def call() -> None:
+        begun.set()
+        assert may_end.wait(TIMEOUT_S)
+
+    assert not thread.has_waiting()
+    thread.submit(call)
+    assert begun.wait(TIMEOUT_S)
+    assert not thread.has_waiting()
+    waiting = thread.submit(int)
+    assert thread.has_waiting()
+    may_end.set()
+    assert waiting.result(TIMEOUT_S) == 0
+    assert not thread.has_waiting()
+    thread.shutdown()
+
+
 def test_what_has_not_begun_is_given_up_and_the_thread_ends_after_what_has() -> None:
     thread = DaemonThread("calls")
     begun, go_on = threading.Event(), threading.Event()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
 from types import TracebackType
@@ -249,7 +248,6 @@ class Services:
         self._running = running
         self._recorder: Recorder | None = None
         self._saving = DaemonThread("saving")
-        self._last_request: Future[None] | None = None
 
     def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
         """Open the services; `opening` closes them. Raises StartError.
@@ -312,10 +310,9 @@ class Services:
         if self._recorder is None:
             logger.warning("nothing to save: the table has no 'record: {last: ...}'")
             return
-        last = self._last_request
-        if last is None or last.running() or last.done():
+        if not self._saving.has_waiting():
             try:
-                self._last_request = self._saving.submit(_save, self._recorder, reason)
+                self._saving.submit(_save, self._recorder, reason)
             except (RuntimeError, MemoryError) as error:  # no thread can be started
                 logger.error("cannot save the last datagrams", problem=str(error))
 

@@ -195,15 +195,15 @@ def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
     """Handle signals one after the other until one of `ending` arrives, which no reload delays."""
     from router.threads import DaemonThread
 
-    reloads, reload = DaemonThread("reload"), None  # one may be stuck, if files are on another computer
+    reloads = DaemonThread("reload")  # a reload may be stuck, if files are on another computer
     while True:
         last = signal.sigpending() & set(ending)  # sigwait alone would return SIGHUP first each time
         match signal.sigwait(last or {*ending, signal.SIGHUP, signal.SIGUSR1}):
-            case signal.SIGHUP if reload is not None and not reload.running() and not reload.done():
+            case signal.SIGHUP if reloads.has_waiting():
                 pass  # the one that waits will read the files
             case signal.SIGHUP:
                 try:
-                    reload = reloads.submit(router.reload)
+                    reloads.submit(router.reload)
                 except (RuntimeError, MemoryError):  # no thread can be started
                     router.reload()
             case signal.SIGUSR1:
