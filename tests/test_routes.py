@@ -107,17 +107,19 @@ def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_
 
 
 def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program) -> None:
+    brakes = ["manual_brake {brake: true}"]
     stops = {
-        "drive_motor": ("manual_brake", ("driving_board",), ["manual_drive"]),
-        "manual_drive": ("manual_brake", ("driving_board",), ["drive_motor"]),
-        "manual_arm": ("manual_arm", ("arm_board",), ["arm_ctrl", "arm_target"]),
+        "drive_motor": (brakes, ("driving_board",), ["manual_drive"]),
+        "manual_drive": (brakes, ("driving_board",), ["drive_motor"]),
+        "manual_arm": (["manual_arm"], ("arm_board",), ["arm_ctrl", "arm_target"]),
     }
     routes = {route.name: route for route in rover.table.routes}
     assert {name for name, route in routes.items() if route.deadman} == set(stops)
-    for name, (case, to, others) in stops.items():
+    for name, (sent, to, others) in stops.items():
         deadman, ttl = routes[name].deadman, routes[name].ttl
         assert deadman is not None
-        assert (deadman.case.value, tuple(endpoint.value for endpoint in deadman.to)) == (case, to)
+        assert [*map(str, deadman.payloads)] == sent
+        assert tuple(endpoint.value for endpoint in deadman.to) == to
         assert [other.value for other in deadman.disarmed_by or ()] == others
         assert ttl is not None
         assert ttl.value < deadman.timeout.value

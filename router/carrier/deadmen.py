@@ -9,7 +9,7 @@ from router.carrier.threads import NativeThread
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
     from typing import TypeVar
 
     from router.carrier.names import Names
@@ -115,13 +115,18 @@ def destinations_of(
     """Return the payloads of a deadman for its senders or publishers (`kind`), as arguments of `deadman_open`."""
     made = [
         c.DeadmanDestination(
-            datagram=datagram,
-            size=len(datagram),
+            datagrams=datagrams_of(datagrams),
+            count=len(datagrams),
             sent=counters.index("deadman_datagrams_sent", plan.route, name),
             send_errors=counters.index("deadman_send_errors", plan.route, name),
             id=names.number(name),
             **{kind: outlet.address},
         )
-        for (name, datagram), outlet in zip(plan.datagrams, outlets, strict=True)
+        for (name, datagrams), outlet in zip(plan.datagrams, outlets, strict=True)
     ]
     return (c.DeadmanDestination * len(made))(*made), len(made)
+
+
+def datagrams_of(datagrams: Collection[bytes]) -> ctypes.Array[c.DeadmanDatagram]:
+    """Return the datagrams for one destination."""
+    return (c.DeadmanDatagram * len(datagrams))(*(c.DeadmanDatagram(data=each, size=len(each)) for each in datagrams))

@@ -13,6 +13,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
+from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import DeadmanGroup
 from router.carrier.deferrals import Adoption
@@ -138,13 +139,17 @@ def _plain(argument: object) -> object:
     """Return an argument for the head start: (number,) for a symbol, a list for deadman destinations, or the value."""
     if isinstance(argument, ctypes.Array):
         return [
-            (_plain(each.sender), ctypes.string_at(_address_in(each, "datagram"), each.size), each.sent,
+            (_plain(each.sender), [_bytes(datagram) for datagram in each.datagrams[: each.count]], each.sent,
              each.send_errors, each.id)
             for each in argument
         ]  # fmt: skip
     if isinstance(argument, int) and argument >= _FIRST:
         return (argument - _FIRST,)
     return argument
+
+
+def _bytes(datagram: c.DeadmanDatagram) -> bytes:
+    return ctypes.string_at(_address_in(datagram, "data"), datagram.size)
 
 
 def _address_in(structure: Any, field: str) -> int:

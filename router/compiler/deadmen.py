@@ -1,4 +1,4 @@
-"""Checks deadmen: their timing, the payload that they send, and commands to boards without a deadman.
+"""Checks deadmen: their timing, the payloads that they send, and commands to boards without a deadman.
 
 `gateways` uses this module for the deadmen of topics that clients publish on.
 """
@@ -22,6 +22,7 @@ from router.table.model import (
     FieldMap,
     InboundDeadman,
     OnLimit,
+    Payload,
     Route,
     RouteTable,
 )
@@ -47,21 +48,16 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
         _require_deadman(lookup, route)
         return None
     _require_commands(lookup, route, deadman)
-    case = lookup.case(deadman.case)
-    if case is None:
-        return None
-    known = len(lookup.findings)
-    for name in deadman.to:
-        lookup.recipient(case, name, sources=frozenset())
-    can_reach = len(lookup.findings) == known
     disarmed_by = _successors(lookup, route, deadman)
-    sent = _payload(lookup, deadman, case)
-    if sent is None or (can_reach and _is_refused(lookup, deadman, sent[0], case)):
+    sent = [_datagram(lookup, deadman, payload) for payload in deadman.payloads]
+    datagrams = [each for each in sent if each is not None]
+    if len(datagrams) < len(sent):
         return None
-    _, datagram = sent
     trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
-    datagrams = [(to.value, trimmed(datagram) if to.value in trims else datagram) for to in deadman.to]
-    return deadman_plan(route.name, deadman, datagrams, disarmed_by)
+    by_endpoint = [
+        (to.value, tuple(trimmed(each) if to.value in trims else each for each in datagrams)) for to in deadman.to
+    ]
+    return deadman_plan(route.name, deadman, by_endpoint, disarmed_by)
 
 
 def _require_deadman(lookup: Lookup, route: Route) -> None:
@@ -218,32 +214,40 @@ def _commanding(table: RouteTable, route: Route, deadman: Deadman) -> set[str]:
     return {each.case.value for each in others if stopped & {to.endpoint.value for to in each.destinations}}
 
 
-def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> tuple[Record, bytes] | None:
-    """Return the payload of the deadman as a computed plan and as an envelope; None with a finding."""
-    plan = constant_plan(lookup, deadman.fields, case.type, deadman.case.span)
+def _datagram(lookup: Lookup, deadman: Deadman, payload: Payload) -> bytes | None:
+    """Return a payload of the deadman as an envelope; None with a finding."""
+    case = lookup.case(payload.case)
+    if case is None:
+        return None
+    known = len(lookup.findings)
+    for name in deadman.to:
+        lookup.recipient(case, name, sources=frozenset())
+    can_reach = len(lookup.findings) == known
+    plan = constant_plan(lookup, payload.fields, case.type, payload.case.span)
     if plan is None:
         return None
     try:
-        payload = computed(plan)
-        return payload, envelope_of(payload, case)
+        made = computed(plan)
+        datagram = envelope_of(made, case)
     except MappingError as error:
-        lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
+        lookup.report(payload.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
+    return None if can_reach and _is_refused(lookup, deadman, payload, made, case) else datagram
 
 
-def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: PayloadCase) -> bool:
-    """Report the first board that cannot decode the deadman's payload. Return whether there is one.
+def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, made: Record, case: PayloadCase) -> bool:
+    """Report the first board that cannot decode the payload, which has these fields. Return whether there is one.
 
     The size was checked with the payload case.
     """
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
         bounds = board.fields.get(case.number)
-        for field, value in scalars(payload, bounds.message or {}) if bounds else ():
+        for field, value in scalars(made, bounds.message or {}) if bounds else ():
             if misfit := board.misfit(field, value):
                 allow = f"set `allow_non_finite: true` for '{name}' if its firmware handles {value}"
                 hint = f"send a finite number, or {allow}" if isinstance(value, float) else ""
-                lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board rejects this: {misfit}", hint)
+                lookup.report(payload.case.span, Code.BOARD_PAYLOAD, f"a board rejects this: {misfit}", hint)
                 return True
     return False
 
@@ -251,7 +255,7 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Record, case: Payload
 def deadman_plan(
     name: str,
     settings: Deadman | InboundDeadman,
-    datagrams: Iterable[tuple[str, bytes]],
+    datagrams: Iterable[tuple[str, tuple[bytes, ...]]],
     disarmed_by: tuple[str, ...] = (),
 ) -> DeadmanPlan:
     timeout, repeat = settings.timeout.value, settings.repeat.value

@@ -94,4 +94,4 @@ def _deadman(
     except MappingError as error:
         lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
         return None
-    return deadman_plan(f"{gateway.name}:{name}", deadman, [(name, message)])
+    return deadman_plan(f"{gateway.name}:{name}", deadman, [(name, (message,))])

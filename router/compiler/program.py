@@ -82,14 +82,14 @@ class TargetPlan:
 class DeadmanPlan:
     """A route's deadman: the datagrams that are sent if no fresh command was sent for `timeout` (all times in ns).
 
-    With `at_start`, they are also sent when the router starts. `disarmed_by` are names of routes, not the payload cases
-    of the table.
+    `datagrams` are by endpoint, in the order of sending. With `at_start`, they are also sent when the router starts.
+    `disarmed_by` are names of routes, not the payload cases of the table.
     """
 
     route: str
     timeout: int
     repeat: int
-    datagrams: tuple[tuple[str, bytes], ...]
+    datagrams: tuple[tuple[str, tuple[bytes, ...]], ...]
     at_start: bool = True
     disarmed_by: tuple[str, ...] = field(default=(), compare=False)
 

@@ -12,6 +12,7 @@ import signal
 from contextlib import ExitStack
 
 from router import declared as c
+from router.carrier.deadmen import datagrams_of
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding
 from router.carrier.library import library
@@ -109,8 +110,8 @@ class HeadStart:
         if not isinstance(argument, list):
             return argument
         made = (c.DeadmanDestination * len(argument))()
-        for to, (sender, datagram, sent, send_errors, number) in zip(made, argument, strict=True):
-            to.sender, to.datagram, to.size = self._argument(sender, parts), datagram, len(datagram)
+        for to, (sender, datagrams, sent, send_errors, number) in zip(made, argument, strict=True):
+            to.sender, to.datagrams, to.count = self._argument(sender, parts), datagrams_of(datagrams), len(datagrams)
             to.sent, to.send_errors, to.id = sent, send_errors, number
         return made
 

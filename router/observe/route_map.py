@@ -86,7 +86,7 @@ def deadman_edges(program: Program) -> Iterator[Edge]:
     """
     for route in program.table.routes:
         if route.deadman is not None:
-            about = f"the deadman sends {route.deadman.case.value}"
+            about = f"the deadman sends {' and '.join(each.case.value for each in route.deadman.payloads)}"
             for name in (to.value for to in route.deadman.to):
                 yield Edge(f"case:{route.case.value}", f"to:@{name}", route.name, name, about)
     for gateway in program.gateways:

@@ -17,7 +17,7 @@ from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields, invalid
 from router.table.addresses import BadAddressError, parse_address
-from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
 from router.types.model import Enum, MessageType
@@ -333,16 +333,14 @@ class ExpectedReader:
         content = [(name, entry) for name, entry in node.entries.items() if name != "times"]
         if not content:
             return [_unchanged(node.span, given)] * times
-        if len(content) > 1:
-            _, second = content[1]
-            message, hint = "a datagram has one payload", "write a list of several datagrams"
-            raise invalid(second.key.span, Code.BAD_VALUE, message, hint)
-        ((name, entry),) = content
+        return [self._datagram(name, entry, given) for name, entry in content] * times
+
+    def _datagram(self, name: str, entry: Entry, given: Node | None) -> Delivery:
         if name == "hex":
-            return [Delivery(entry.key.span, data=_bytes(entry.value))] * times
+            return Delivery(entry.key.span, data=_bytes(entry.value))
         case = self._names.case(name, entry.key.span)
         fields = None if _is(entry.value, ANY) else self._content(case.type, entry.value, given)
-        return [Delivery(entry.key.span, case=case, fields=fields)] * times
+        return Delivery(entry.key.span, case=case, fields=fields)
 
     def _published(self, node: Node | None, given: Node | None) -> Deliveries:
         found: dict[str, tuple[Delivery, ...]] = {}

@@ -38,6 +38,7 @@ from router.table.model import (
     Listener,
     Networks,
     NodeSettings,
+    Payload,
     RecordSettings,
     Route,
     RouteTable,
@@ -374,13 +375,13 @@ def _topic(node: Node, span: SourceSpan) -> Topic:
 
 
 def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
-    """Build the deadman of a route. Without `to`, its payload goes to the route's destinations."""
+    """Build the deadman of a route. Without `to`, its payloads go to the route's destinations."""
     settings = _with_timeout(entry)
-    [payload] = mapping(settings.get("send")).entries.values()
-    own = {} if settings.get("to") else {"to": destinations}
-    return structure(
-        Deadman, settings, span=entry.key.span, case=located(payload.key), fields=_constants(payload), **own
+    payloads = tuple(
+        Payload(located(each.key), _constants(each)) for each in mapping(settings.get("send")).entries.values()
     )
+    own = {} if settings.get("to") else {"to": destinations}
+    return structure(Deadman, settings, span=entry.key.span, payloads=payloads, **own)
 
 
 def _with_timeout(deadman: Entry) -> MappingNode:

@@ -3,8 +3,8 @@
 Mappings merge key by key; everything else is replaced. These mappings are also replaced: values that may be a list
 (such as the topics of a route) or a name (a QoS); a `map` of values; a route or gateway that only one of the two files
 ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and the
-reverse; the payload of a deadman; and the transport of a gateway. `topic` and `topics` of a route replace each other.
-Every node keeps the span of its own file.
+reverse; the payloads of a deadman, unless both files have the same cases in the same order; and the transport of a
+gateway. `topic` and `topics` of a route replace each other. Every node keeps the span of its own file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ALTERNATIVES = {"topic": "topics", "topics": "topic"}
 _WHOLE = ("source", "destinations", *_ALTERNATIVES)
 """Keys of a route that take a single value or a list."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
-"""Parts of a route or gateway with a single key, which selects their kind."""
+"""Parts of a route or gateway whose keys select their kind."""
 
 
 def load_chain(
@@ -87,7 +87,7 @@ def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
     if path[0] == "routes" and len(path) == _DEPTH + 1 and path[-1] in _WHOLE:
         return True
     if path[_DEPTH:] == _OF_ONE_KIND[path[0]]:
-        return over.entries.keys() != base.entries.keys()
+        return [*over.entries] != [*base.entries]
     word = _WORDS_FOR_NONE.get(path[_DEPTH:]) if len(path) >= _DEPTH else None
     if word is not None and (word in over.entries) != (word in base.entries):
         return True

@@ -304,16 +304,26 @@ class DeadmanKeys:
 
 
 @dataclass(frozen=True, slots=True)
-class Deadman(DeadmanKeys):
-    """What is sent when commands stop: the payload `case` with `fields`, to the endpoints `to`.
+class Payload:
+    """A payload of constants: a payload `case` with `fields`."""
 
-    `span` is the key `deadman`. `disarmed_by` are payload cases, None if not set. With `at_start`, it is also sent when
-    the router starts.
+    case: Located[str]
+    fields: FieldMap
+
+    def __str__(self) -> str:
+        return f"{self.case.value} {self.fields}" if self.fields.entries else self.case.value
+
+
+@dataclass(frozen=True, slots=True)
+class Deadman(DeadmanKeys):
+    """What is sent when commands stop: each of `payloads` in this order, to the endpoints `to`.
+
+    `span` is the key `deadman`. `disarmed_by` are payload cases or names of routes, None if not set. With `at_start`,
+    the payloads are also sent when the router starts.
     """
 
     span: SourceSpan
-    case: Located[str]
-    fields: FieldMap
+    payloads: Annotated[tuple[Payload, ...], Named("send")]
     to: tuple[Located[str], ...]
     disarmed_by: tuple[Located[str], ...] | None = None
 

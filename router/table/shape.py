@@ -215,9 +215,8 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
         return _repeated(error, tree)
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
     if keyword == "maxProperties":
-        hint = hints.without_case(error.value) if path[-1] == "send" and isinstance(error.value, dict) else ""
         count = len(error.value) if isinstance(error.value, dict) else 0
-        return Diagnostic(span, code, f"{name} has {count} keys; it {_expected(error)}", hint)
+        return Diagnostic(span, code, f"{name} has {count} keys; it {_expected(error)}")
     hint = hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")

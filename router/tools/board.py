@@ -32,11 +32,15 @@ class State(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A payload that a deadman sends in place of commands. It counts for `hold` seconds."""
+    """A payload that a deadman sends in place of commands. It counts for `hold` seconds.
+
+    `text` describes all payloads of the deadman.
+    """
 
     case: str
     message: Message
     hold: float
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +69,18 @@ def command_cases(table: RouteTable, board: str) -> frozenset[str]:
 def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[Stop]:
     """Return the payloads that the deadmen of a program send to this board."""
     return [
-        Stop(decoded.case.name, decoded.message, MISSED_REPEATS * plan.repeat / 1e9)
+        Stop(each.case.name, each.message, MISSED_REPEATS * plan.repeat / 1e9, text)
         for plan in deadmen
-        for endpoint, datagram in plan.datagrams
+        for endpoint, datagrams in plan.datagrams
         if endpoint == board
-        for decoded in [wire.decode(datagram)]
+        for payloads in [[*map(wire.decode, datagrams)]]
+        for text in [", ".join(map(_described, payloads))]
+        for each in payloads
     ]
+
+
+def _described(payload: Decoded) -> str:
+    return f"{payload.case.name} {compact(payload.message, payload.case.type)}"
 
 
 class Board:
@@ -99,7 +109,7 @@ class Board:
         stop = next((stop for stop in self._stops if stop.case == case.name and stop.message == message), None)
         if stop is not None:
             self._commanded_at, self._halted_until = now, now + stop.hold
-            self._halt = f"{case.name} {compact(message, case.type)}"
+            self._halt = stop.text
             self._enter(now, State.HALTED)
         elif case.name in self._commands:
             self._commanded_at = now

@@ -115,9 +115,9 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"complete within {duration(collect.timeout.value)}"
         )
     if deadman is not None and (settings := route.deadman) is not None:
-        sent = f"{settings.case.value} {settings.fields}" if settings.fields.entries else settings.case.value
+        sent, to = ", ".join(map(str, settings.payloads)), ", ".join(to.value for to in settings.to)
         yield (
-            f"  deadman: {sent} to {', '.join(to.value for to in settings.to)} when no command came for "
+            f"  deadman: {sent} to {to} when no command came for "
             f"{duration(settings.timeout.value)}, again every {duration(settings.repeat.value)}, "
             f"{_at_start(settings.at_start)}"
         )

@@ -54,7 +54,7 @@ class Clients:
     ) -> ClientDeadman:
         if topic not in self.publishers:
             self.publishers[topic] = Publisher(self._functions)
-        payload = (topic, b"stop " + topic.encode())
+        payload = (topic, (b"stop " + topic.encode(),))
         plan = DeadmanPlan(f"gateway:{topic}", timeout_ms * MS, repeat_ms * MS, (payload,), at_start)
         return self.deadmen.get_or_open(plan, self._counters, self.publishers, State(self._library))
 

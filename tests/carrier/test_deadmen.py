@@ -42,8 +42,8 @@ STALE = -1
 MS = 1_000_000
 EVENT = Struct("@IIIIiI")
 TRIPPED, RELEASED, ERROR = 1, 2, 3
-PAYLOADS = {"wheels": b"brake", "arm": b"hold", "mast": b"fold\0\0"}
-PLAN = DeadmanPlan("drive", 500, 100, (("wheels", b"brake"), ("arm", b"hold")))
+PAYLOADS = {"wheels": (b"brake",), "arm": (b"hold", b"stay"), "mast": (b"fold\0\0", b"", b"fold")}
+PLAN = DeadmanPlan("drive", 500, 100, (("wheels", PAYLOADS["wheels"]), ("arm", PAYLOADS["arm"])))
 
 
 class Outlet:
@@ -361,7 +361,7 @@ def test_at_the_start_it_says_whom_it_reached(side: NativeSide) -> None:
     side.breaks("arm", is_broken=True)
     assert side.add(open_plan()).start(0) == ["wheels"]
     assert side.add(open_plan(at_start=False)).start(0) == []
-    assert side.events() == [("error", "drive", "arm", errno.ENOTSOCK)]
+    assert side.events() == [("error", "drive", "arm", errno.ENOTSOCK)] * 2
 
 
 def test_a_command_that_waits_for_the_lock_until_it_is_stale_is_not_sent(

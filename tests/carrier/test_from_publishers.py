@@ -131,7 +131,7 @@ def test_commands_arrive_in_order_with_their_values_and_the_brake_behind_them(ro
     assert router.total("messages_dropped") == 0
     assert router.thread.failures == 0
     router.library.timers_serve(router.deadmen.address, 1 << 62)
-    assert router.board.recv(1000) == router.program.deadmen[0].datagrams[0][1]
+    assert (router.board.recv(1000),) == router.program.deadmen[0].datagrams[0][1]
 
 
 def test_what_has_arrived_is_sent_before_the_stop(router: Router) -> None:

@@ -49,15 +49,38 @@ def test_deadman_that_is_written_wrong_is_not_missing_as_well(check_text: CheckT
 
 
 @pytest.mark.parametrize(
-    ("send", "envelope"), [("manual_brake: {brake: true}", "ca01020801"), ("manual_arm: {}", "d20100")]
+    ("send", "envelopes"),
+    [
+        ("manual_brake: {brake: true}", ["ca01020801"]),
+        ("manual_arm: {}", ["d20100"]),
+        ("manual_arm: {}, manual_brake: {brake: true}", ["d20100", "ca01020801"]),
+        ("manual_brake: {brake: true}, manual_arm: {}", ["ca01020801", "d20100"]),
+    ],
 )
-def test_payload_is_known_before_the_start(check_text: CheckText, send: str, envelope: str) -> None:
+def test_payloads_are_known_before_the_start(check_text: CheckText, send: str, envelopes: list[str]) -> None:
     deadman = f"{{timeout: 500ms, send: {{{send}}}, to: [board, base]}}"
     checked = check_text(ROUTE.format(destinations="board", deadman=deadman))
     (route,) = checked.routes
     assert not checked.has_errors
     assert route.deadman is not None
-    assert [(to, sent.hex()) for to, sent in route.deadman.datagrams] == [("board", envelope), ("base", envelope)]
+    sent = [(to, [each.hex() for each in datagrams]) for to, datagrams in route.deadman.datagrams]
+    assert sent == [("board", envelopes), ("base", envelopes)]
+
+
+@pytest.mark.parametrize(
+    ("send", "to", "code", "at"),
+    [
+        ("manual_brake: {}, manual_break: {}", "board", Code.UNKNOWN_PAYLOAD_CASE, "manual_break"),
+        ("manual_brake: {}, manual_arm: {speeds: 1}", "board", Code.UNKNOWN_FIELD, "speeds"),
+        ("manual_brake: {}, manual_arm: {speed: 1 / 0}", "board", Code.OUT_OF_RANGE, "1 / 0"),
+        ("manual_brake: {}, manual_drive: {}", "bord", Code.UNKNOWN_ENDPOINT, "bord"),
+    ],
+)
+def test_each_payload_is_checked(check_text: CheckText, send: str, to: str, code: Code, at: str) -> None:
+    deadman = f"{{timeout: 500ms, send: {{{send}}}, to: [{to}]}}"
+    found = [each for each in findings(check_text, "board", deadman) if each.code is not Code.DOUBTFUL_DEADMAN]
+    text = ROUTE.format(destinations="board", deadman=deadman)
+    assert [(each.code, f"'{at}'" in each.message or text.count(at) == 1) for each in found] == [(code, True)]
 
 
 TURNS = """

@@ -60,8 +60,8 @@ def test_of_strangers_the_latest_are_remembered() -> None:
     assert list(reporter.mismatches()) == [*seen[10:40], seen[0], *seen[40:]]
 
 
-PLAN = DeadmanPlan("manual_drive", 10**12, 10**8, (("driving_board", b""),))
-OF_CLIENTS = DeadmanPlan("phone:/cmd_vel", 10**12, 10**8, (("/cmd_vel", b""),))
+PLAN = DeadmanPlan("manual_drive", 10**12, 10**8, (("driving_board", (b"",)),))
+OF_CLIENTS = DeadmanPlan("phone:/cmd_vel", 10**12, 10**8, (("/cmd_vel", (b"",)),))
 
 
 @pytest.mark.parametrize(

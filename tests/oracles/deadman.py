@@ -23,7 +23,7 @@ Event = tuple[str, str, str, int]
 @dataclass(eq=False)
 class Deadman:
     plan: DeadmanPlan
-    outlets: dict[str, bytes]
+    outlets: dict[str, tuple[bytes, ...]]
     is_armed: bool = False
     """Armed or tripped."""
     has_tripped: bool = False
@@ -100,11 +100,11 @@ class Deadmen:
     def _send_at_start(self, deadman: Deadman, now: int) -> list[str]:
         errors = self._send_all(deadman)
         times = [deadman.greets_again]
-        if any(error not in {0, errno.ECONNREFUSED} for error in errors.values()):
+        if any({*each} - {0, errno.ECONNREFUSED} for each in errors.values()):
             times.append(now + START_AGAIN)
         deadman.due = min((time for time in times if time is not None), default=None)
         deadman.greets_again = None
-        return [endpoint for endpoint, error in errors.items() if not error]
+        return [endpoint for endpoint, each in errors.items() if not any(each)]
 
     def await_subscribers(self, deadman: Deadman, now: int) -> None:
         deadman.greets_until = now + START if deadman.plan.at_start else 0
@@ -143,12 +143,13 @@ class Deadmen:
         deadman.ends_when_due, deadman.greets_until = deadman.is_armed, 0
         deadman.due = 0 if deadman.ends_when_due else None
 
-    def _send_all(self, deadman: Deadman) -> dict[str, int]:
-        errors = {endpoint: self._send(endpoint, data) for endpoint, data in deadman.outlets.items()}
-        for endpoint, error in errors.items():
-            self.counts["send_errors" if error else "datagrams_sent", deadman.plan.route, endpoint] += 1
-            if error:
-                self.events.append(("error", deadman.plan.route, endpoint, error))
+    def _send_all(self, deadman: Deadman) -> dict[str, list[int]]:
+        errors = {endpoint: [self._send(endpoint, each) for each in all_] for endpoint, all_ in deadman.outlets.items()}
+        for endpoint, each in errors.items():
+            for error in each:
+                self.counts["send_errors" if error else "datagrams_sent", deadman.plan.route, endpoint] += 1
+                if error:
+                    self.events.append(("error", deadman.plan.route, endpoint, error))
         return errors
 
     def _send(self, endpoint: str, data: bytes) -> int:

@@ -197,7 +197,7 @@ class Setting:
             ttl={route: ms * MS for route, ms in ttl.items() if ms is not None},
             bandwidths={name: bandwidth for name, bandwidth in bandwidths.items() if bandwidth is not None},
             timeouts={"part": self.collect * MS},
-            deadmen={"drive": DeadmanPlan("drive", timeout * MS, repeat * MS, (("wheels", BRAKE),))},
+            deadmen={"drive": DeadmanPlan("drive", timeout * MS, repeat * MS, (("wheels", (BRAKE,)),))},
         )
 
 

@@ -178,7 +178,6 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (GOOD, "    source: sensor_board\n", "", "imu_info", 'Missing property "source"'),
         (GOOD, "ignore: nobody", "source: any, ignore: nobody", "source: any", "is not allowed with 'ignore'"),
         (GOOD, "max_rate: 20 Hz, ", "", "on_limit: latest", "needs 'max_rate'"),
-        (GOOD, "{manual_brake: {", "{arm_ctrl: {}, manual_brake: {", "send", "more properties than limit of 1"),
         (GOOD, "{none: nothing moves because of it}", "500ms", "deadman: 500ms", "{none: why} if there is none"),
         (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "allowed only if the source is a topic"),
         (GOOD, "for_each: detections", "collect: {}", "collect: {}", "it is not allowed if the source is a topic"),

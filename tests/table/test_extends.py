@@ -59,19 +59,27 @@ routes:
 
 
 @pytest.mark.parametrize(
-    ("send", "case", "fields"),
+    ("send", "sent"),
     [
-        ("{manual_brake: {brake: false}}", "manual_brake", {"brake": "false", "by.who": "'router'"}),
-        ("{drive_motor: {speed: 0}}", "drive_motor", {"speed": "0"}),
+        ("{manual_brake: {brake: false}}", ["manual_brake {brake: false, by.who: 'router'}"]),
+        ("{drive_motor: {speed: 0}}", ["drive_motor {speed: 0}"]),
+        ("{drive_motor: {}, manual_brake: {brake: false}}", ["drive_motor", "manual_brake {brake: false}"]),
     ],
 )
-def test_a_deadman_merges_but_for_the_payload_of_another_case(
-    base: Path, send: str, case: str, fields: dict[str, str]
-) -> None:
+def test_a_deadman_merges_but_for_payloads_of_other_cases(base: Path, send: str, sent: list[str]) -> None:
     table = good(base, f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {send}}}}}\n")
     [deadman] = [route.deadman for route in table.routes if route.deadman]
-    assert (deadman.timeout.value, deadman.case.value) == (300_000_000, case)
-    assert {".".join(entry.path): entry.value.text for entry in deadman.fields.entries} == fields
+    assert deadman.timeout.value == 300_000_000
+    assert [*map(str, deadman.payloads)] == sent
+
+
+def test_payloads_in_another_order_replace_those_below(base: Path) -> None:
+    first = "{manual_brake: {brake: true}, drive_motor: {speed: 0}}"
+    (base / "both.yaml").write_text(f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {first}}}}}\n")
+    send = "{drive_motor: {}, manual_brake: {}}"
+    table = good(base, f"extends: both.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {send}}}}}\n")
+    [deadman] = [route.deadman for route in table.routes if route.deadman]
+    assert [*map(str, deadman.payloads)] == ["drive_motor", "manual_brake"]
 
 
 def test_a_reason_takes_the_place_of_a_deadman(base: Path) -> None:

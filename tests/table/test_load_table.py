@@ -73,8 +73,8 @@ ROUTES = {
         "destinations.0.endpoint": "sensor_board", "destinations.0.max_rate": "20 Hz",
         "destinations.0.on_limit": "latest",
         "priority": "command", "ttl": "200 ms", "deadman.timeout": "300 ms", "deadman.repeat": "100 ms",
-        "deadman.at_start": "send", "deadman.case": "manual_brake",
-        "deadman.fields": "{brake: true, by.who: 'router'}", "deadman.to": "sensor_board, basestation",
+        "deadman.at_start": "send", "deadman.send": "manual_brake {brake: true, by.who: 'router'}",
+        "deadman.to": "sensor_board, basestation",
         "deadman.disarmed_by": "arm_target",
     },
     "detected_object_from_ros": {
@@ -102,7 +102,8 @@ def test_a_payload_of_defaults_and_a_repeat_of_its_own_are_taken(tmp_path: Path)
     text = text.replace("300 ms, send", "300 ms, repeat: 20ms, send").replace(",\n      disarmed_by: [arm_target]", "")
     deadman = route(good(tmp_path, text), "manual_drive").deadman
     assert deadman
-    assert (deadman.repeat.value, deadman.fields.entries, deadman.disarmed_by) == (20_000_000, (), None)
+    assert (deadman.repeat.value, [*map(str, deadman.payloads)]) == (20_000_000, ["manual_brake"])
+    assert deadman.disarmed_by is None
 
 
 def test_names_of_routes_differ_whatever_cases_are_called(tmp_path: Path) -> None:

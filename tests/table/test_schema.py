@@ -72,7 +72,7 @@ MODELS: list[tuple[str, type, set[str]]] = [
     ("topic", Topic, set()),
     ("qos", Qos, set()),
     ("route", Route, {"case", "no_deadman", "source_topics"}),
-    ("deadman", Deadman, {"case", "fields"}),
+    ("deadman", Deadman, set()),
     ("collect", Collect, set()),
     ("gateway", Gateway, {"address", "zenoh"}),
     ("zenoh", ZenohSettings, set()),
@@ -80,7 +80,7 @@ MODELS: list[tuple[str, type, set[str]]] = [
     ("inbound_deadman", InboundDeadman, set()),
 ]
 """Definitions, the classes that declare their keys, and which of the fields are no keys of their own."""
-WITHIN = {("deadman", "send"), ("deadman", "none"), ("gateway", "ignore"), ("route", "topic")}
+WITHIN = {("deadman", "none"), ("gateway", "ignore"), ("route", "topic")}
 """Keys that are read with the mapping that they stand in."""
 
 

@@ -24,7 +24,7 @@ def changes() -> list[Change]:
 @pytest.fixture
 def board(wire: Wire, changes: list[Change]) -> Board:
     """Commands are `plain`; the deadman's `every_kind` with `i32` 1 holds for 0.3 s."""
-    stop = Stop("every_kind", payload(wire.case("every_kind"), ["i32=1"]), hold=0.3)
+    stop = Stop("every_kind", payload(wire.case("every_kind"), ["i32=1"]), hold=0.3, text="every_kind i32=1")
     return Board("board", {"plain"}, [stop], changes.append)
 
 
@@ -76,12 +76,14 @@ def test_a_deadman_that_dies_and_what_is_neither_command_nor_stop_keep_no_board_
 def test_only_boards_that_are_told_something_play_one_and_know_what_deadmen_send(
     wire: Wire, table: RouteTable, changes: list[Change]
 ) -> None:
-    datagram = wire.encode(wire.case("every_kind"), payload(wire.case("every_kind"), ["i32=1"]))
-    plan = DeadmanPlan("plain", timeout=500_000_000, repeat=100_000_000, datagrams=(("board", datagram),))
+    case = wire.case("every_kind")
+    datagrams = tuple(wire.encode(case, payload(case, words)) for words in ([], ["i32=1"]))
+    plan = DeadmanPlan("plain", timeout=500_000_000, repeat=100_000_000, datagrams=(("board", datagrams),))
     [board] = boards(wire, table, [plan], changes.append).values()
     board.take(0.0, decoded(wire, "every_kind", "i32=1"))
     board.take(0.31, decoded(wire, "plain"))
     assert [(change.board, change.state) for change in changes] == [("board", State.HALTED), ("board", State.OBEYING)]
+    assert changes[0].text == "halted by a deadman: every_kind (all default), every_kind i32=1"
 
 
 def part(frame_id: int, total_count: int, index: int) -> SimpleNamespace:

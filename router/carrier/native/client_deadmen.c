@@ -26,16 +26,17 @@ struct client_deadmen {
     struct publishing publishing;
     /* For the thread: */
     bool has_message;              /* the machine's output is the message of a served deadman */
-    struct deadman_destination to; /* its destination; `datagram` is not used, as the deadman may be closed */
+    struct deadman_destination to; /* its destination; `datagrams` is not used, as the deadman may be closed */
 };
 
 /* ---- with the lock held ---- */
 
-/* Keep the datagram of a deadman as the output of the machine. Only one deadman is served at a time. */
-static int keep_message(struct stage *stage, const struct deadman_destination *to) {
+/* Keep the only datagram of a deadman as the output of the machine. Only one deadman is served at a time. */
+static int keep_message(struct stage *stage, const struct deadman_destination *to,
+                        const struct deadman_datagram *datagram) {
     struct client_deadmen *of = (struct client_deadmen *)stage;
     stage->machine.output.size = 0;
-    if (!append(&stage->machine.output, to->datagram, to->size)) return ENOMEM;
+    if (!append(&stage->machine.output, datagram->data, datagram->size)) return ENOMEM;
     of->to = *to;
     of->has_message = true;
     return BRAKE_LATER;

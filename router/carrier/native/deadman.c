@@ -50,19 +50,28 @@ static void report_error(struct timers *timers, const struct deadman *deadman, c
     report_with(timers, (struct deadman_event){0, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, why);
 }
 
-/* Send the datagrams. Return a bit for each of the first 64 destinations reached. A refused one counts as sent: a receiver
- * that refuses it does not execute earlier commands either. */
+/* Send a datagram. Return whether it was sent; if not, `is_kept_back` says whether it is worth another attempt. A refused
+ * one is not: a receiver that refuses it does not execute earlier commands either. */
+static bool send_one(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to,
+                     const struct deadman_datagram *datagram) {
+    int error = timers->stage->brake(timers->stage, to, datagram);
+    if (error == BRAKE_LATER) return false;
+    stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
+    deadman->is_kept_back |= error && error != ECONNREFUSED;
+    if (error) report_error(timers, deadman, to, error, "");
+    return !error;
+}
+
+/* Send the datagrams. Return a bit for each of the first 64 destinations that all of theirs have reached. */
 static uint64_t send_all(struct timers *timers, struct deadman *deadman) {
     uint64_t reached = 0;
     deadman->is_kept_back = false;
     for (uint32_t index = 0; index < deadman->count; index++) {
         const struct deadman_destination *to = &deadman->destinations[index];
-        int error = timers->stage->brake(timers->stage, to);
-        if (error == BRAKE_LATER) continue;
-        stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
-        deadman->is_kept_back |= error && error != ECONNREFUSED;
-        if (error) report_error(timers, deadman, to, error, "");
-        else if (index < MOST_REACHED) reached |= (uint64_t)1 << index;
+        bool is_reached = index < MOST_REACHED;
+        for (uint32_t each = 0; each < to->count; each++)
+            is_reached &= send_one(timers, deadman, to, &to->datagrams[each]);
+        if (is_reached) reached |= (uint64_t)1 << index;
     }
     return reached;
 }
@@ -195,19 +204,28 @@ static void take_over(struct timers *timers, struct deadman *next, struct deadma
 struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t repeat, bool starts, uint32_t active,
                              uint32_t trips, uint32_t id, const struct deadman_destination *destinations,
                              uint32_t count) {
-    size_t datagrams = 0;
-    for (uint32_t index = 0; index < count; index++) datagrams += destinations[index].size;
-    struct deadman *deadman = calloc(1, sizeof *deadman + count * sizeof *destinations + datagrams);
+    size_t datagrams = 0, bytes = 0;
+    for (uint32_t index = 0; index < count; index++)
+        for (uint32_t each = 0; each < destinations[index].count; each++, datagrams++)
+            bytes += destinations[index].datagrams[each].size;
+    size_t own = sizeof(struct deadman) + count * sizeof *destinations;
+    struct deadman *deadman = calloc(1, own + datagrams * sizeof(struct deadman_datagram) + bytes);
     if (!deadman) return NULL;
     *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER}, .acting = deadman, .timeout = timeout,
                                 .repeat = repeat, .starts = starts, .active = active, .trips = trips, .id = id,
                                 .count = count, .greets_again = NEVER};
     deadman->fellow = deadman;
-    uint8_t *copy = (uint8_t *)&deadman->destinations[count];
+    struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->destinations[count];
+    uint8_t *data = (uint8_t *)(copy + datagrams);
     for (uint32_t index = 0; index < count; index++) {
-        deadman->destinations[index] = destinations[index];
-        deadman->destinations[index].datagram = memcpy(copy, destinations[index].datagram, destinations[index].size);
-        copy += destinations[index].size;
+        const struct deadman_destination *from = &destinations[index];
+        deadman->destinations[index] = *from;
+        deadman->destinations[index].datagrams = copy;
+        for (uint32_t each = 0; each < from->count; each++, copy++) {
+            *copy = (struct deadman_datagram){memcpy(data, from->datagrams[each].data, from->datagrams[each].size),
+                                              from->datagrams[each].size};
+            data += copy->size;
+        }
     }
     pthread_mutex_lock(&timers->lock);
     timers_add(timers, &deadman->timer);

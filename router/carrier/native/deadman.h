@@ -1,4 +1,4 @@
-/* Deadmen: timers that send a prepared datagram when the commands of a route stop.
+/* Deadmen: timers that send prepared datagrams when the commands of a route stop.
  *
  * Unarmed: no command was sent yet, or another route has taken over; nothing is due.
  * Armed:   trips `timeout` after the last command was sent.
@@ -20,10 +20,16 @@
 #include "sender.h"
 #include "timers.h"
 
+struct deadman_datagram {
+    const uint8_t *data;
+    uint32_t size;
+};
+
 struct deadman_destination {
     struct sender *sender;
-    const uint8_t *datagram; /* `deadman_open` copies it, and the list of destinations */
-    uint32_t size;
+    /* Sent in this order. `deadman_open` copies them, and the list of destinations. */
+    const struct deadman_datagram *datagrams;
+    uint32_t count;
     uint32_t sent, send_errors; /* counters */
     uint32_t id;                /* in events */
     const void *publisher;      /* rcl_publisher_t of the topic, for a gateway's deadman, which has no sender */

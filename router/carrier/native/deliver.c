@@ -235,9 +235,10 @@ static int send_by_socket(struct stage *stage, const struct target *target, cons
     return command_send(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
 }
 
-static int brake_by_socket(struct stage *stage, const struct deadman_destination *to) {
+static int brake_by_socket(struct stage *stage, const struct deadman_destination *to,
+                           const struct deadman_datagram *datagram) {
     (void)stage;
-    return sender_send_checked(to->sender, to->datagram, to->size);
+    return sender_send_checked(to->sender, datagram->data, datagram->size);
 }
 
 bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers) {

@@ -118,8 +118,8 @@ struct stage {
     int64_t (*now)(struct stage *stage);
     /* Send as `command_send` does. The caller has just checked the age. */
     int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
-    /* Send the datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
-    int (*brake)(struct stage *stage, const struct deadman_destination *to);
+    /* Send a datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
+    int (*brake)(struct stage *stage, const struct deadman_destination *to, const struct deadman_datagram *datagram);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. ABANDONED: the thread was
      * stuck in the middleware and has been abandoned: it must not use anything that belongs to others. */
     enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);

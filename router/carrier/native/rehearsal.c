@@ -78,8 +78,9 @@ static int send_nowhere(struct stage *stage, const struct target *target, const 
     return 0;
 }
 
-static int brake_nowhere(struct stage *stage, const struct deadman_destination *to) {
-    note_output(stage, RECORD_BRAKED, to->id, to->datagram, to->size);
+static int brake_nowhere(struct stage *stage, const struct deadman_destination *to,
+                         const struct deadman_datagram *datagram) {
+    note_output(stage, RECORD_BRAKED, to->id, datagram->data, datagram->size);
     return 0;
 }
 

@@ -54,8 +54,10 @@ static void close_board(struct board board) {
 }
 
 static struct deadman *open_deadman(bool has_spare) {
-    struct deadman_destination to[] = {{drive.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 7},
-                                       {spare.sender, (const uint8_t *)&brake, sizeof brake, SENT, ERRORS, 8}};
+    struct deadman_datagram datagram = {(const uint8_t *)&brake, sizeof brake};
+    struct deadman_destination to[] = {
+        {.sender = drive.sender, .datagrams = &datagram, .count = 1, .sent = SENT, .send_errors = ERRORS, .id = 7},
+        {.sender = spare.sender, .datagrams = &datagram, .count = 1, .sent = SENT, .send_errors = ERRORS, .id = 8}};
     return deadman_open(timers, TIMEOUT, REPEAT, true, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
 }
 

@@ -38,7 +38,8 @@ static struct error_text error_of(void) { return (struct error_text){"it refuses
 static void forget_error(void) {}
 
 static struct deadman *opened(int topic) {
-    struct deadman_destination to = {.datagram = (const uint8_t *)"stop", .size = 4, .sent = SENT, .send_errors = ERRORS,
+    struct deadman_datagram stop = {(const uint8_t *)"stop", 4};
+    struct deadman_destination to = {.datagrams = &stop, .count = 1, .sent = SENT, .send_errors = ERRORS,
                                      .publisher = &acting[topic]};
     struct deadman *made = deadman_open(client_deadmen_group(clients), 500000, 100000, true, ACTIVE, TRIPS, 1, &to, 1);
     assert(made);

@@ -51,7 +51,8 @@ int main(void) {
     struct sender *sender = sender_open(pair[0], -1, 0, 0);
     struct ring *events = ring_open(1 << 12);
     struct timers *timers = timers_open(braked, NULL);
-    struct deadman_destination braking = {.sender = sender, .datagram = MESSAGE, .size = 1, .sent = 2, .send_errors = 3};
+    struct deadman_datagram brake = {MESSAGE, 1};
+    struct deadman_destination braking = {.sender = sender, .datagrams = &brake, .count = 1, .sent = 2, .send_errors = 3};
     struct deadman *deadman = deadman_open(timers, 1000, 1000000, true, 0, 1, 0, &braking, 1);
     struct feed feed = {deadman, 0, 0};
     struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,

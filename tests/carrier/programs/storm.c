@@ -152,7 +152,9 @@ static void make_route(struct made *made, int index) {
 }
 
 static struct deadman *open_deadman(void) {
-    struct deadman_destination to = {senders[0], (const uint8_t *)"brake", 5, BRAKES, BRAKE_ERRORS, 0};
+    struct deadman_datagram brake = {(const uint8_t *)"brake", 5};
+    struct deadman_destination to = {
+        .sender = senders[0], .datagrams = &brake, .count = 1, .sent = BRAKES, .send_errors = BRAKE_ERRORS};
     return deadman_open(timers, 2000000, 500000, true, ACTIVE, TRIPS, 1, &to, 1);
 }
 
