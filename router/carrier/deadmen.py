@@ -120,11 +120,22 @@ def destinations_of(
             sent=counters.index("deadman_datagrams_sent", plan.route, name),
             send_errors=counters.index("deadman_send_errors", plan.route, name),
             id=names.number(name),
+            follows=name in plan.following,
             **{kind: outlet.address},
         )
         for (name, datagrams), outlet in zip(plan.datagrams, outlets, strict=True)
     ]
     return (c.DeadmanDestination * len(made))(*made), len(made)
+
+
+def feed_of(plan: DeadmanPlan, deadman: Addressed, endpoint: str, *, disarms: bool) -> c.Feed:
+    """Return the effect on a deadman of each command to an endpoint.
+
+    A command to an endpoint that the deadman does not send to arms all that it sends to.
+    """
+    endpoints = [name for name, _ in plan.datagrams]
+    armed = [endpoint] if endpoint in endpoints else endpoints
+    return c.Feed(deadman=deadman.address, to=sum(1 << endpoints.index(each) for each in armed), disarms=disarms)
 
 
 def datagrams_of(datagrams: Collection[bytes]) -> ctypes.Array[c.DeadmanDatagram]:

@@ -140,7 +140,7 @@ def _plain(argument: object) -> object:
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), [_bytes(datagram) for datagram in each.datagrams[: each.count]], each.sent,
-             each.send_errors, each.id)
+             each.send_errors, each.id, each.follows)
             for each in argument
         ]  # fmt: skip
     if isinstance(argument, int) and argument >= _FIRST:

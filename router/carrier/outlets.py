@@ -9,12 +9,12 @@ from typing import Any, Protocol
 
 from router import declared as c
 from router.carrier.boards import NativeBoards
-from router.carrier.deadmen import DeadmanGroup, NativeDeadman
+from router.carrier.deadmen import DeadmanGroup, NativeDeadman, feed_of
 from router.carrier.deferrals import Adoption
 from router.carrier.limits import period
 from router.carrier.names import Names
 from router.carrier.state import Native, State
-from router.compiler.program import Program, RoutePlan, TargetPlan
+from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
 from router.net.udp import Listener
 
 
@@ -38,8 +38,8 @@ class Publication(Addressed, Protocol):
 class Outlets:
     """The open sockets and topics of a program. `state` is that of its targets, passed on by key at a reload.
 
-    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` by route. Without `boards`, no limits
-    of boards are checked.
+    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` and their plans by route. Without
+    `boards`, no limits of boards are checked.
     """
 
     library: ctypes.CDLL
@@ -49,6 +49,7 @@ class Outlets:
     senders: Mapping[str, Addressed]
     publications: Mapping[str, Publication]
     deadmen: Mapping[str, NativeDeadman]
+    deadman_plans: Mapping[str, DeadmanPlan]
     bandwidths: Mapping[str, int]
     boards: NativeBoards | None = None
 
@@ -73,13 +74,17 @@ class Outlets:
             senders=senders,
             publications=publications,
             deadmen={plan.route: group.get_or_open(plan, program.counters, senders, state) for plan in program.deadmen},
+            deadman_plans={plan.route: plan for plan in program.deadmen},
             bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=boards,
         )
 
     def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
         """Return the deadmen that commands of the route feed (its own) or disarm."""
-        return [c.Feed(deadman=self.deadmen[name].address, disarms=name != plan.route) for name in target.deadmen]
+        return [
+            feed_of(self.deadman_plans[name], self.deadmen[name], target.label, disarms=name != plan.route)
+            for name in target.deadmen
+        ]
 
     def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:
         """Return the limit of a target with `max_rate` for one source of its route."""

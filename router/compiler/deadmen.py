@@ -10,21 +10,21 @@ from dataclasses import replace
 
 from router.compiler.constants import computed, envelope_of, scalars
 from router.compiler.expressions.functions import NS_PER_SECOND
+from router.compiler.feeds import feeding, require_hand_over, successors
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
-from router.errors import Code, Diagnostic, Located, MappingError, SourceSpan, did_you_mean
+from router.declared import MOST_DESTINATIONS
+from router.errors import Code, Diagnostic, Located, MappingError, SourceSpan
 from router.table.model import (
     DEFAULT_REPEAT,
     Deadman,
-    Destination,
     FieldMap,
     InboundDeadman,
     OnLimit,
     Payload,
     Route,
-    RouteTable,
 )
 from router.table.units import duration
 from router.types.framing import trimmed
@@ -48,16 +48,23 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
         _require_deadman(lookup, route)
         return None
     _require_commands(lookup, route, deadman)
-    disarmed_by = _successors(lookup, route, deadman)
+    disarmed_by = successors(lookup, route, deadman)
+    if len(deadman.to) > MOST_DESTINATIONS:
+        message = f"a deadman sends to at most {MOST_DESTINATIONS} endpoints, not {len(deadman.to)}"
+        lookup.report(deadman.to[0].span, Code.BAD_VALUE, message, "divide them among several routes")
+        return None
     sent = [_datagram(lookup, deadman, payload) for payload in deadman.payloads]
     datagrams = [each for each in sent if each is not None]
     if len(datagrams) < len(sent):
         return None
+    commanded = {each.endpoint.value for each in route.destinations}
+    others = frozenset(to.value for to in deadman.to) - commanded
+    following = others if len(others) < len(deadman.to) else frozenset()
     trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
     by_endpoint = [
         (to.value, tuple(trimmed(each) if to.value in trims else each for each in datagrams)) for to in deadman.to
     ]
-    return deadman_plan(route.name, deadman, by_endpoint, disarmed_by)
+    return replace(deadman_plan(route.name, deadman, by_endpoint), following=following, disarmed_by=disarmed_by)
 
 
 def _require_deadman(lookup: Lookup, route: Route) -> None:
@@ -84,7 +91,7 @@ def _require_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     lookup.findings += timing_findings(deadman, None if are_late else route.ttl, max_rate, "datagrams")
     if deadman.because is None:
         _require_all_boards(lookup, route, deadman)
-        _require_hand_over(lookup, route, deadman)
+        require_hand_over(lookup, route, deadman)
 
 
 def timing_findings(
@@ -142,33 +149,6 @@ def _require_all_boards(lookup: Lookup, route: Route, deadman: Deadman) -> None:
             return
 
 
-def _require_hand_over(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """Report routes with a deadman whose commands to a board this deadman would interrupt."""
-    if deadman.disarmed_by == ():
-        return
-    boards = [to.value for to in deadman.to if to.value in lookup.boards]
-    forgotten: dict[str, str] = {}
-    for other in lookup.table.routes:
-        shared = [to.endpoint.value for to in other.destinations if to.endpoint.value in boards]
-        if shared and other.deadman and other.name != route.name and not takes_over(other, shared[0], route):
-            forgotten.setdefault(other.case.value, shared[0])
-    if not forgotten:
-        return
-    case, board = next(iter(forgotten.items()))
-    named = [name.value for name in deadman.disarmed_by or ()]
-    message = f"the deadman would interrupt commands of '{case}', which '{board}' also receives"
-    # Commands to another motor must not disarm this deadman: it would stay silent as long as they arrive.
-    beside = "`because: why`" if named else "`disarmed_by: []`"
-    cases = ", ".join((*named, *forgotten))
-    value = f"[{cases}]" if "," in cases else cases
-    hint = (
-        f"add `disarmed_by: {value}` if they take over from '{route.case.value}', or {beside} if they move other motors"
-    )
-    lookup.report(
-        deadman.disarmed_by[0].span if deadman.disarmed_by else deadman.span, Code.DOUBTFUL_DEADMAN, message, hint
-    )
-
-
 def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> bool:
     """Report commands that may be sent after the timeout and undo the deadman. Return whether there are any."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
@@ -182,36 +162,6 @@ def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> boo
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
             return True
     return False
-
-
-def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
-    """Return the routes whose commands disarm the deadman. Report cases in `disarmed_by` without such a route."""
-    table = lookup.table
-    found = [
-        each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
-    ]
-    served = {each.case.value for each in found}
-    served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-    are_known = all(to.value in table.endpoints for to in deadman.to)  # otherwise there is a finding already
-    for name in deadman.disarmed_by or ():
-        if name.value not in lookup.envelope.cases:
-            message = f"{lookup.envelope.name} has no payload case '{name.value}'"
-            hint = did_you_mean(name.value, _commanding(table, route, deadman) or lookup.envelope.cases)
-            lookup.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
-        elif name.value not in served and are_known:
-            to = " or ".join(f"'{to.value}'" for to in deadman.to)
-            message = f"no other route sends '{name.value}' to {to}, so it cannot disarm this deadman"
-            nobody = f"remove it: no other route sends commands to {to}"
-            hint = did_you_mean(name.value, _commanding(table, route, deadman)) or nobody
-            lookup.report(name.span, Code.BAD_VALUE, message, hint)
-    return tuple(each.name for each in found)
-
-
-def _commanding(table: RouteTable, route: Route, deadman: Deadman) -> set[str]:
-    """Return the payload cases of other routes to the endpoints of the deadman."""
-    stopped = {to.value for to in deadman.to}
-    others = [each for each in table.routes if each.name != route.name]
-    return {each.case.value for each in others if stopped & {to.endpoint.value for to in each.destinations}}
 
 
 def _datagram(lookup: Lookup, deadman: Deadman, payload: Payload) -> bytes | None:
@@ -253,13 +203,10 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, made: Record
 
 
 def deadman_plan(
-    name: str,
-    settings: Deadman | InboundDeadman,
-    datagrams: Iterable[tuple[str, tuple[bytes, ...]]],
-    disarmed_by: tuple[str, ...] = (),
+    name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, tuple[bytes, ...]]]
 ) -> DeadmanPlan:
     timeout, repeat = settings.timeout.value, settings.repeat.value
-    return DeadmanPlan(name, timeout, repeat, tuple(datagrams), settings.at_start, disarmed_by)
+    return DeadmanPlan(name, timeout, repeat, tuple(datagrams), settings.at_start)
 
 
 def constant_plan(
@@ -274,31 +221,3 @@ def constant_plan(
     findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
     lookup.findings += findings
     return None if findings else mapping.plan
-
-
-def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[str, ...]:
-    """Return the routes whose deadmen each command to `destination` feeds or disarms, its own route first."""
-    disarmed = lookup.disarmed.get(route.case.value, ())
-    others = [other.name for other in disarmed if takes_over(route, destination.endpoint.value, other)]
-    feeds_own = route.deadman is not None and destination in feeding(route, route.deadman)
-    return (route.name, *others) if feeds_own else tuple(others)
-
-
-def feeding(route: Route, deadman: Deadman) -> list[Destination]:
-    """Return the destinations whose commands feed a route's own deadman: those that the deadman stops.
-
-    If the route does not send to any of these, return all of its destinations.
-    """
-    stopped = {to.value for to in deadman.to}
-    return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)
-
-
-def takes_over(route: Route, endpoint: str, other: Route) -> bool:
-    """Return whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
-    deadman = other.deadman
-    return (
-        deadman is not None
-        and other.name != route.name
-        and route.case.value in [case.value for case in deadman.disarmed_by or ()]
-        and endpoint in [to.value for to in deadman.to]
-    )

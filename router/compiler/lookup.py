@@ -83,12 +83,16 @@ class Lookup:
 
     @cached_property
     def disarmed(self) -> Mapping[str, Sequence[Route]]:
-        """The routes whose deadman names a payload case in `disarmed_by`, by case."""
+        """The routes whose deadman names a payload case or a route in `disarmed_by`, by that name."""
         found: dict[str, list[Route]] = {}
         for route in self.table.routes:
-            for case in {each.value for each in (route.deadman and route.deadman.disarmed_by) or ()}:
-                found.setdefault(case, []).append(route)
+            for name in {each.value for each in (route.deadman and route.deadman.disarmed_by) or ()}:
+                found.setdefault(name, []).append(route)
         return found
+
+    @cached_property
+    def routes(self) -> Mapping[str, Route]:
+        return {route.name: route for route in self.table.routes}
 
     def case(self, name: Located[str]) -> PayloadCase | None:
         found = self.envelope.cases.get(name.value)

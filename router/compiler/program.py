@@ -83,7 +83,8 @@ class DeadmanPlan:
     """A route's deadman: the datagrams that are sent if no fresh command was sent for `timeout` (all times in ns).
 
     `datagrams` are by endpoint, in the order of sending. With `at_start`, they are also sent when the router starts.
-    `disarmed_by` are names of routes, not the payload cases of the table.
+    Endpoints in `following` get no commands from the route, and are armed and disarmed with the others. `disarmed_by`
+    are names of routes, not the payload cases of the table.
     """
 
     route: str
@@ -91,6 +92,7 @@ class DeadmanPlan:
     repeat: int
     datagrams: tuple[tuple[str, tuple[bytes, ...]], ...]
     at_start: bool = True
+    following: frozenset[str] = frozenset()
     disarmed_by: tuple[str, ...] = field(default=(), compare=False)
 
 

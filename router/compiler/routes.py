@@ -6,12 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.deadmen import check_deadman, deadmen_of
+from router.compiler.deadmen import check_deadman
 from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.scope import field_of
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
+from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.topics import qos_findings, resolved, topic_name_finding

@@ -110,9 +110,9 @@ class HeadStart:
         if not isinstance(argument, list):
             return argument
         made = (c.DeadmanDestination * len(argument))()
-        for to, (sender, datagrams, sent, send_errors, number) in zip(made, argument, strict=True):
+        for to, (sender, datagrams, sent, send_errors, number, follows) in zip(made, argument, strict=True):
             to.sender, to.datagrams, to.count = self._argument(sender, parts), datagrams_of(datagrams), len(datagrams)
-            to.sent, to.send_errors, to.id = sent, send_errors, number
+            to.sent, to.send_errors, to.id, to.follows = sent, send_errors, number, follows
         return made
 
     def _symbols(self, parts: Mapping[str, Any]) -> list[tuple[tuple[str | None, ...], int]]:

@@ -18,13 +18,14 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from struct import Struct
 from typing import cast
+from weakref import WeakKeyDictionary
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router import declared as c
-from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.deadmen import Deadmen, NativeDeadman, feed_of
 from router.carrier.names import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
@@ -98,11 +99,14 @@ class NativeSide:
         self._counters = counters
         self._outlets = {endpoint: Outlet(library, stack) for endpoint in PAYLOADS}
         self._names = Names()
+        self._plans: WeakKeyDictionary[NativeDeadman, DeadmanPlan] = WeakKeyDictionary()
         self._ring = Ring(library, event_bytes)
         self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
-        return self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
+        made = self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
+        self._plans[made] = plan
+        return made
 
     def replace(self, later: NativeDeadman, earlier: NativeDeadman) -> None:
         later.replace(earlier)
@@ -111,16 +115,20 @@ class NativeSide:
     def remove(self, deadman: NativeDeadman) -> None:
         deadman.end()
 
-    def command(self, now: int, feeds: list[tuple[NativeDeadman, bool]], data: bytes) -> None:
-        array = (c.Feed * len(feeds))(*(c.Feed(deadman.address, disarms) for deadman, disarms in feeds))
-        to, deadmen = self._outlets["wheels"].address, self.deadmen.address
+    def command(self, now: int, feeds: list[tuple[NativeDeadman, bool]], data: bytes, endpoint: str = "wheels") -> None:
+        array = self._feeds(feeds, endpoint)
+        to, deadmen = self._outlets[endpoint].address, self.deadmen.address
         self._library.command_send_at(deadmen, to, data, len(data), NEVER, array, len(feeds), now)
+
+    def _feeds(self, feeds: Sequence[tuple[NativeDeadman, bool]], endpoint: str) -> ctypes.Array[c.Feed]:
+        made = [feed_of(self._plans[each], each, endpoint, disarms=disarms) for each, disarms in feeds]
+        return (c.Feed * len(feeds))(*made)
 
     def commander(
         self, outlet: Outlet, feeds: Sequence[tuple[NativeDeadman, bool]]
     ) -> Callable[[bytes, int | None], int]:
         """Return what sends a command that may expire, and returns its size. True: the deadman is disarmed."""
-        array = (c.Feed * len(feeds))(*(c.Feed(deadman.address, disarms) for deadman, disarms in feeds))
+        array = self._feeds(feeds, "wheels")
         send, deadmen, to = self._library.command_send, self.deadmen.address, outlet.address
 
         def command(data: bytes, expires: int | None) -> int:
@@ -172,19 +180,23 @@ class NativeSide:
 
 
 plans = st.builds(
-    lambda timeout, repeat, endpoints, at_start: (timeout, repeat, sorted(endpoints), at_start),
+    lambda timeout, repeat, endpoints, at_start, following: (timeout, repeat, sorted(endpoints), at_start, following),
     st.integers(1, 50),
     st.integers(1, 20),
-    st.sets(st.sampled_from(list(PAYLOADS))),
+    st.sets(st.sampled_from(list(PAYLOADS)), min_size=1),
     st.booleans(),
+    st.integers(0, 2),
 )
 routes = st.sampled_from(["drive", "stop"])
 endpoints = st.sampled_from(list(PAYLOADS))
 chosen = st.tuples(routes, st.integers(0, 3))
 pauses = st.integers(0, 80) | st.sampled_from([GREETING, START_AGAIN - 1, START_AGAIN, START])
 steps = st.one_of(
-    st.tuples(st.just("command"), st.lists(st.tuples(routes, st.booleans(), st.integers(0, 3)), max_size=3)),
-    st.tuples(st.just("command"), st.just([("drive", False, 0)])),
+    st.tuples(
+        st.just("command"),
+        st.tuples(endpoints, st.lists(st.tuples(routes, st.booleans(), st.integers(0, 3)), max_size=3)),
+    ),
+    st.tuples(st.just("command"), st.tuples(endpoints, st.just([("drive", False, 0)]))),
     st.tuples(st.just("pass"), st.integers(0, 80)),
     st.tuples(st.just("pass"), pauses),
     st.tuples(st.just("replace"), st.tuples(routes, plans)),
@@ -198,6 +210,8 @@ steps = st.one_of(
     st.tuples(st.just("refuse"), endpoints),
 )
 
+Plan = tuple[int, int, list[str], bool, int]
+"""Timeout, repeat, endpoints, whether it sends at the start, how many of its later endpoints are never commanded."""
 Pair = tuple[oracle.Deadman, NativeDeadman]
 
 
@@ -210,14 +224,15 @@ class Comparison:
         self._native = NativeSide(library, seams, stack, self._counters)
         self._now = 0
         self._routes: dict[str, list[Pair]] = {"drive": [], "stop": []}
-        self._add("drive", (50, 10, ["wheels", "arm"], True))
-        self._add("stop", (20, 20, ["wheels"], True))
+        self._add("drive", (50, 10, ["wheels", "arm"], True, 0))
+        self._add("stop", (20, 20, ["wheels"], True, 0))
         for route in self._routes:
             self.do_await_subscribers((route, 0))
 
-    def _add(self, route: str, plan: tuple[int, int, list[str], bool]) -> Pair:
-        timeout, repeat, endpoints, at_start = plan
-        made = DeadmanPlan(route, timeout, repeat, tuple((each, PAYLOADS[each]) for each in endpoints), at_start)
+    def _add(self, route: str, plan: Plan) -> Pair:
+        timeout, repeat, endpoints, at_start, following = plan
+        datagrams = tuple((each, PAYLOADS[each]) for each in endpoints)
+        made = DeadmanPlan(route, timeout, repeat, datagrams, at_start, frozenset(endpoints[1:][:following]))
         pair = self._plain.add(made), self._native.add(made)
         self._routes[route].append(pair)
         return pair
@@ -239,18 +254,19 @@ class Comparison:
             assert self._native.counts[index] == count
         assert sum(self._native.counts) == sum(self._plain.counts.values())
 
-    def do_command(self, feeds: list[tuple[str, bool, int]]) -> None:
+    def do_command(self, arguments: tuple[str, list[tuple[str, bool, int]]]) -> None:
+        endpoint, feeds = arguments
         chosen = [(*self._chosen(route, age), disarms) for route, disarms, age in feeds]
         data = b"command %d" % self._now
-        self._plain.command(self._now, [(plain, disarms) for plain, _, disarms in chosen], "wheels", data)
-        self._native.command(self._now, [(native, disarms) for _, native, disarms in chosen], data)
+        self._plain.command(self._now, [(plain, disarms) for plain, _, disarms in chosen], endpoint, data)
+        self._native.command(self._now, [(native, disarms) for _, native, disarms in chosen], data, endpoint)
 
     def do_pass(self, time: int) -> None:
         self._now += time
         self._plain.serve(self._now)
         self._native.serve(self._now)
 
-    def do_replace(self, arguments: tuple[str, tuple[int, int, list[str], bool]]) -> None:
+    def do_replace(self, arguments: tuple[str, Plan]) -> None:
         route, plan = arguments
         (plain, native), (next_plain, next_native) = self._chosen(route, 0), self._add(route, plan)
         self._plain.replace(next_plain, plain)
@@ -301,9 +317,14 @@ class Comparison:
 
 
 @example(
-    steps=[("greet", ("stop", 0)), ("replace", ("stop", (20, 20, ["wheels"], True))), ("pass", 1), ("pass", GREETING)]
+    steps=[
+        ("greet", ("stop", 0)),
+        ("replace", ("stop", (20, 20, ["wheels"], True, 0))),
+        ("pass", 1),
+        ("pass", GREETING),
+    ]
 )
-@example(steps=[("replace", ("stop", (20, 20, ["wheels"], False))), ("greet", ("stop", 0))])
+@example(steps=[("replace", ("stop", (20, 20, ["wheels"], False, 0))), ("greet", ("stop", 0))])
 @given(steps=st.lists(steps, max_size=60))
 def test_they_give_the_same_answers(library: ctypes.CDLL, seams: ctypes.CDLL, steps: list[tuple[str, object]]) -> None:
     with ExitStack() as stack:

@@ -316,7 +316,7 @@ def test_a_brake_leaves_behind_the_last_command_and_commands_of_others_disarm_it
     serving.library.timers_serve(deadmen, boottime_ns() + SECOND)
     command, brake = board.received()
     assert of(command) == 1
-    assert brake == serving.program.deadmen[0].datagrams[0][1]
+    assert (brake,) == serving.program.deadmen[0].datagrams[0][1]
     serving.subscriptions["arm"].put(arm(1), wall_ns())
     wait_until(lambda: serving.count("messages_received", "arm_ctrl", "arm"))
     assert len(board.received()) == 2

@@ -145,6 +145,79 @@ def test_a_broken_route_is_not_blamed_for_what_it_would_take_over(check_text: Ch
     assert Code.BAD_VALUE not in {finding.code for finding in found}
 
 
+ROBOTS = """
+routes:
+  manual_drive:
+    - source: {{topic: a, type: std_msgs/msg/Int8}}
+      fields: {{forward_backward: data, turn: {first}}}
+      destinations: [board]
+      deadman: {{timeout: 500ms, send: {{manual_drive: {{}}}}{disarmed_by}}}
+    - source: {{topic: b, type: std_msgs/msg/Int8}}
+      fields: {{forward_backward: data, turn: {second}}}
+      destinations: [board]
+      deadman: {{timeout: 500ms, send: {{manual_drive: {{}}}}{of_second}}}
+"""
+FROM_SECOND, FROM_FIRST = "manual_drive_from_ros_2", "manual_drive_from_ros"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "hint"),
+    [
+        ("0", "1", "add `disarmed_by: []` if they move other motors, as 'turn' suggests"),
+        ("-1", "1 - 1", "add `disarmed_by: []` if they move other motors, as 'turn' suggests"),
+        ("1", "2 - 1", "add `disarmed_by: manual_drive_from_ros_2` if they take over"),
+        ("data", "1", "add `disarmed_by: manual_drive_from_ros_2` if they take over"),
+    ],
+)
+def test_routes_of_one_case_that_set_a_field_differently_move_different_things(
+    check_text: CheckText, first: str, second: str, hint: str
+) -> None:
+    """For example two robots behind one address, of which each has a number."""
+    table = ROBOTS.format(first=first, second=second, disarmed_by="", of_second=", disarmed_by: []")
+    [found] = [each for each in check_text(table).diagnostics if each.code is Code.DOUBTFUL_DEADMAN]
+    assert found.hint.startswith(hint)
+    assert FROM_SECOND in found.hint
+
+
+@pytest.mark.parametrize(
+    ("name", "disarms", "codes"),
+    [
+        (FROM_SECOND, [FROM_SECOND, FROM_FIRST], []),
+        ("manual_drive", [FROM_SECOND, FROM_FIRST], []),
+        (FROM_FIRST, [FROM_SECOND], [Code.BAD_VALUE, Code.DOUBTFUL_DEADMAN]),
+        ("manual_drive_from_ros_3", [FROM_SECOND], [Code.UNKNOWN_PAYLOAD_CASE, Code.DOUBTFUL_DEADMAN]),
+    ],
+)
+def test_routes_may_take_over_by_their_names(
+    check_text: CheckText, name: str, disarms: list[str], codes: list[Code]
+) -> None:
+    table = ROBOTS.format(first=0, second=0, disarmed_by=f", disarmed_by: {name}", of_second=", disarmed_by: []")
+    checked = check_text(table)
+    assert {each.code for each in checked.diagnostics} - {Code.UNCOVERED_PAYLOAD_CASE} == {*codes}
+    second = checked.routes[1].subscriptions[0].targets[0]
+    assert [second.deadmen] == [tuple(disarms)]
+
+
+def test_a_route_whose_deadman_leaves_the_board_alone_is_not_proposed_to_take_over(check_text: CheckText) -> None:
+    """Disarmed by its commands, no deadman would stop the board."""
+    arm = "timeout: 500ms, send: {manual_arm: {}}, to: tool, because: it is a test"
+    table = BESIDE.format(destinations="board", drive="", arm=arm)
+    [found] = [each for each in check_text(table, endpoints=THREE).diagnostics if each.code is Code.DOUBTFUL_DEADMAN]
+    assert found.hint == (
+        "add `disarmed_by: []` if they move other motors; if 'manual_arm' takes over from 'manual_drive', first add "
+        "'board' to `to` of its deadman, which does not stop it"
+    )
+
+
+def test_a_deadman_has_room_for_the_endpoints_that_it_stops(check_text: CheckText) -> None:
+    for count, codes in ((64, []), (65, [Code.BAD_VALUE])):
+        boards = [f"b{number}" for number in range(count)]
+        endpoints = ", ".join(f"{name}: {{address: 127.0.1.{at}:8, kind: board}}" for at, name in enumerate(boards))
+        table = ROUTE.format(destinations=", ".join(boards), deadman="{timeout: 500ms, send: {manual_brake: {}}}")
+        found = check_text(table, endpoints=f"{{{endpoints}, base: {{address: 127.0.0.3:9000, kind: basestation}}}}")
+        assert {each.code for each in found.diagnostics} - {Code.UNCOVERED_PAYLOAD_CASE} == {*codes}
+
+
 @pytest.mark.parametrize("value", ["brake", "message", "source == 'base'", "received_at > 0", "turn > 0", "has(turn)"])
 def test_payload_is_made_of_constants(check_text: CheckText, value: str) -> None:
     deadman = f'{{timeout: 500ms, send: {{manual_brake: {{brake: "{value}"}}}}, to: [board]}}'

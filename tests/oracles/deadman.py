@@ -2,8 +2,10 @@
 
 A deadman is in one of three states. *Unarmed*: no command was sent yet, or another route has taken over. *Armed*: it
 trips `timeout` after the last command. *Tripped*: it has sent when that was over, and repeats that on the grid of this
-time. A command arms it in any state, one of a route that it hands over to disarms it. A command that failed changes
-nothing, and one that left though an earlier one was refused arms an unarmed deadman and puts off nothing.
+time. Endpoints are armed one by one, and a deadman sends to those that are. A command arms the one that it goes to in
+any state, one of a route that it hands over to disarms it; endpoints that the route never commands go with the others.
+A command that failed changes nothing, and one that left though an earlier one was refused arms what is unarmed and puts
+off nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +26,9 @@ Event = tuple[str, str, str, int]
 class Deadman:
     plan: DeadmanPlan
     outlets: dict[str, tuple[bytes, ...]]
-    is_armed: bool = False
-    """Armed or tripped."""
+    armed: set[str] = field(default_factory=set)
+    unstarted: set[str] = field(default_factory=set)
+    """What gets the payloads of the start at the next attempt."""
     has_tripped: bool = False
     due: int | None = None
     greets_until: int = 0
@@ -36,6 +39,13 @@ class Deadman:
     @property
     def acting(self) -> Deadman:
         return self.successor.acting if self.successor else self
+
+    @property
+    def names(self) -> set[str]:
+        return {name for name, _ in self.plan.datagrams}
+
+    def with_followers(self, armed: set[str]) -> set[str]:
+        return armed | self.plan.following if armed - self.plan.following else armed
 
 
 @dataclass
@@ -66,13 +76,38 @@ class Deadmen:
         if error == errno.ENOTSOCK:
             return
         for named, disarms in feeds:
-            deadman = named.acting
-            if error:
-                if not disarms and not deadman.is_armed:
-                    deadman.is_armed, deadman.due = True, now + deadman.plan.timeout
-                continue
-            deadman.is_armed, deadman.due = not disarms, None if disarms else now + deadman.plan.timeout
+            if not (error and disarms):
+                self._feed(now, named, {endpoint} if endpoint in named.names else named.names, disarms, bool(error))
+
+    def _feed(self, now: int, named: Deadman, to: set[str], disarms: bool, is_refused: bool) -> None:
+        deadman = named.acting
+        if deadman is not named:
+            for each in self.deadmen:
+                if each.acting is deadman and each is not deadman:
+                    own = to & each.outlets.keys()
+                    each.armed = each.armed - own if disarms else each.armed | own
+            to &= deadman.names
+            if not to:
+                return
+        if disarms:
+            self._disarm(deadman, to)
+            return
+        if not (is_refused and deadman.armed):
+            deadman.due = now + deadman.plan.timeout
+        deadman.armed |= to | deadman.plan.following
+        if not is_refused:
             self._release(deadman)
+
+    def _disarm(self, deadman: Deadman, to: set[str]) -> None:
+        was_armed = bool(deadman.armed)
+        deadman.armed -= to
+        deadman.unstarted -= to
+        if deadman.armed - deadman.plan.following:
+            return
+        deadman.armed = set()
+        if was_armed or not deadman.unstarted:
+            deadman.due = None
+        self._release(deadman)
 
     def serve(self, now: int) -> None:
         for deadman in self.deadmen:
@@ -82,25 +117,30 @@ class Deadmen:
     def serve_one(self, deadman: Deadman, due: int, now: int) -> None:
         if deadman.ends_when_due:
             self.end(deadman)
-        elif not deadman.is_armed:
+        elif not deadman.armed:
             self._send_at_start(deadman, now)
         else:
             repeat, trips = deadman.plan.repeat, not deadman.has_tripped
             deadman.due = due + repeat * (1 + (now - due) // repeat)  # repeats missed by a stalled process are skipped
             deadman.has_tripped = True
             self.counts["trips", deadman.plan.route] += trips
-            self._send_all(deadman)
+            self._send_all(deadman, deadman.armed)
             if trips:
                 self._tell("tripped", deadman)
 
     def start(self, deadman: Deadman, now: int) -> list[str]:
         """Send the payload at the router's start, without changing the state. Return the endpoints reached."""
-        return self._send_at_start(deadman, now) if deadman.plan.at_start else []
+        if not deadman.plan.at_start:
+            return []
+        deadman.unstarted = {*deadman.outlets}
+        return self._send_at_start(deadman, now)
 
     def _send_at_start(self, deadman: Deadman, now: int) -> list[str]:
-        errors = self._send_all(deadman)
+        errors = self._send_all(deadman, deadman.unstarted)
         times = [deadman.greets_again]
-        if any({*each} - {0, errno.ECONNREFUSED} for each in errors.values()):
+        failed = {name for name, each in errors.items() if {*each} - {0, errno.ECONNREFUSED}}
+        deadman.unstarted = failed if deadman.greets_again is None else {*deadman.outlets}
+        if failed:
             times.append(now + START_AGAIN)
         deadman.due = min((time for time in times if time is not None), default=None)
         deadman.greets_again = None
@@ -111,40 +151,63 @@ class Deadmen:
 
     def greet(self, deadman: Deadman, now: int) -> bool:
         """Handle a new subscriber: send at once, and again later, because it may not have discovered us yet."""
-        if now >= deadman.greets_until or deadman.is_armed:
+        if now >= deadman.greets_until or deadman.armed:
             return False
+        deadman.unstarted = {*deadman.outlets}
         deadman.due, deadman.greets_again = now, now + GREETING
         return True
 
     def replace(self, next_one: Deadman, earlier: Deadman) -> None:
         earlier.acting.successor = next_one
-        earlier.outlets = {name: data for name, data in earlier.outlets.items() if name not in next_one.outlets}
+        passed, was_armed = earlier.armed & next_one.names, bool(earlier.armed)
+        earlier.outlets = {name: data for name, data in earlier.outlets.items() if name not in next_one.names}
+        earlier.armed &= earlier.outlets.keys()
         next_one.greets_until = earlier.greets_until if next_one.plan.at_start else 0
         due, earlier.due = earlier.due, None
-        if due is None:
-            return
-        if next_one.is_armed:
+        if was_armed:
+            assert due is not None
+            self._pass_on(next_one, earlier, next_one.with_followers(passed), due)
+        elif due is not None and next_one.plan.at_start and not next_one.armed:
+            unstarted = earlier.unstarted & next_one.names
+            if unstarted:
+                next_one.unstarted |= unstarted
+                next_one.due, next_one.greets_again = due, earlier.greets_again
+
+    def _pass_on(self, next_one: Deadman, earlier: Deadman, passed: set[str], due: int) -> None:
+        was_armed = bool(next_one.armed)
+        next_one.armed |= passed
+        if not passed or (was_armed and earlier.has_tripped):
             self._release(earlier)
-        elif earlier.is_armed:
-            now, then = earlier.plan, next_one.plan
-            next_one.is_armed, next_one.has_tripped = True, earlier.has_tripped
-            next_one.due = due + (then.repeat - now.repeat if earlier.has_tripped else then.timeout - now.timeout)
-        elif next_one.plan.at_start:
-            next_one.due, next_one.greets_again = due, earlier.greets_again
+            return
+        now, then = earlier.plan, next_one.plan
+        due += then.repeat - now.repeat if earlier.has_tripped else then.timeout - now.timeout
+        if was_armed and not next_one.has_tripped:
+            assert next_one.due is not None
+            next_one.due = max(due, next_one.due)
+            return
+        self._release(next_one)
+        next_one.due = due
+        if earlier.has_tripped:
+            earlier.has_tripped, next_one.has_tripped = False, True
+            self.counts["active", earlier.plan.route] = 0
+            self.counts["active", next_one.plan.route] = 1
 
     def end(self, deadman: Deadman) -> None:
-        """Send a last time unless unarmed; also when replaced by a deadman that does not send."""
-        is_armed, deadman.is_armed = deadman.is_armed, False
+        """Send a last time to what is armed; also when replaced by a deadman that does not send there."""
+        armed, deadman.armed = deadman.armed, set()
         deadman.due, deadman.greets_until = None, 0
-        if is_armed:
-            self._send_all(deadman)
+        self._send_all(deadman, armed)
 
     def end_when_served(self, deadman: Deadman) -> None:
-        deadman.ends_when_due, deadman.greets_until = deadman.is_armed, 0
+        deadman.ends_when_due, deadman.greets_until = bool(deadman.armed), 0
         deadman.due = 0 if deadman.ends_when_due else None
 
-    def _send_all(self, deadman: Deadman) -> dict[str, list[int]]:
-        errors = {endpoint: [self._send(endpoint, each) for each in all_] for endpoint, all_ in deadman.outlets.items()}
+    def _send_all(self, deadman: Deadman, to: set[str]) -> dict[str, list[int]]:
+        errors = {
+            endpoint: [self._send(endpoint, each) for each in datagrams]
+            for endpoint, datagrams in deadman.plan.datagrams
+            if endpoint in to
+        }
         for endpoint, each in errors.items():
             for error in each:
                 self.counts["send_errors" if error else "datagrams_sent", deadman.plan.route, endpoint] += 1

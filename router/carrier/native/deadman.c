@@ -6,8 +6,6 @@
 
 #include "deliver.h"
 
-enum { MOST_REACHED = 64 };
-
 /* In ns: the delay before a failed datagram of the start is sent again; how long after the start a newly discovered
  * subscriber may be one that already existed, as discovery takes less; and the time in which it also discovers the
  * publisher. */
@@ -18,10 +16,13 @@ struct deadman {
     struct deadman *acting;  /* the last deadman that has replaced it, or itself */
     struct deadman *fellow;  /* the next one with the same `acting`, in a circular list */
     int64_t timeout, repeat; /* ns */
-    bool is_armed;           /* or tripped: sends when it ends */
+    /* Destinations, a bit for each: */
+    uint64_t armed;          /* get datagrams when it trips, and when it ends */
+    uint64_t followers;
+    uint64_t own;            /* all, without those that have passed to the deadman that has replaced it */
+    uint64_t unstarted;      /* get the datagrams of the start when it is served next */
     bool has_tripped;
     bool starts;             /* sends when the router starts */
-    bool is_kept_back;       /* the last attempt to send a datagram failed */
     bool is_ending;          /* ends when it is served next */
     int64_t greets_until;    /* until then, and while unarmed, it greets new subscribers */
     int64_t greets_again;    /* the due time after the next one, while unarmed; or NEVER */
@@ -50,30 +51,33 @@ static void report_error(struct timers *timers, const struct deadman *deadman, c
     report_with(timers, (struct deadman_event){0, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, why);
 }
 
-/* Send a datagram. Return whether it was sent; if not, `is_kept_back` says whether it is worth another attempt. A refused
- * one is not: a receiver that refuses it does not execute earlier commands either. */
-static bool send_one(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to,
-                     const struct deadman_datagram *datagram) {
-    int error = timers->stage->brake(timers->stage, to, datagram);
-    if (error == BRAKE_LATER) return false;
-    stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
-    deadman->is_kept_back |= error && error != ECONNREFUSED;
-    if (error) report_error(timers, deadman, to, error, "");
-    return !error;
+/* Send the datagrams for a destination. Return 0, BRAKE_LATER, or the last error. */
+static int send_to(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to) {
+    int failed = 0;
+    for (uint32_t index = 0; index < to->count; index++) {
+        int error = timers->stage->brake(timers->stage, to, &to->datagrams[index]);
+        if (error) failed = error;
+        if (error == BRAKE_LATER) continue;
+        stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
+        if (error) report_error(timers, deadman, to, error, "");
+    }
+    return failed;
 }
 
-/* Send the datagrams. Return a bit for each of the first 64 destinations that all of theirs have reached. */
-static uint64_t send_all(struct timers *timers, struct deadman *deadman) {
-    uint64_t reached = 0;
-    deadman->is_kept_back = false;
-    for (uint32_t index = 0; index < deadman->count; index++) {
-        const struct deadman_destination *to = &deadman->destinations[index];
-        bool is_reached = index < MOST_REACHED;
-        for (uint32_t each = 0; each < to->count; each++)
-            is_reached &= send_one(timers, deadman, to, &to->datagrams[each]);
-        if (is_reached) reached |= (uint64_t)1 << index;
+struct outcome {
+    uint64_t reached, failed;
+};
+
+/* Send to destinations. A refused datagram has not failed: a receiver that refuses it does not execute earlier commands
+ * either. */
+static struct outcome send_all(struct timers *timers, struct deadman *deadman, uint64_t destinations) {
+    struct outcome outcome = {0};
+    for (uint64_t left = destinations; left; left &= left - 1) {
+        int error = send_to(timers, deadman, &deadman->destinations[__builtin_ctzll(left)]);
+        if (!error) outcome.reached |= left & -left;
+        else if (error != BRAKE_LATER && error != ECONNREFUSED) outcome.failed |= left & -left;
     }
-    return reached;
+    return outcome;
 }
 
 static void release(struct timers *timers, struct deadman *deadman) {
@@ -83,40 +87,101 @@ static void release(struct timers *timers, struct deadman *deadman) {
     report(timers, EVENT_RELEASED, deadman);
 }
 
-static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
-    struct deadman *deadman = feed->deadman->acting;
-    deadman->is_armed = !feed->disarms;
-    timer_set_due(timers, &deadman->timer, feed->disarms ? NEVER : now + deadman->timeout);
+static void arm(struct timers *timers, struct deadman *deadman, uint64_t to, int64_t now) {
+    deadman->armed |= to | deadman->followers;
+    timer_set_due(timers, &deadman->timer, now + deadman->timeout);
     release(timers, deadman);
 }
 
+/* Destinations that stay armed keep the deadline. */
+static void disarm(struct timers *timers, struct deadman *deadman, uint64_t to) {
+    bool was_armed = deadman->armed;
+    deadman->armed &= ~to;
+    deadman->unstarted &= ~to;
+    if (deadman->armed & ~deadman->followers) return;
+    deadman->armed = 0;
+    if (was_armed || !deadman->unstarted) timer_set_due(timers, &deadman->timer, NEVER);
+    release(timers, deadman);
+}
+
+static uint64_t bit(uint32_t index) { return (uint64_t)1 << index; }
+
+/* Return the destinations with this name. */
+static uint64_t named(const struct deadman *deadman, uint32_t id) {
+    uint64_t found = 0;
+    for (uint32_t index = 0; index < deadman->count; index++)
+        if (deadman->destinations[index].id == id) found |= bit(index);
+    return found;
+}
+
+/* Return the destinations with this sender. */
+static uint64_t placed(const struct deadman *deadman, const struct sender *sender) {
+    uint64_t found = 0;
+    for (uint32_t index = 0; index < deadman->count; index++)
+        if (deadman->destinations[index].sender == sender) found |= bit(index);
+    return found;
+}
+
+/* Return the destinations of `next` that have the names of these. */
+static uint64_t renumbered(const struct deadman *next, const struct deadman *earlier, uint64_t destinations) {
+    uint64_t found = 0;
+    for (uint64_t left = destinations; left; left &= left - 1)
+        found |= named(next, earlier->destinations[__builtin_ctzll(left)].id);
+    return found;
+}
+
+/* Return the destinations that a feed of a deadman that was replaced has in the acting one. Arm or disarm those that only
+ * replaced ones send to, which they do when they end. */
+static uint64_t redirected(const struct feed *feed) {
+    struct deadman *acting = feed->deadman->acting;
+    for (uint64_t left = feed->to; left; left &= left - 1) {
+        const struct sender *sender = feed->deadman->destinations[__builtin_ctzll(left)].sender;
+        for (struct deadman *each = acting->fellow; each != acting; each = each->fellow) {
+            uint64_t own = each->own & placed(each, sender);
+            each->armed = feed->disarms ? each->armed & ~own : each->armed | own;
+        }
+    }
+    return renumbered(acting, feed->deadman, feed->to);
+}
+
+static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
+    struct deadman *deadman = feed->deadman->acting;
+    uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
+    if (!to) return;
+    if (feed->disarms) disarm(timers, deadman, to);
+    else arm(timers, deadman, to, now);
+}
+
 /* A command was sent, and an ICMP message says that the board refused an earlier one. The message may be forged, and whether
- * the board executes this command is unknown: so arm the deadman, but do not extend its deadline. */
+ * the board executes this command is unknown: so arm the destination, but do not extend the deadline. */
 static void arm_one(struct timers *timers, const struct feed *feed, int64_t now) {
     struct deadman *deadman = feed->deadman->acting;
-    if (feed->disarms || deadman->is_armed) return;
-    deadman->is_armed = true;
-    timer_set_due(timers, &deadman->timer, now + deadman->timeout);
+    if (feed->disarms) return;
+    uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
+    if (!to) return;
+    if (!deadman->armed) timer_set_due(timers, &deadman->timer, now + deadman->timeout);
+    deadman->armed |= to | deadman->followers;
 }
 
 /* Send the datagrams of the start. If that fails, for example because the network is not up yet, repeat it. */
 static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t now) {
-    uint64_t reached = send_all(timers, deadman);
-    int64_t again = deadman->is_kept_back ? now + START_AGAIN : NEVER;
+    struct outcome outcome = send_all(timers, deadman, deadman->unstarted);
+    int64_t again = outcome.failed ? now + START_AGAIN : NEVER;
+    deadman->unstarted = deadman->greets_again == NEVER ? outcome.failed : deadman->own;
     timer_set_due(timers, &deadman->timer, again < deadman->greets_again ? again : deadman->greets_again);
     deadman->greets_again = NEVER;
-    return reached;
+    return outcome.reached;
 }
 
-/* Send a last time if the deadman is armed or tripped. */
+/* Send a last time to what is armed. */
 static void end(struct timers *timers, struct timer *timer, int64_t now) {
     struct deadman *deadman = (struct deadman *)timer;
     (void)now;
-    bool was_armed = deadman->is_armed;
-    deadman->is_armed = false;
+    uint64_t armed = deadman->armed;
+    deadman->armed = 0;
     timer_set_due(timers, timer, NEVER);
     deadman->greets_until = 0;
-    if (was_armed) send_all(timers, deadman);
+    send_all(timers, deadman, armed);
 }
 
 static void serve(struct timers *timers, struct timer *timer, int64_t now) {
@@ -125,39 +190,24 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
         end(timers, timer, now);
         return;
     }
-    if (!deadman->is_armed) {
+    if (!deadman->armed) {
         start(timers, deadman, now);
         return;
     }
     /* Skip repetitions that a stalled process has missed. */
     timer_set_due(timers, timer, timer->due + deadman->repeat * ((now - timer->due) / deadman->repeat + 1));
     if (deadman->has_tripped) {
-        send_all(timers, deadman);
+        send_all(timers, deadman, deadman->armed);
         return;
     }
     deadman->has_tripped = true;
     counter_set(timers->stage->counters, deadman->active, 1);
     stage_count(timers->stage, deadman->trips, 1);
-    send_all(timers, deadman);
+    send_all(timers, deadman, deadman->armed);
     report(timers, EVENT_TRIPPED, deadman);
 }
 
 static const struct timer_kind DEADMAN = {.serve = serve, .end = end};
-
-static bool sends_to(const struct deadman *deadman, const struct sender *sender) {
-    for (uint32_t index = 0; index < deadman->count; index++)
-        if (deadman->destinations[index].sender == sender) return true;
-    return false;
-}
-
-static void keep_others_than(struct deadman *deadman, const struct deadman *next) {
-    uint32_t kept = 0;
-    for (uint32_t index = 0; index < deadman->count; index++) {
-        struct deadman_destination *each = &deadman->destinations[index];
-        if (!sends_to(next, each->sender)) deadman->destinations[kept++] = *each;
-    }
-    deadman->count = kept;
-}
 
 static void leave_fellows(struct deadman *deadman) {
     struct deadman *before = deadman;
@@ -166,37 +216,63 @@ static void leave_fellows(struct deadman *deadman) {
     deadman->fellow = deadman;
 }
 
-/* Let `next` act for `earlier`, and for all deadmen that `earlier` acts for. */
+/* Let `next` act for all deadmen that `earlier` acts for. */
 static void redirect(struct deadman *next, struct deadman *earlier) {
-    leave_fellows(next);
-    next->fellow = earlier->fellow;
-    earlier->fellow = next;
+    struct deadman *fellow = next->fellow;
+    next->fellow = earlier->fellow; /* makes one circle of two */
+    earlier->fellow = fellow;
     next->acting = next;
     for (struct deadman *each = next->fellow; each != next; each = each->fellow) each->acting = next;
 }
 
-/* Pass deadline and state to `next`, unless a later command has already fed it. */
-static void take_over(struct timers *timers, struct deadman *next, struct deadman *earlier) {
-    redirect(next, earlier);
-    keep_others_than(earlier, next);
-    next->greets_until = next->starts ? earlier->greets_until : 0;
-    int64_t due = earlier->timer.due;
-    timer_set_due(timers, &earlier->timer, NEVER);
-    if (due == NEVER) return;
-    if (next->is_armed) {
+/* Leave only those destinations to `earlier` that `next` does not send to. */
+static void leave_others(const struct deadman *next, struct deadman *earlier) {
+    for (uint32_t index = 0; index < next->count; index++)
+        earlier->own &= ~placed(earlier, next->destinations[index].sender);
+    earlier->armed &= earlier->own;
+}
+
+static void inherit_start(struct timers *timers, struct deadman *next, struct deadman *earlier, int64_t due) {
+    uint64_t unstarted = renumbered(next, earlier, earlier->unstarted);
+    if (!next->starts || next->armed || !unstarted) return;
+    next->unstarted |= unstarted;
+    next->greets_again = earlier->greets_again;
+    timer_set_due(timers, &next->timer, due);
+}
+
+/* Pass on that destinations are armed. If `next` is armed, because of a later command or because it also replaces another
+ * deadman, it trips at the later deadline. */
+static void inherit_deadline(struct timers *timers, struct deadman *next, struct deadman *earlier, uint64_t armed,
+                             int64_t due) {
+    bool was_armed = next->armed, has_tripped = earlier->has_tripped;
+    if (armed & ~next->followers) armed |= next->followers;
+    next->armed |= armed;
+    if (!armed || (was_armed && has_tripped)) {
         release(timers, earlier);
         return;
     }
-    if (!earlier->is_armed) {
-        if (!next->starts) return;
-        timer_set_due(timers, &next->timer, due);
-        next->greets_again = earlier->greets_again;
-        return;
-    }
-    next->is_armed = true;
-    next->has_tripped = earlier->has_tripped;
-    due += next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout;
+    due += has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout;
+    if (was_armed && !next->has_tripped && due < next->timer.due) return;
+    release(timers, next);
     timer_set_due(timers, &next->timer, due);
+    if (!has_tripped) return;
+    earlier->has_tripped = false;
+    next->has_tripped = true;
+    counter_set(timers->stage->counters, earlier->active, 0);
+    counter_set(timers->stage->counters, next->active, 1);
+}
+
+/* Pass deadline and state on. */
+static void take_over(struct timers *timers, struct deadman *next, struct deadman *earlier) {
+    uint64_t armed = renumbered(next, earlier, earlier->armed);
+    bool was_armed = earlier->armed;
+    int64_t due = earlier->timer.due;
+    redirect(next, earlier);
+    leave_others(next, earlier);
+    next->greets_until = next->starts ? earlier->greets_until : 0;
+    timer_set_due(timers, &earlier->timer, NEVER);
+    if (was_armed) inherit_deadline(timers, next, earlier, armed, due);
+    else if (due != NEVER) inherit_start(timers, next, earlier, due);
 }
 
 /* ---- public ---- */
@@ -215,6 +291,10 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
                                 .repeat = repeat, .starts = starts, .active = active, .trips = trips, .id = id,
                                 .count = count, .greets_again = NEVER};
     deadman->fellow = deadman;
+    for (uint32_t index = 0; index < count; index++) {
+        deadman->own |= bit(index);
+        if (destinations[index].follows) deadman->followers |= bit(index);
+    }
     struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->destinations[count];
     uint8_t *data = (uint8_t *)(copy + datagrams);
     for (uint32_t index = 0; index < count; index++) {
@@ -244,6 +324,7 @@ void deadman_close(struct timers *timers, struct deadman *deadman) {
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now) {
     if (!deadman->starts) return 0;
     pthread_mutex_lock(&timers->lock);
+    deadman->unstarted = deadman->own;
     uint64_t reached = start(timers, deadman, now);
     pthread_mutex_unlock(&timers->lock);
     return reached;
@@ -257,8 +338,9 @@ void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, i
 
 bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now) {
     pthread_mutex_lock(&timers->lock);
-    bool greets = now < deadman->greets_until && !deadman->is_armed;
+    bool greets = now < deadman->greets_until && !deadman->armed;
     if (greets) {
+        deadman->unstarted = deadman->own;
         timer_set_due(timers, &deadman->timer, now);
         deadman->greets_again = now + GREETING;
     }
@@ -280,7 +362,7 @@ void command_has_left(struct timers *timers, const struct feed *feeds, uint32_t 
 }
 
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
-    struct feed feed = {.deadman = deadman};
+    struct feed feed = {.deadman = deadman, .to = bit(0)};
     pthread_mutex_lock(&timers->lock);
     command_has_left(timers, &feed, 1, 0, now);
     pthread_mutex_unlock(&timers->lock);
@@ -288,8 +370,8 @@ void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
 
 void deadman_schedule_end(struct timers *timers, struct timer *timer) {
     struct deadman *deadman = (struct deadman *)timer;
-    deadman->is_ending = deadman->is_armed;
-    timer_set_due(timers, timer, deadman->is_armed ? 0 : NEVER);
+    deadman->is_ending = deadman->armed;
+    timer_set_due(timers, timer, deadman->armed ? 0 : NEVER);
     deadman->greets_until = 0;
 }
 
@@ -312,7 +394,8 @@ void deadman_settle(struct timers *timers, struct timer *timer, const struct dea
     struct deadman *deadman = (struct deadman *)timer;
     report_error(timers, deadman, to, 0, why);
     deadman = deadman->acting;
-    if (deadman->is_armed || now >= deadman->greets_until || deadman->timer.due <= now + START_AGAIN) return;
+    if (deadman->armed || now >= deadman->greets_until || deadman->timer.due <= now + START_AGAIN) return;
+    deadman->unstarted = deadman->own;
     timer_set_due(timers, &deadman->timer, now + START_AGAIN);
 }
 

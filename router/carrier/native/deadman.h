@@ -2,11 +2,16 @@
  *
  * Unarmed: no command was sent yet, or another route has taken over; nothing is due.
  * Armed:   trips `timeout` after the last command was sent.
- * Tripped: has sent its datagram, and repeats it at fixed intervals, counted from when it was due to trip.
+ * Tripped: has sent its datagrams, and repeats them at fixed intervals, counted from when it was due to trip.
  *
- * A sent command arms the deadman in any state; a command of a route that it hands over to disarms it. A failed command
- * changes nothing: the deadman trips unless another one is sent. If the receiver refused an earlier command, a sent command
- * arms the deadman but does not extend its deadline. Datagrams sent at router start change no state. */
+ * Each destination is armed or not, and gets datagrams only while it is; the deadman is armed while one of them is, and has
+ * one deadline. A sent command arms the destination that it went to, in any state; a command of a route that the deadman
+ * hands over to disarms it. Destinations that the route itself never commands follow: they are armed by each command, and
+ * disarmed when no commanded one is armed any more.
+ *
+ * A failed command changes nothing: the deadman trips unless another one is sent. If the receiver refused an earlier
+ * command, a sent command arms the destination but does not extend the deadline. Datagrams sent at router start change no
+ * state. */
 #ifndef DEADMAN_H
 #define DEADMAN_H
 
@@ -25,13 +30,16 @@ struct deadman_datagram {
     uint32_t size;
 };
 
+enum { MOST_DESTINATIONS = 64 }; /* of a deadman */
+
 struct deadman_destination {
     struct sender *sender;
     /* Sent in this order. `deadman_open` copies them, and the list of destinations. */
     const struct deadman_datagram *datagrams;
     uint32_t count;
     uint32_t sent, send_errors; /* counters */
-    uint32_t id;                /* in events */
+    uint32_t id;                /* of its name: in events, and the same in the next program */
+    uint32_t follows;           /* 1: the route never commands it */
     const void *publisher;      /* rcl_publisher_t of the topic, for a gateway's deadman, which has no sender */
 };
 
@@ -40,21 +48,23 @@ struct deadman;
 /* The effect of a sent command on a deadman. */
 struct feed {
     struct deadman *deadman;
+    uint64_t to;      /* a bit for each destination that the command arms or disarms, without those that follow */
     uint32_t disarms; /* 1: the command is from a route that the deadman hands over to */
     uint32_t reserved;
 };
 
 /* Add a deadman, with its timeout and repetition in ns. Returns NULL if memory runs out. `starts`: it sends at router start.
  * `active` and `trips` are counters, `id` identifies it in events. It is unarmed, and served from now on. When it ends, it
- * sends a last time if it is armed or tripped. Its first member is a struct timer. */
+ * sends a last time to the destinations that are armed. Its first member is a struct timer. */
 struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t repeat, bool starts, uint32_t active,
                              uint32_t trips, uint32_t id, const struct deadman_destination *destinations, uint32_t count);
 
 /* Remove a deadman that no program uses and nothing can feed. */
 void deadman_close(struct timers *timers, struct deadman *deadman);
 
-/* Send the datagrams at router start, if the deadman does so. Return a bit for each of the first 64 destinations reached.
- * While one of the datagrams fails, all are sent again each second, until a command feeds or disarms the deadman. */
+/* Send the datagrams at router start, if the deadman does so. Return a bit for each destination that all of its datagrams
+ * have reached. Destinations for which one failed get all again each second, until a command arms the deadman, or disarms
+ * them. */
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now);
 
 /* Like `deadman_start`, for a deadman that publishes. It reaches no subscriber that is not discovered yet, so for some
@@ -64,16 +74,17 @@ uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t n
 void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, int64_t now);
 bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now);
 
-/* Pass deadline and state of `earlier`, the deadman of the same route in the previous program, to `next`. `earlier` keeps
- * only the destinations (by sender) that `next` does not have, and sends to them when it ends. From now on, feeding
- * `earlier` feeds `next`. */
+/* Pass deadline and state of `earlier`, the deadman of the same commands in the previous program, to `next`: what was armed
+ * stays armed, by `id`. `earlier` keeps only the destinations (by sender) that `next` does not have, and sends to them when
+ * it ends. From now on, feeding `earlier` feeds `next`. Several deadmen may be replaced by one: it trips when the last of
+ * their deadlines has passed. */
 void deadman_replace(struct timers *timers, struct deadman *next, struct deadman *earlier);
 
 enum { COMMAND_STALE = -1 };
 
 /* Send a command: check that it has not expired (`expires`, boot clock, ns; NEVER: it does not), send it, and feed or
  * disarm the deadmen if that returned no error, all under the lock. Return 0, COMMAND_STALE, or an errno of `sender_send`.
- * If that is about an earlier command (ECONNREFUSED), this one arms an unarmed deadman, but does not extend a deadline.
+ * If that is about an earlier command (ECONNREFUSED), this one arms what is unarmed, but does not extend a deadline.
  * Without feeds, the lock is not taken. */
 int command_send(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count);
@@ -82,7 +93,7 @@ int command_send(struct timers *timers, struct sender *sender, const void *data,
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now);
 
-/* A command of the deadman's route was sent at `now`. Takes the lock. */
+/* A message was published at `now` on the only topic of a deadman that publishes. Takes the lock. */
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now);
 
 /* Like `timer_end`, but done by the thread that serves the group: an armed or tripped deadman becomes due at once. */

@@ -57,7 +57,8 @@ static struct deadman *open_deadman(bool has_spare) {
     struct deadman_datagram datagram = {(const uint8_t *)&brake, sizeof brake};
     struct deadman_destination to[] = {
         {.sender = drive.sender, .datagrams = &datagram, .count = 1, .sent = SENT, .send_errors = ERRORS, .id = 7},
-        {.sender = spare.sender, .datagrams = &datagram, .count = 1, .sent = SENT, .send_errors = ERRORS, .id = 8}};
+        {.sender = spare.sender, .datagrams = &datagram, .count = 1, .sent = SENT, .send_errors = ERRORS, .id = 8,
+         .follows = 1}};
     return deadman_open(timers, TIMEOUT, REPEAT, true, ACTIVE, TRIPS, 1, to, has_spare ? 2 : 1);
 }
 
@@ -67,7 +68,8 @@ static void *send_commands(void *seed) {
     for (long number = 0; number < commands; number++) {
         int64_t born = boottime_ns();
         struct datagram command = {COMMAND, born, born + TTL};
-        struct feed feeds[] = {{atomic_load(&acting), 0, 0}, {takes_over, 1, 0}};
+        struct feed feeds[] = {{.deadman = atomic_load(&acting), .to = 1},
+                               {.deadman = takes_over, .to = 1, .disarms = 1}};
         if (rand_r(&random) % 50 == 0) usleep(150);
         int error = command_send(timers, drive.sender, &command, sizeof command, command.expires, feeds, 2);
         if (error == COMMAND_STALE) atomic_fetch_add(&stale, 1);
@@ -81,7 +83,7 @@ static void *send_commands(void *seed) {
 static void *send_others(void *seed) {
     unsigned random = (unsigned)(uintptr_t)seed;
     for (long number = 0; number < commands / 4; number++) {
-        struct feed feeds[] = {{takes_over, 0, 0}};
+        struct feed feeds[] = {{.deadman = takes_over, .to = 1}};
         command_send(timers, spare.sender, "other", 5, NEVER, feeds, 1);
         if (rand_r(&random) % 2) usleep(700);
     }
@@ -164,7 +166,8 @@ int main(int count, char **arguments) {
     drive = open_board();
     spare = open_board();
     atomic_store(&acting, open_deadman(true));
-    takes_over = deadman_open(timers, TIMEOUT, REPEAT, true, 4, 5, 2, NULL, 0);
+    struct deadman_destination silent = {.sender = spare.sender};
+    takes_over = deadman_open(timers, TIMEOUT, REPEAT, true, 4, 5, 2, &silent, 1);
     void *(*others[])(void *) = {wait_for_timer, look_for_due, replace, read_events, receive};
     void *(*senders[])(void *) = {send_commands, send_commands, send_others};
     enum { OTHERS = 5, SENDERS = 3 };

@@ -54,7 +54,7 @@ int main(void) {
     struct deadman_datagram brake = {MESSAGE, 1};
     struct deadman_destination braking = {.sender = sender, .datagrams = &brake, .count = 1, .sent = 2, .send_errors = 3};
     struct deadman *deadman = deadman_open(timers, 1000, 1000000, true, 0, 1, 0, &braking, 1);
-    struct feed feed = {deadman, 0, 0};
+    struct feed feed = {.deadman = deadman, .to = 1};
     struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,
                             .delivered = SENT, .delivered_bytes = BYTES};
     for (int reason = 0; reason < LOSSES; reason++) target.dropped[reason] = LOST;

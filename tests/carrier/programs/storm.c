@@ -269,7 +269,7 @@ static void *send_datagrams(void *of) {
 static void *send_commands(void *unused) {
     while (!atomic_load(&is_quiet)) {
         atomic_store(&commander_at, atomic_load(&latest));
-        struct feed feed = {atomic_load(&acting), 0, 0};
+        struct feed feed = {.deadman = atomic_load(&acting), .to = 1};
         int error = command_send(timers, senders[0], "command", 7, NEVER, &feed, 1);
         check(!error, "a command is sent");
         atomic_fetch_add(&commands, 1);
