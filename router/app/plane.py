@@ -18,7 +18,7 @@ from router import declared as c
 from router.app.counts import ThreadCounts
 from router.carrier.boards import NativeBoards
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
-from router.carrier.deadmen import NativeDeadman, replaced
+from router.carrier.deadmen import NativeDeadman, replaced, successors
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import EventReader, EventThread
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
@@ -238,7 +238,8 @@ class Plane:
         else:
             for listener in unused:
                 listener.end_input()
-            deadmen = replaced(built.deadmen, earlier.deadmen)
+            routes = successors(built.program.deadmen, earlier.program.deadmen)
+            deadmen = replaced(built.deadmen, earlier.deadmen, routes)
             change = change_to(built.native, built.timers(earlier, of_topics=False), deadmen)
             self._carrier.change(change, built.native)
         self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)

@@ -91,7 +91,7 @@ class ClientDeadmen(NativeThread):
         """
         for name in before.keys() - now.keys():
             before[name].end()
-        for each, earlier in replaced(now, before):
+        for each, earlier in replaced(now, before, {name: name for name in now}):
             self._library.deadman_replace(self._group, each.address, earlier.address)
         self._library.client_deadmen_advance(self._address, generation)
 

@@ -92,12 +92,33 @@ class Deadmen(NativeThread, DeadmanGroup):
         self.library.timers_end(self.address)
 
 
-def replaced(now: Mapping[str, Deadman], before: Mapping[str, Deadman]) -> list[tuple[Deadman, Deadman]]:
-    """Return pairs of a deadman and the earlier one that it replaces, matched by route.
+def successors(now: Collection[DeadmanPlan], before: Iterable[DeadmanPlan]) -> dict[str, str]:
+    """Return the routes whose deadmen replace those of an earlier program, by the earlier route.
+
+    A deadman replaces the one that watched the same commands, because the name of a route depends on the other routes
+    of its case. If there is none, it replaces the one of the same name.
+    """
+    routes: dict[str, str] = {}
+    others: list[str] = []
+    for earlier in before:
+        best = max(now, key=lambda plan: len(plan.watched & earlier.watched), default=None)
+        if best is not None and best.watched & earlier.watched:
+            routes[earlier.route] = best.route
+        else:
+            others.append(earlier.route)
+    free = {plan.route for plan in now} - {*routes.values()}
+    return {**routes, **{route: route for route in others if route in free}}
+
+
+def replaced(
+    now: Mapping[str, Deadman], before: Mapping[str, Deadman], routes: Mapping[str, str]
+) -> list[tuple[Deadman, Deadman]]:
+    """Return pairs of a deadman and the earlier one that it replaces; `routes` are as `successors` returns them.
 
     The deadman now lives as long as the earlier one.
     """
-    pairs = [(each, before[route]) for route, each in now.items() if before.get(route, each) is not each]
+    kept = [*now.values()]
+    pairs = [(now[routes[name]], each) for name, each in before.items() if name in routes and each not in kept]
     for each, earlier in pairs:
         each.replace(earlier)
     return pairs

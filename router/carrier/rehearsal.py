@@ -12,7 +12,7 @@ from weakref import finalize
 
 from router import declared as c
 from router.carrier.boards import NativeBoards
-from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced
+from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced, successors
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import CountedReport, DeadmanChange, EventReader
 from router.carrier.names import Names
@@ -98,7 +98,8 @@ class Stage:
         before = earlier.deadmen if earlier else {}
         dropped = [each.address for each in before.values() if each not in running.deadmen.values()]
         timers = running.timers(earlier, dropped, of_topics=False)
-        change = change_to(running.native, timers, replaced(running.deadmen, before))
+        routes = successors(running.program.deadmen, earlier.program.deadmen) if earlier else {}
+        change = change_to(running.native, timers, replaced(running.deadmen, before, routes))
         of_topics = running.timers(earlier, (), of_topics=True)
         address = self._opened.address
         self._library.rehearsal_adopt(address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)

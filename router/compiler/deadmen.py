@@ -64,7 +64,10 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     by_endpoint = [
         (to.value, tuple(trimmed(each) if to.value in trims else each for each in datagrams)) for to in deadman.to
     ]
-    return replace(deadman_plan(route.name, deadman, by_endpoint), following=following, disarmed_by=disarmed_by)
+    sources = *(each.value for each in route.sources), *(each.topic.value for each in route.source_topics)
+    watched = frozenset((source, route.case.value) for source in sources)
+    plan = deadman_plan(route.name, deadman, by_endpoint)
+    return replace(plan, following=following, disarmed_by=disarmed_by, watched=watched)
 
 
 def _require_deadman(lookup: Lookup, route: Route) -> None:

@@ -84,7 +84,8 @@ class DeadmanPlan:
 
     `datagrams` are by endpoint, in the order of sending. With `at_start`, they are also sent when the router starts.
     Endpoints in `following` get no commands from the route, and are armed and disarmed with the others. `disarmed_by`
-    are names of routes, not the payload cases of the table.
+    are names of routes, not the payload cases of the table. `watched` are the commands of the route: each source, with
+    the payload case.
     """
 
     route: str
@@ -94,6 +95,7 @@ class DeadmanPlan:
     at_start: bool = True
     following: frozenset[str] = frozenset()
     disarmed_by: tuple[str, ...] = field(default=(), compare=False)
+    watched: frozenset[tuple[str, str]] = field(default=frozenset(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)

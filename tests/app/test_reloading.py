@@ -222,6 +222,35 @@ def test_a_deadman_with_another_timeout_inherits_the_last_command(site: Site) ->
         wait_until(lambda: router.total("deadman_trips") == 2)
 
 
+SECOND = """\
+  manual_drive:
+    - source: sensor_board
+      destinations: [basestation]
+      deadman: &halt {timeout: TIMEOUT, send: {manual_brake: {brake: true}}, repeat: 10ms, at_start: silent}
+    - {source: basestation, destinations: [sensor_board], deadman: {none: it is answered}}
+"""
+"""`turns`, with a second route of the case, which renames the first one."""
+
+
+def test_a_second_route_of_its_case_does_not_stop_what_drives(site: Site) -> None:
+    with site.router(turns("1h")) as router:
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        for routes in (SECOND.replace("TIMEOUT", "1h"), turns("1h"), SECOND.replace("TIMEOUT", "50ms")):
+            assert router.total("deadman_datagrams_sent") == 0
+            site.write(routes)
+            assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE  # of the last command before the reloads
+        wait_until(lambda: router.total("deadman_trips") == 1)
+        site.write(turns("50ms"))
+        assert router.reload().ok
+        assert router.total("deadman_active") == 1
+        site.send(DRIVE)
+        while site.basestation.recv(1000) != DRIVE:
+            pass
+        wait_until(lambda: router.total("deadman_trips") == 2)
+
+
 def test_a_deadman_that_goes_has_the_last_word_if_it_was_armed(site: Site) -> None:
     with site.router(turns("1h") + PH) as router:
         site.write(PH)

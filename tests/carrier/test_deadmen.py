@@ -15,6 +15,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from struct import Struct
 from typing import cast
@@ -25,7 +26,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router import declared as c
-from router.carrier.deadmen import Deadmen, NativeDeadman, feed_of
+from router.carrier.deadmen import Deadmen, NativeDeadman, feed_of, successors
 from router.carrier.names import Names
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
@@ -423,6 +424,48 @@ def test_one_that_was_replaced_keeps_its_successors_alive(side: NativeSide) -> N
     assert not any(each() for each in alive)
     side.serve(10**12)
     assert side.next_due == NEVER
+
+
+def watching(route: str, *sources: str) -> DeadmanPlan:
+    return replace(PLAN, route=route, watched=frozenset((source, "drive") for source in sources))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "routes"),
+    [
+        ([("a", "1")], [("a", "1")], {"a": "a"}),
+        ([("drive", "1")], [("drive_from_1", "1"), ("drive_from_2", "2")], {"drive": "drive_from_1"}),
+        ([("from_1", "1"), ("from_2", "2")], [("drive", "2")], {"from_2": "drive"}),
+        ([("ros", "1"), ("ros_2", "2")], [("ros", "2"), ("ros_2", "1")], {"ros": "ros_2", "ros_2": "ros"}),
+        ([("ros", "1"), ("ros_2", "2")], [("ros", "2")], {"ros_2": "ros"}),
+        ([("from_1", "1"), ("from_2", "2")], [("drive", "1", "2")], {"from_1": "drive", "from_2": "drive"}),
+        ([("drive", "1", "2", "3")], [("from_1", "1"), ("from_2", "2", "3")], {"drive": "from_2"}),
+        ([("drive", "1")], [("drive", "2")], {"drive": "drive"}),
+        ([("drive", "1")], [], {}),
+    ],
+)
+def test_a_deadman_replaces_the_one_that_watched_the_same_commands(
+    before: list[tuple[str, ...]], now: list[tuple[str, ...]], routes: dict[str, str]
+) -> None:
+    assert successors([watching(*each) for each in now], [watching(*each) for each in before]) == routes
+
+
+def test_one_deadman_may_replace_several(side: NativeSide) -> None:
+    """It trips when the last of them would, and brakes what is armed in any of them."""
+    of_wheels, of_arm, both = side.add(open_plan(timeout=400)), side.add(open_plan()), side.add(open_plan())
+    side.command(100, [(of_wheels, False)], b"drive", "wheels")
+    side.command(0, [(of_arm, False)], b"lift", "arm")
+    side.taken()
+    side.replace(both, of_wheels)
+    side.replace(both, of_arm)
+    assert side.next_due == 600
+    side.serve(600)
+    assert side.taken() == [("wheels", b"brake"), ("arm", b"hold"), ("arm", b"stay")]
+    side.command(650, [(of_arm, True)], b"lift", "arm")  # of a thread that has not changed to the next program
+    side.serve(700)
+    assert side.taken() == [("wheels", b"brake"), ("arm", b"lift")]
+    side.command(750, [(of_wheels, True)], b"drive", "wheels")
+    assert (side.next_due, side.events()[-1][0]) == (NEVER, "released")
 
 
 def test_what_a_command_feeds_lives_as_long_as_the_command(side: NativeSide, outlet: Outlet) -> None:
