@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -38,8 +38,8 @@ class Publication(Addressed, Protocol):
 class Outlets:
     """The open sockets and topics of a program. `state` is that of its targets, passed on by key at a reload.
 
-    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` and their plans by route. Without
-    `boards`, no limits of boards are checked.
+    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` and their plans by route, `plans` of
+    all routes. Without `boards`, no limits of boards are checked.
     """
 
     library: ctypes.CDLL
@@ -50,6 +50,7 @@ class Outlets:
     publications: Mapping[str, Publication]
     deadmen: Mapping[str, NativeDeadman]
     deadman_plans: Mapping[str, DeadmanPlan]
+    plans: Sequence[RoutePlan]
     bandwidths: Mapping[str, int]
     boards: NativeBoards | None = None
 
@@ -75,15 +76,24 @@ class Outlets:
             publications=publications,
             deadmen={plan.route: group.get_or_open(plan, program.counters, senders, state) for plan in program.deadmen},
             deadman_plans={plan.route: plan for plan in program.deadmen},
+            plans=(*program.routes,),
             bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=boards,
         )
 
-    def feeds(self, plan: RoutePlan, target: TargetPlan) -> list[c.Feed]:
-        """Return the deadmen that commands of the route feed (its own) or disarm."""
+    def feed(self, route: str, endpoint: str, *, disarms: bool) -> c.Feed:
+        """Return the effect of commands to an endpoint on the deadman of a route."""
+        return feed_of(self.deadman_plans[route], self.deadmen[route], endpoint, disarms=disarms)
+
+    def holding(self, route: str, endpoint: str) -> list[Native]:
+        """Return the deferrals that hold commands of a route to an endpoint."""
         return [
-            feed_of(self.deadman_plans[name], self.deadmen[name], target.label, disarms=name != plan.route)
-            for name in target.deadmen
+            self.deferral(plan, target, source)
+            for plan in self.plans
+            if plan.route == route
+            for target in plan.targets
+            if target.label == endpoint and target.is_deferred and not target.is_topic
+            for source in ([None] if plan.topic is not None else sorted(plan.sources, key=str))
         ]
 
     def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> Native:

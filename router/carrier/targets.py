@@ -72,8 +72,18 @@ class TargetStates:
                 limits = {place: outlets.limit(plan, target, source) for place, source in sources.items()}
                 native.limits = self._by_place(limits)
             if target.deadmen:
-                feeds = outlets.feeds(plan, target)
+                feeds = [self._feed(outlets, plan, target, route) for route in target.deadmen]
                 native.feeds, native.feed_count = self.bound.array(c.Feed, feeds), len(feeds)
+
+    def _feed(self, outlets: Outlets, plan: RoutePlan, target: TargetPlan, route: str) -> c.Feed:
+        """Return the effect of the target's commands on the deadman of a route: its own, or one that they disarm."""
+        feed = outlets.feed(route, target.label, disarms=route != plan.route)
+        held = outlets.holding(route, target.label) if feed.disarms else []
+        if held:
+            self.bound.keep(*held)
+            feed.superseded = self.bound.add((ctypes.c_void_p * len(held))(*(each.address for each in held)))
+            feed.superseded_count = len(held)
+        return feed
 
     def _bind_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
         collector = outlets.collector(plan)

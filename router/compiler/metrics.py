@@ -141,6 +141,7 @@ DROP_REASONS: Mapping[str, str] = {
     "send_error": "the network refused it, or nobody listens there",
     "publish_error": "the ROS middleware rejected it",
     "incomplete": "a frame that was not complete within its timeout, or for which there was no room",
+    "superseded": "a command was held until a newer one of another route, which disarms its deadman, was sent",
     "loop": "it came from this router: stays 0, because tables with loops are rejected",
 }
 """Reasons why a message was not delivered to a target, with their meaning."""

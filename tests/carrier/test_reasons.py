@@ -187,6 +187,11 @@ LOSING = """\
     collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
     topics: [{topic: seen, type: comms/msg/DetectedObjectArray, fields: {frame_id: frame_id, detections: items}}]
   pump_info: {ignore: for tests}
+  manual_arm:
+    source: basestation
+    destinations: [{endpoint: driving_board, max_rate: 5 Hz, on_limit: latest}]
+    ttl: 500ms
+    deadman: {timeout: 500ms, send: {manual_arm: {}}, disarmed_by: manual_drive}
 """
 LARGE = bytes.fromhex("c201") + b"\xa6\x1f" + bytes.fromhex("1005") + b"\xfa\x3e\xa0\x1f" + bytes(4000)
 """A `manual_drive` with a field of 4000 bytes that no board knows."""
@@ -202,9 +207,10 @@ def from_board(*datagrams: bytes, age: int = 0) -> Callable[[Stage], None]:
     return happen
 
 
-def from_basestation(datagram: bytes) -> Callable[[Stage], None]:
+def from_basestation(*datagrams: bytes) -> Callable[[Stage], None]:
     def happen(stage: Stage) -> None:
-        stage.datagram("exact", BASESTATION, datagram, START)
+        for each in datagrams:
+            stage.datagram("exact", BASESTATION, each, START)
         stage.advance(START + 20 * SECOND)
 
     return happen
@@ -219,6 +225,7 @@ DROPPED: Mapping[str, Callable[[Stage], None]] = {
     "rate_limited": from_board(GPS, GPS),
     "queue_full": from_board(*[enveloped(load_cell_info={"force_newtons": 1})] * 5000),
     "incomplete": from_basestation(enveloped(detected_object=PART)),
+    "superseded": from_basestation(*[enveloped(manual_arm={})] * 2, enveloped(manual_drive={})),
 }
 REJECTED: Mapping[str, Callable[[Stage], None]] = {
     "truncated": from_board(bytes(1 << 15)),
@@ -266,7 +273,7 @@ def test_every_loss_has_a_line_with_what_shows_it(reason: str, tmp_path: Path) -
     assert line["reason"] == reason
     assert line["route"]
     assert line["target"]
-    assert line.get("detail") or reason == "queue_full"
+    assert line.get("detail") or reason in {"queue_full", "superseded"}
 
 
 @pytest.mark.parametrize("reason", WITHOUT_A_STAGE)

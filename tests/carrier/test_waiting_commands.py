@@ -132,6 +132,22 @@ def drives(stage: Rehearsing, ns: int) -> None:
 # ---- deadmen
 
 
+def test_a_command_in_the_queue_is_dropped_when_another_route_takes_over(rehearse: Rehearse) -> None:
+    """Else it would leave after the newer command, which has priority."""
+    paced = rehearse(PACED.replace("priority: command", "priority: bulk", 1))
+    paced.receive(large(paced, "pump_info", 1400))
+    paced.receive(TURN, BASESTATION)  # waits for the bandwidth
+    paced.pass_time(10 * MS)
+    paced.receive(enveloped(pump_info={}))
+    assert paced.dropped("manual_drive", "far_board")["superseded"] == 1
+    paced.pass_time(SECOND)
+    assert paced.many(TURN) == 0
+    paced.receive(TURN, BASESTATION)
+    paced.pass_time(10 * MS)
+    assert paced.many(TURN) == 1
+    paced.assert_counters_balance()
+
+
 def test_commands_beside_more_bulk_than_the_budget_are_neither_late_nor_stale(paced: Rehearsing) -> None:
     bulk = large(paced, "ph_info", 15_000)
     for _ in range(20):

@@ -58,7 +58,11 @@ routes:
   drive_motor:
     source: basestation
     ttl: 1h
-    destinations: [{{endpoint: driving_board, when: "distance_to_go > 0.5 and source == 'basestation'"}}]
+    destinations:
+      - endpoint: driving_board
+        when: "distance_to_go > 0.5 and source == 'basestation'"
+        max_rate: 1000000 Hz
+        on_limit: latest   # so commands of manual_drive may supersede held ones
     deadman: {{timeout: 1h, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], disarmed_by: [manual_drive]}}
   manual_brake: {{source: any, destinations: [driving_board]}}
   detected_object:

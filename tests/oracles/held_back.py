@@ -18,13 +18,14 @@ Fate = Callable[[int, "Message", str], None]
 
 @dataclass(frozen=True)
 class Message:
-    """`expires` is None for no expiry. `rank` is the rank of its priority, commands first."""
+    """`expires` is None for no expiry. `rank` is the rank of its priority, commands first. `arrived` is a time."""
 
     number: int
     target: object
     size: int = 0
     expires: int | None = None
     rank: int = 0
+    arrived: int = 0
 
     def is_stale(self, now: int) -> bool:
         return self.expires is not None and now > self.expires
@@ -35,6 +36,8 @@ class Pacer:
         self._bandwidth = bandwidth
         self._fate = fate
         self._waiting: list[Message] = []
+        self._superseded: set[int] = set()
+        """Numbers of messages that are lost already, but take room until they are the first."""
         self._paid_at = -BURST
         self.has_ended = False
         self.next_due: int | None = None
@@ -54,7 +57,8 @@ class Pacer:
             lowest = max(each.rank for each in self._waiting)
             oldest = next(each for each in self._waiting if each.rank == lowest)
             self._waiting.remove(oldest)
-            self._fate(now, oldest, "queue_full")
+            if oldest.number not in self._superseded:
+                self._fate(now, oldest, "queue_full")
 
     def serve(self, now: int) -> None:
         self._limit_savings(now)
@@ -65,6 +69,15 @@ class Pacer:
         for each in sorted(filter(leaves, self._waiting), key=lambda each: each.rank):
             self._send(now, each)
         self._limit_savings(now)
+
+    def supersede(self, now: int, before: int, target: object) -> None:
+        lost = [each for each in self._waiting if each.target == target and each.number not in self._superseded]
+        for each in sorted(lost, key=lambda each: each.rank):
+            if each.arrived <= before:
+                self._superseded.add(each.number)
+                self._fate(now, each, "superseded")
+        if any(each.target == target for each in self._waiting):
+            self.next_due = now
 
     def end(self, now: int) -> None:
         """Send all queued messages, regardless of the bandwidth."""
@@ -85,16 +98,19 @@ class Pacer:
         for rank in range(3):
             while (first := self._first(rank)) is not None:
                 may_go_at = self._paid_at + (self.cost(first.size) if rank else -overdraft)
-                if now < may_go_at and not first.is_stale(now):
+                is_lost = first.is_stale(now) or first.number in self._superseded
+                if now < may_go_at and not is_lost:
                     ends = [] if first.expires is None else [first.expires + 1]
                     self.next_due = min([may_go_at + BURST // 2, *ends])
                     return
                 self._send(now, first)
-                if first.is_stale(now):
+                if is_lost:
                     self._limit_savings(now)
 
     def _send(self, now: int, message: Message) -> None:
         self._waiting.remove(message)
+        if message.number in self._superseded:
+            return
         if message.is_stale(now):
             self._fate(now, message, "stale")
         else:
@@ -132,6 +148,14 @@ class Deferral:
     def serve(self, now: int) -> None:
         if self.held is not None and (self.held.is_stale(now) or self.limit.may_pass(now)):
             self._release(now)
+
+    def supersede(self, now: int, before: int, target: object) -> None:
+        """Drop what arrived before a command of a route that takes over."""
+        if self.held is not None and self.held.arrived <= before:
+            held, self.held, self.next_due = self.held, None, None
+            self.fate(now, held, "superseded")
+        if self.pacer is not None:
+            self.pacer.supersede(now, before, target)
 
     def change(self, now: int, hertz: float | None) -> None:
         """Reload. If the rate changes, send the held message now."""

@@ -182,7 +182,7 @@ class Model:
         ttl = self.table.ttl.get(target.route)
         expires = None if ttl is None else event + ttl
         self._messages.append((target, data))
-        message = Message(len(self._messages) - 1, (target.place, source), len(data), expires, target.rank)
+        message = Message(len(self._messages) - 1, (target.place, source), len(data), expires, target.rank, self.now)
         limit: RateLimit | None = self._kept.get(_limit_key(self.table, target, source))
         deferral: Deferral | None = self._kept.get(_deferral_key(self.table, target, source))
         if target.only_positive and number <= 0:
@@ -206,9 +206,18 @@ class Model:
         elif not target.feeds:
             self._tell(target, "sent", data)
         else:
+            for name in target.feeds:
+                if name != target.route:
+                    self._supersede(name, target.label, message.arrived)
             feeds = [(self._deadman_timers[name].deadman, name != target.route) for name in target.feeds]
             self._deadmen.command(now, feeds, target.label, data)
             self._tell_deadmen(target.route, False)
+
+    def _supersede(self, route: str, label: str, before: int) -> None:
+        """Drop older commands of a route to an endpoint, which would leave after this one."""
+        for key, kept in self._kept.items():
+            if isinstance(kept, Deferral) and key[1][0] == (route, label):
+                kept.supersede(self.now, before, key[1])
 
     def _tell(self, target: Target, what: str, data: bytes = b"") -> None:
         self.happened.append(Happened(self.now, *target.place, what, data))

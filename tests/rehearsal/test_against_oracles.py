@@ -70,7 +70,8 @@ routes:
     destinations: [{{endpoint: wheels{drive}}}]
     deadman: {{timeout: {timeout}ms, repeat: {repeat}ms, send: {{brake: {{number: 1}}}}, disarmed_by: [arm],
                to: [wheels], because: this is a test}}
-  arm: {{source: operator, ttl: {ttl}ms, destinations: [wheels], deadman: {{none: not in this test}}}}
+  arm:
+    {{source: operator, ttl: {ttl}ms, destinations: [{{endpoint: wheels{arm}}}], deadman: {{none: not in this test}}}}
   part:
     source: operator
     collect: {{by: frame, count: count, order: place, timeout: {collect}ms}}
@@ -124,6 +125,7 @@ CHOICES: Mapping[str, list[Any]] = {
     "bulk": [To(), To(), *RATES],
     "topic": [*RATES, *CONDITIONS],
     "drive": RATES,
+    "arm": [To(), To(), *RATES],
     "orders": RATES,
     "frames": RATES,
     "ttl": [None, None, TTL],
@@ -145,6 +147,7 @@ class Setting:
     bulk: To
     topic: To
     drive: To
+    arm: To
     orders: To
     frames: To
     ttl: int | None
@@ -184,7 +187,7 @@ class Setting:
                 target("telemetry", "latest", self.topic, is_topic=True),
                 target("bulk", "operator", self.bulk, rank=BULK),
                 target("drive", "wheels", self.drive, feeds=("drive",), **command),
-                target("arm", "wheels", To(), feeds=("drive",), **command),
+                target("arm", "wheels", self.arm, feeds=("drive",), **command),
                 target("part", "frames", self.frames, is_topic=True),
                 target("orders", "wheels", self.orders, **command),
             ),

@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "defer.h"
 #include "deliver.h"
 
 /* In ns: the delay before a failed datagram of the start is sent again; how long after the start a newly discovered
@@ -145,6 +146,8 @@ static uint64_t redirected(const struct feed *feed) {
 }
 
 static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
+    for (uint32_t index = 0; index < feed->superseded_count; index++)
+        deferral_supersede(timers, feed->superseded[index], now);
     struct deadman *deadman = feed->deadman->acting;
     uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
     if (!to) return;

@@ -9,6 +9,9 @@
  * hands over to disarms it. Destinations that the route itself never commands follow: they are armed by each command, and
  * disarmed when no commanded one is armed any more.
  *
+ * What the deadman's route still holds for a destination when it is disarmed is dropped: it would leave after the newer
+ * command.
+ *
  * A failed command changes nothing: the deadman trips unless another one is sent. If the receiver refused an earlier
  * command, a sent command arms the destination but does not extend the deadline. Datagrams sent at router start change no
  * state. */
@@ -44,13 +47,15 @@ struct deadman_destination {
 };
 
 struct deadman;
+struct deferral;
 
 /* The effect of a sent command on a deadman. */
 struct feed {
     struct deadman *deadman;
-    uint64_t to;      /* a bit for each destination that the command arms or disarms, without those that follow */
+    uint64_t to; /* a bit for each destination that the command arms or disarms, without those that follow */
+    struct deferral *const *superseded; /* what holds commands that the command replaces (deferral_supersede) */
+    uint32_t superseded_count;
     uint32_t disarms; /* 1: the command is from a route that the deadman hands over to */
-    uint32_t reserved;
 };
 
 /* Add a deadman, with its timeout and repetition in ns. Returns NULL if memory runs out. `starts`: it sends at router start.

@@ -12,7 +12,7 @@ struct deferral {
     struct pacer *pacer;  /* NULL without a bandwidth */
     struct limit limit;   /* for `on_limit: latest`; otherwise its period is 0 */
     struct output held;
-    int64_t expires; /* of the held message */
+    int64_t expires, arrived; /* of the held message */
     bool is_held;
     bool has_ended; /* no longer holds messages */
 };
@@ -41,7 +41,8 @@ static void forget(struct timers *timers, struct deferral *deferral) {
 }
 
 /* Keep a message until it may pass. The machine's output is not copied. */
-static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires) {
+static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
+                 int64_t now) {
     struct output *written = &stage->machine.output;
     deferral->held.size = 0;
     if (data == written->data) {
@@ -52,6 +53,7 @@ static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *
     }
     deferral->is_held = true;
     deferral->expires = expires;
+    deferral->arrived = now;
     timer_set_due(stage->timers, &deferral->timer, deferral->limit.next_pass);
 }
 
@@ -68,7 +70,9 @@ static void release(struct timers *timers, struct deferral *deferral, int64_t no
         exchange(held, &timers->stage->machine.output);
         held = &timers->stage->machine.output;
     }
+    timers->arrived = deferral->arrived;
     pass_on(timers, deferral, held->data, held->size, deferral->expires, now);
+    timers->arrived = NEVER;
 }
 
 static void offer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
@@ -78,7 +82,7 @@ static void offer(struct stage *stage, struct deferral *deferral, const uint8_t 
         forget(stage->timers, deferral);
         pass_on(stage->timers, deferral, data, size, expires, now);
     } else {
-        hold(stage, deferral, data, size, expires);
+        hold(stage, deferral, data, size, expires, now);
     }
 }
 
@@ -98,7 +102,8 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
         if (timers->is_abandoned) return;
         deferral->limit = (struct limit){period, period - period / 2, -period};
     }
-    deferral->of = (struct route_target){to, target};
+    deferral->of.to = to;
+    deferral->of.target = target;
     timers_add(timers, timer);
 }
 
@@ -123,6 +128,14 @@ bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, 
     bool goes_on = !timers->is_abandoned;
     pthread_mutex_unlock(&timers->lock);
     return goes_on;
+}
+
+void deferral_supersede(struct timers *timers, struct deferral *deferral, int64_t now) {
+    if (deferral->is_held && deferral->arrived <= timers->arrived) {
+        forget(timers, deferral);
+        lose_superseded(timers->stage, &deferral->of, now);
+    }
+    if (deferral->of.queued) pacer_supersede(timers, deferral->pacer, &deferral->of, now);
 }
 
 struct deferral *deferral_open(struct pacer *pacer) {

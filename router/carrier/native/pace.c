@@ -10,11 +10,12 @@ enum { LEAST_OVERDRAFT = 2048 };               /* bytes, if that is more than OV
 
 /* The header of a waiting datagram, which follows, padded to a multiple of 8 bytes. */
 struct waiting_datagram {
-    const struct route_target *of;
-    int64_t expires;
+    struct route_target *of;
+    int64_t expires, arrived;
     int64_t cost; /* ns of budget */
     size_t size;
 };
+static const int64_t SUPERSEDED = INT64_MIN; /* expires: it is lost already, and only takes room until it is the first */
 enum { LONGEST_WAITING = sizeof(struct waiting_datagram) + LONGEST_SENT + 8 };
 
 /* Datagrams of one priority, the oldest first: between `first` and `end`, or if they wrap around, between `first` and `limit`
@@ -103,6 +104,7 @@ static const struct waiting_datagram *take_off(struct pacer *pacer, struct lane 
     const struct waiting_datagram *taken = take(lane);
     pacer->bytes_left += (int64_t)taken->size;
     pacer->datagrams_left++;
+    taken->of->queued--;
     return taken;
 }
 
@@ -110,12 +112,15 @@ static const struct waiting_datagram *take_off(struct pacer *pacer, struct lane 
 static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *lane, int64_t now) {
     const struct waiting_datagram *first = take_off(pacer, lane);
     const struct route_target *of = first->of;
+    if (first->expires == SUPERSEDED) return false;
     if (now > first->expires) {
         lose_stale(timers->stage, of->to, of->target, now, first->expires, REFUSED_WAITING);
         return false;
     }
     pacer->paid_at += first->cost;
+    timers->arrived = first->arrived;
     deliver_now(timers->stage, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);
+    timers->arrived = NEVER;
     return true;
 }
 
@@ -140,7 +145,9 @@ static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64
 static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
     int lowest = PRIORITIES - 1;
     while (!pacer->lanes[lowest].count) lowest--;
-    const struct route_target *of = take_off(pacer, &pacer->lanes[lowest])->of;
+    const struct waiting_datagram *oldest = take_off(pacer, &pacer->lanes[lowest]);
+    const struct route_target *of = oldest->of;
+    if (oldest->expires == SUPERSEDED) return;
     lose_message(timers->stage, of->to, of->target, now, (struct lost_event){.reason = LOSS_QUEUE_FULL}, "");
 }
 
@@ -171,9 +178,10 @@ static const struct timer_kind PACER = {.serve = serve, .adopt = adopt, .end = e
 
 /* ---- public ---- */
 
-void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
+void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target *of, const uint8_t *data, size_t size,
                  int64_t expires, int64_t now) {
-    struct waiting_datagram waiting = {of, expires, cost_of(pacer, size), size};
+    int64_t arrived = timers->arrived == NEVER ? now : timers->arrived;
+    struct waiting_datagram waiting = {of, expires, arrived, cost_of(pacer, size), size};
     if (pacer->has_ended) {
         deliver_now(timers->stage, of->to, of->target, data, size, expires, now);
         return;
@@ -182,6 +190,7 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_
     put(&pacer->lanes[of->target->priority], &waiting, data);
     pacer->bytes_left -= (int64_t)size;
     pacer->datagrams_left--;
+    of->queued++;
     timer_set_due(timers, &pacer->timer, send_affordable(timers, pacer, now));
     while (pacer->bytes_left < 0 || pacer->datagrams_left < 0) drop_one(timers, pacer, now);
 }
@@ -201,6 +210,26 @@ void pacer_release(struct timers *timers, struct pacer *pacer, const struct rout
         }
     }
     limit_savings(pacer, now);
+}
+
+void pacer_supersede(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now) {
+    for (int index = 0; index < PRIORITIES; index++) {
+        struct lane *lane = &pacer->lanes[index];
+        size_t at = lane->first;
+        for (uint32_t left = lane->count; left; left--) {
+            if (lane->goes_round && at == lane->limit) at = 0;
+            struct waiting_datagram *waiting = (struct waiting_datagram *)(lane->bytes + at);
+            at += whole_size(waiting->size);
+            if (waiting->of != of || waiting->expires == SUPERSEDED || waiting->arrived > timers->arrived) continue;
+            waiting->expires = SUPERSEDED;
+            lose_superseded(timers->stage, of, now);
+        }
+    }
+    timer_set_due(timers, &pacer->timer, now);
+}
+
+void lose_superseded(struct stage *stage, const struct route_target *of, int64_t now) {
+    lose_message(stage, of->to, of->target, now, (struct lost_event){.reason = LOSS_SUPERSEDED}, "");
 }
 
 struct pacer *pacer_open(int64_t bandwidth) {

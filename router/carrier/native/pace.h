@@ -27,6 +27,7 @@ enum { LONGEST_SENT = 65507 }; /* by UDP over IPv4 */
 struct route_target {
     const struct targets *to;
     const struct target *target;
+    uint32_t queued; /* by its pacer */
 };
 
 struct pacer;
@@ -35,10 +36,14 @@ struct pacer;
 struct pacer *pacer_open(int64_t bandwidth);
 void pacer_close(struct pacer *pacer);
 
-/* Call both with the lock of the group held. `pacer_queue` sends a datagram of up to LONGEST_SENT bytes now or later, or
- * drops it; `pacer_release` sends all waiting datagrams of `of` at once, whatever the budget. */
-void pacer_queue(struct timers *timers, struct pacer *pacer, const struct route_target *of, const uint8_t *data, size_t size,
+/* Call these with the lock of the group held. `pacer_queue` sends a datagram of up to LONGEST_SENT bytes now or later, or
+ * drops it; `pacer_release` sends all waiting datagrams of `of` at once, whatever the budget; `pacer_supersede` drops those
+ * that arrived before the command that is being sent. */
+void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target *of, const uint8_t *data, size_t size,
                  int64_t expires, int64_t now);
 void pacer_release(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);
+void pacer_supersede(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);
+
+void lose_superseded(struct stage *stage, const struct route_target *of, int64_t now);
 
 #endif

@@ -29,7 +29,7 @@ struct timers *timers_open_on(struct stage *stage, bool has_timer) {
         return NULL;
     }
     timers->stage = stage;
-    timers->wakes_at = NEVER;
+    timers->wakes_at = timers->arrived = NEVER;
     return timers;
 }
 

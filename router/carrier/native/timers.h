@@ -46,6 +46,7 @@ struct timers {
     pthread_mutex_t lock;
     struct stage *stage;
     bool has_own_stage;
+    int64_t arrived;   /* when the message that is being delivered arrived, if it was held or queued; otherwise NEVER */
     bool is_abandoned; /* publishing returned ABANDONED: use nothing that belongs to others */
     int timer;    /* timerfd, readable from `wakes_at` on; -1 if the thread of the group waits without it */
     /* Nothing is due before this time (boot clock, ns); NEVER if nothing is due at all. May be read without the lock. It moves
