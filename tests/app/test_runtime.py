@@ -35,7 +35,7 @@ from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
 from router.recording.recorder import Recorder, RecordError
 from tests.acceptance.site import wait_until
-from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
+from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, numbered, udp
 from tests.ports import free_port
 from tests.recording.recorder_rig import read
 
@@ -114,6 +114,36 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
         "no commands arrive; the deadman sends in their place",
         "commands arrive again; the deadman has stopped sending",
     ]
+
+
+TWO_BOARDS = """\
+  manual_drive:
+    source: sensor_board
+    destinations: [first, {endpoint: second, max_rate: 4 Hz, on_limit: latest}]
+    ttl: 300ms
+    deadman: {timeout: 300ms, send: {manual_drive: {turn: 1}, manual_brake: {brake: true}}, at_start: silent,
+              disarmed_by: ph_info}
+  ph_info: {source: sensor_board, destinations: second, deadman: {none: for tests}}
+"""
+
+
+def test_who_takes_over_one_board_leaves_the_other_its_brake_and_gets_no_older_command(site: Site) -> None:
+    with udp("127.0.0.1") as first, udp("127.0.0.1") as second:
+        addresses = {"first": first.getsockname()[1], "second": second.getsockname()[1]}
+        endpoints = "".join(
+            f'  {name}: {{address: "127.0.0.1:{port}", kind: tool}}\n' for name, port in addresses.items()
+        )
+        with Router(site.program(TWO_BOARDS, endpoints)) as router:
+            site.send(DRIVE, DRIVE, numbered(1))  # the second board is to get its second command later
+            assert [first.recv(1000) for _ in range(4)] == [DRIVE, DRIVE, bytes.fromhex("c201021002"), BRAKE]
+            wait_until(lambda: router.total("deadman_datagrams_sent") >= 4)
+            assert router.total("deadman_trips") == 1
+            site.send(numbered(2))
+            assert [second.recv(1000) for _ in range(3)] == [DRIVE, numbered(1), numbered(2)]
+            assert router.total("messages_dropped") == 1
+        second.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            second.recv(1000)
 
 
 def test_what_a_deadman_sends_is_trimmed_for_who_asks_for_it(site: Site) -> None:

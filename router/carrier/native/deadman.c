@@ -146,11 +146,12 @@ static uint64_t redirected(const struct feed *feed) {
 }
 
 static void feed_one(struct timers *timers, const struct feed *feed, int64_t now) {
-    for (uint32_t index = 0; index < feed->superseded_count; index++)
-        deferral_supersede(timers, feed->superseded[index], now);
     struct deadman *deadman = feed->deadman->acting;
-    uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
-    if (!to) return;
+    uint64_t to = feed->to;
+    if (feed->disarms)
+        for (uint32_t index = 0; index < feed->superseded_count; index++)
+            deferral_supersede(timers, feed->superseded[index], now);
+    if (deadman != feed->deadman && !(to = redirected(feed))) return;
     if (feed->disarms) disarm(timers, deadman, to);
     else arm(timers, deadman, to, now);
 }

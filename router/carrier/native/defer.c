@@ -21,7 +21,7 @@ struct deferral {
 
 static void pass_on(struct timers *timers, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
                     int64_t now) {
-    const struct route_target *of = &deferral->of;
+    struct route_target *of = &deferral->of;
     bool can_leave = size <= LONGEST_SENT; /* otherwise sending fails, which is counted */
     if (deferral->pacer && !deferral->has_ended && can_leave)
         pacer_queue(timers, deferral->pacer, of, data, size, expires, now);
