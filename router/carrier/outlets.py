@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from router.carrier.deferrals import Adoption
 from router.carrier.limits import period
 from router.carrier.names import Names
 from router.carrier.state import Native, State
-from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan
+from router.compiler.program import Program, RoutePlan, TargetPlan
 from router.net.udp import Listener
 
 
@@ -38,10 +38,11 @@ class Publication(Addressed, Protocol):
 class Outlets:
     """The open sockets and topics of a program. `state` is that of its targets, passed on by key at a reload.
 
-    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` and their plans by route, `plans` of
-    all routes. Without `boards`, no limits of boards are checked.
+    `senders` and `bandwidths` are by endpoint, `publications` by topic, `deadmen` by route. Without `boards`, no limits
+    of boards are checked.
     """
 
+    program: Program
     library: ctypes.CDLL
     state: State
     names: Names
@@ -49,8 +50,6 @@ class Outlets:
     senders: Mapping[str, Addressed]
     publications: Mapping[str, Publication]
     deadmen: Mapping[str, NativeDeadman]
-    deadman_plans: Mapping[str, DeadmanPlan]
-    plans: Sequence[RoutePlan]
     bandwidths: Mapping[str, int]
     boards: NativeBoards | None = None
 
@@ -68,6 +67,7 @@ class Outlets:
     ) -> Outlets:
         """Return the outlets of a program, with its deadmen in `group`. Raises MemoryError."""
         return cls(
+            program=program,
             library=group.library,
             state=state,
             names=group.names,
@@ -75,21 +75,20 @@ class Outlets:
             senders=senders,
             publications=publications,
             deadmen={plan.route: group.get_or_open(plan, program.counters, senders, state) for plan in program.deadmen},
-            deadman_plans={plan.route: plan for plan in program.deadmen},
-            plans=(*program.routes,),
             bandwidths={each.name: each.bandwidth for each in program.senders if each.bandwidth is not None},
             boards=boards,
         )
 
     def feed(self, route: str, endpoint: str, *, disarms: bool) -> c.Feed:
         """Return the effect of commands to an endpoint on the deadman of a route."""
-        return feed_of(self.deadman_plans[route], self.deadmen[route], endpoint, disarms=disarms)
+        (plan,) = (each for each in self.program.deadmen if each.route == route)
+        return feed_of(plan, self.deadmen[route], endpoint, disarms=disarms)
 
     def holding(self, route: str, endpoint: str) -> list[Native]:
         """Return the deferrals that hold commands of a route to an endpoint."""
         return [
             self.deferral(plan, target, source)
-            for plan in self.plans
+            for plan in self.program.routes
             if plan.route == route
             for target in plan.targets
             if target.label == endpoint and target.is_deferred and not target.is_topic

@@ -145,6 +145,7 @@ class Publishing:
     def _made(self, program: Program, generation: int) -> NativeProgram:
         listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         outlets = Outlets(
+            program=program,
             library=self._library,
             state=self._state,
             names=self._names,

@@ -95,6 +95,7 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         counters = (ctypes.c_int64 * (1 << 12))()
         deadmen = Deadmen(library, (ctypes.c_int64 * (1 << 12))(), Ring(library, 1 << 12), names)
         outlets = Outlets(
+            program=made,
             library=library,
             state=State(library),
             names=names,
