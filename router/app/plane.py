@@ -20,7 +20,7 @@ from router.carrier.boards import NativeBoards
 from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
 from router.carrier.deadmen import NativeDeadman, replaced, successors
 from router.carrier.deferrals import Adoption, timer_change
-from router.carrier.events import EventReader, EventThread
+from router.carrier.events import DeadmanEvents, EventReader, EventThread
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
@@ -82,14 +82,14 @@ class Built:
 
 
 class Plane:
-    """Receives, forwards, publishes and brakes. `changed` is called with a route and whether its deadman is tripped."""
+    """Receives, forwards, publishes and brakes. `of_deadmen` gets the events of deadmen."""
 
     def __init__(
         self,
         forwarding: Forwarding,
         counts: ThreadCounts,
         reporter: Reporter,
-        changed: Callable[[str, bool], None],
+        of_deadmen: Callable[[DeadmanEvents], None],
         first: Program,
         head_start: HeadStart | None = None,
     ) -> None:
@@ -117,7 +117,7 @@ class Plane:
             counts.add_thread(thread)
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
         reader = EventReader(self._names, self._why_rejected, self._where_refused)
-        self._events = EventThread(threads, reader, reporter.report, changed, self._pulse)
+        self._events = EventThread(threads, reader, reporter.report, of_deadmen, self._pulse)
 
     @property
     def turns(self) -> int:

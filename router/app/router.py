@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from types import TracebackType
@@ -15,15 +15,17 @@ from router.app.plane import Plane
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
+from router.carrier.events import DeadmanChange, DeadmanEvents
 from router.carrier.forwarding import Forwarding
 from router.carrier.library import load
 from router.clock import boottime_ns
-from router.compiler.metrics import Mismatch
+from router.compiler.metrics import Answer, Evidence, Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.kept.head_start import HeadStart
 from router.log import logger
 from router.net.udp import Listener
+from router.observe.obedience import Obedience, Said
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
@@ -69,9 +71,10 @@ class Router:
         self._first = program
         self._start = start
         self._reporter = Reporter(self._address_of)
+        self._obedience = Obedience()
         self._counts = ThreadCounts(program.counters)
         forwarding = head_start.forwarding if head_start else Forwarding(load(), program.counters.size)
-        plane = Plane(forwarding, self._counts, self._reporter, self._deadman_changed, program, head_start)
+        plane = Plane(forwarding, self._counts, self._reporter, self._of_deadman, program, head_start)
         self.mirror = Mirror(plane, self._reporter.failed)
         self._runtime = Runtime(plane, self._reporter, ros_args)
         if head_start is not None:
@@ -157,6 +160,9 @@ class Router:
     def mismatches(self) -> Mapping[Mismatch, int]:
         return self._reporter.mismatches()
 
+    def said(self) -> Said:
+        return self._obedience.said()
+
     def progress(self) -> int:
         return self._runtime.plane.turns + self.total("datagrams_received")
 
@@ -183,11 +189,24 @@ class Router:
         self._services.open(opening, (self._runtime.node_name, diagnostics.publish) if diagnostics else None)
         opening.callback(self.mirror.close)
 
+    def _of_deadman(self, event: DeadmanEvents) -> None:
+        match event:
+            case DeadmanChange(route, is_tripped):
+                self._deadman_changed(route, is_tripped)
+            case Answer():
+                self._obedience.answered(event, self.program)
+                self._services.board_answered(event)
+            case Evidence():
+                self._obedience.note(event, self.program)
+
     def _deadman_changed(self, route: str, active: bool) -> None:
-        plans = (*self.program.deadmen, *self.program.client_deadmen)
-        self._reporter.deadman_changed(route, active, {plan.route: plan for plan in plans}.get(route))
+        self._obedience.forget(route)
+        plans = {plan.route: plan for plan in (*self.program.deadmen, *self.program.client_deadmen)}
+        self._reporter.deadman_changed(route, active, plan := plans.get(route))
         if active:
-            self._services.deadman_tripped(route)
+            self._services.deadman_tripped(route, plan.obeyed.endpoints if plan and plan.obeyed else ())
+        else:
+            self._services.deadman_released(route)
 
     def _watch(self) -> None:
         """Watch the network interfaces of listeners, and the table's files if the table says so."""
@@ -297,10 +316,20 @@ class Services:
             if endpoint.stale_after is not None:
                 yield (endpoint.name, endpoint.kind.value), endpoint.stale_after / 1e9
 
-    def deadman_tripped(self, route: str) -> None:
-        """Save the last datagrams. Called when a deadman trips; returns at once."""
+    def deadman_tripped(self, route: str, awaited: Iterable[str]) -> None:
+        """Save the last datagrams once the `awaited` boards have answered. Returns at once, as the next two do."""
         if self._recorder is not None:
-            self._recorder.deadman_tripped(route)
+            self._recorder.deadman_tripped(route, awaited)
+
+    def board_answered(self, answer: Answer) -> None:
+        if self._recorder is not None:
+            after = f"{answer.after / 1e9:.2f} s"
+            said = f"stopped after {after}" if answer.obeys else f"did not obey for {after}"
+            self._recorder.board_answered(answer.route, answer.endpoint, said)
+
+    def deadman_released(self, route: str) -> None:
+        if self._recorder is not None:
+            self._recorder.deadman_released(route)
 
     def save_recording(self, reason: str) -> None:
         """Start to save, and return at once; the result is logged. Not thread-safe.

@@ -143,6 +143,7 @@ def destinations_of(
             id=names.number(name),
             follows=name in plan.following,
             **{kind: outlet.address},
+            **_obeyed(plan, name, counters),
         )
         for (name, datagrams), outlet in zip(plan.datagrams, outlets, strict=True)
     ]
@@ -162,3 +163,14 @@ def feed_of(plan: DeadmanPlan, deadman: Addressed, endpoint: str, *, disarms: bo
 def datagrams_of(datagrams: Collection[bytes]) -> ctypes.Array[c.DeadmanDatagram]:
     """Return the datagrams for one destination."""
     return (c.DeadmanDatagram * len(datagrams))(*(c.DeadmanDatagram(data=each, size=len(each)) for each in datagrams))
+
+
+def _obeyed(plan: DeadmanPlan, name: str, counters: Counters) -> Mapping[str, int]:
+    """Return the fields of a destination that say within which time it must obey, and the counters for that."""
+    if plan.obeyed is None or name not in plan.obeyed.endpoints:
+        return {}
+    return {
+        "within": plan.obeyed.within,
+        "disobeyed": counters.index("deadman_disobeyed", plan.route, name),
+        "stopping": counters.index("deadman_stopping_seconds", plan.route, name),
+    }

@@ -8,13 +8,13 @@ import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from socket import inet_ntoa
-from typing import cast
+from typing import Union, cast
 
 from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
-from router.compiler.metrics import Mismatch, Report
-from router.declared import NO_NAME, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
+from router.compiler.metrics import Answer, Evidence, Mismatch, Report
+from router.declared import NO_NAME, AnswerEvent, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
@@ -36,6 +36,9 @@ class CountedReport:
     report: Report
 
 
+DeadmanEvents = Union[DeadmanChange, Answer, Evidence]
+
+
 class EventReader:
     """Converts records of `native/events.h` to reports.
 
@@ -53,11 +56,13 @@ class EventReader:
         self._detail = detail
         self._place = place
 
-    def read(self, kind: int, record: memoryview) -> DeadmanChange | CountedReport:
+    def read(self, kind: int, record: memoryview) -> DeadmanEvents | CountedReport:
         if kind == EventKind.REJECTED:
             return self._rejected(record)
         if kind == EventKind.LOST:
             return self._lost(record)
+        if kind in {EventKind.OBEYED, EventKind.DISOBEYED, EventKind.EVIDENCE}:
+            return self._answer(kind, record)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -67,6 +72,13 @@ class EventReader:
         return CountedReport(
             event.counter, Report("deadman", route, self._name(event.destination), "send_error", error)
         )
+
+    def _answer(self, kind: int, record: memoryview) -> Answer | Evidence:
+        event, begin = AnswerEvent.from_buffer(record), ctypes.sizeof(AnswerEvent)
+        place = self._name(event.deadman), self._name(event.destination)
+        if kind == EventKind.EVIDENCE:
+            return Evidence(*place, bytes(record[begin : begin + event.after]))
+        return Answer(*place, kind == EventKind.OBEYED, event.after)
 
     def _rejected(self, record: memoryview) -> CountedReport:
         event, begin = RejectedEvent.from_buffer(record), ctypes.sizeof(RejectedEvent)
@@ -95,7 +107,7 @@ class EventThread:
     """Reads the events of native threads, and calls `pulse` every few seconds to signal that Python is alive.
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
-    that the event names. `changed` gets a route and whether its deadman has tripped.
+    that the event names. `of_deadmen` gets everything else.
     """
 
     def __init__(
@@ -103,13 +115,13 @@ class EventThread:
         threads: Sequence[NativeThread],
         reader: EventReader,
         report: Callable[[Report], None],
-        changed: Callable[[str, bool], None],
+        of_deadmen: Callable[[DeadmanEvents], None],
         pulse: Callable[[], None],
     ) -> None:
         self._threads = threads
         self._reader = reader
         self._report = report
-        self._changed = changed
+        self._of_deadmen = of_deadmen
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
@@ -155,10 +167,10 @@ class EventThread:
         self, kind: int, record: memoryview, counters: Sequence[int], last: dict[int, tuple[int, Report]]
     ) -> None:
         match self._reader.read(kind, record):
-            case DeadmanChange(route, is_tripped):
-                self._changed(route, is_tripped)
             case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
+            case of_deadman:
+                self._of_deadmen(of_deadman)
 
     def _count(
         self, counter: int, report: Report, counters: Sequence[int], last: dict[int, tuple[int, Report]]

@@ -140,7 +140,8 @@ def _plain(argument: object) -> object:
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), [_bytes(datagram) for datagram in each.datagrams[: each.count]], each.sent,
-             each.send_errors, each.id, each.follows)
+             each.send_errors, each.id, each.follows, each.within,
+             each.disobeyed, each.stopping)
             for each in argument
         ]  # fmt: skip
     if isinstance(argument, int) and argument >= _FIRST:

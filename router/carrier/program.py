@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from router import declared as c
 from router.carrier.arrays import Arrays
 from router.carrier.deadmen import NativeDeadman
+from router.carrier.lowered import Routines
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
@@ -161,7 +162,32 @@ class _Writer:
         )
         if topics:
             made.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
+        awaited = [*self._awaited(plan)]
+        made.witnesses = self.made.arrays.array(c.Witness, [self._witness(*each) for each in awaited])
+        made.witness_count = len(awaited)
+        for index, (deadman, _) in enumerate(awaited):
+            self.made.states.add_witness(self.outlets, made.witnesses[index], deadman)
         return made
+
+    def _awaited(self, plan: RoutePlan) -> Iterator[tuple[str, str]]:
+        """Yield the deadmen, by route, that await messages of this route, each with an endpoint that sends them."""
+        for deadman in self.program.deadmen:
+            if deadman.obeyed is not None and deadman.obeyed.case == plan.case.name:
+                yield from ((deadman.route, name) for name in deadman.obeyed.endpoints if name in plan.sources)
+
+    def _witness(self, deadman: str, endpoint: str) -> c.Witness:
+        """Make a witness without its deadman."""
+        lowered = self.program.lowered.obeyed[deadman]
+        routines = Routines(lowered.layout, self.made.arrays)
+        routine = routines.routine(lowered.routine)
+        return c.Witness(
+            condition=routine,
+            layout=routines.layout(),
+            sources=self.targets.names_of_senders(),
+            column=self.columns[endpoint],
+            deadman_id=self.outlets.names.number(deadman),
+            endpoint_id=self.outlets.names.number(endpoint),
+        )
 
 
 def _number(host: str) -> int:

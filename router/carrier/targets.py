@@ -34,6 +34,7 @@ class TargetStates:
     adopted: list[Adoption] = field(default_factory=list)
     _targets: list[tuple[c.Targets, RoutePlan, Sequence[TargetPlan], Sources]] = field(default_factory=list)
     _collects: list[tuple[c.Targets, c.Collect, RoutePlan]] = field(default_factory=list)
+    _witnesses: list[tuple[c.Witness, str]] = field(default_factory=list)
     bound: Arrays = field(default_factory=Arrays)
 
     def add(
@@ -45,6 +46,11 @@ class TargetStates:
     def add_collector(self, outlets: Outlets, made: c.Targets, collect: c.Collect, plan: RoutePlan) -> None:
         self._collects.append((made, collect, plan))
         self._bind_collector(outlets, made, collect, plan)
+
+    def add_witness(self, outlets: Outlets, made: c.Witness, deadman: str) -> None:
+        """Add a witness of the deadman of a route."""
+        self._witnesses.append((made, deadman))
+        made.deadman = outlets.deadmen[deadman].address
 
     def release(self) -> None:
         """Release the state. No message may be delivered before the next `bind`."""
@@ -58,6 +64,8 @@ class TargetStates:
             self._bind(outlets, *targets)
         for collects in self._collects:
             self._bind_collector(outlets, *collects)
+        for made, deadman in self._witnesses:
+            made.deadman = outlets.deadmen[deadman].address
 
     def _bind(
         self, outlets: Outlets, made: c.Targets, plan: RoutePlan, targets: Sequence[TargetPlan], sources: Sources
@@ -121,7 +129,7 @@ class TargetWriter:
             collect = native_collect(lowered.collect, routines, self._ids_of_senders())
             made.collect = ctypes.pointer(self.arrays.add(collect))
             self.states.add_collector(self.outlets, made, collect, plan)
-        made.layout, made.sources = routines.layout(), self._names_of_senders()
+        made.layout, made.sources = routines.layout(), self.names_of_senders()
         return made
 
     def targets(
@@ -196,7 +204,7 @@ class TargetWriter:
     def _labels_of_senders(self) -> list[str]:
         return [*self.program.table.endpoints, source_label(STRANGER)]
 
-    def _names_of_senders(self) -> Any:
+    def names_of_senders(self) -> Any:
         """Return values with the senders' names, by column."""
         if self._sources is None:
             self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)

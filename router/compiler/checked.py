@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
-from router.compiler.program import DeadmanPlan
+from router.compiler.program import DeadmanPlan, ObeyedPlan
 from router.errors import SourceSpan
 from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
@@ -91,6 +91,15 @@ class CheckedCollect:
 
 
 @dataclass(frozen=True, slots=True)
+class CheckedObeyed:
+    """What shows that a deadman's brake is obeyed: a message of `case` that meets the condition `when`."""
+
+    when: Node
+    case: PayloadCase
+    plan: ObeyedPlan
+
+
+@dataclass(frozen=True, slots=True)
 class CheckedRoute:
     """A route whose payload case exists. If there are errors, it is not compiled.
 
@@ -103,3 +112,4 @@ class CheckedRoute:
     subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
     deadman: DeadmanPlan | None = None
+    obeyed: CheckedObeyed | None = None

@@ -10,13 +10,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from router.declared import HISTOGRAM_BOUNDS
+
 
 @dataclass(frozen=True, slots=True)
 class Metric:
     """One metric. `kind` is counter, histogram, number, level, or time (nanoseconds in the counters, seconds exported).
 
     One thread sets a number or a time; several add to a level and subtract from it. A metric that `tells_commands` is
-    also exported with the label COMMAND, which follows from its `route` and `target`.
+    also exported with the label COMMAND, which follows from its `route` and `target`. `bounds` (ns) are a histogram's.
     """
 
     name: str
@@ -24,6 +26,7 @@ class Metric:
     labels: tuple[str, ...]
     help: str
     tells_commands: bool = False
+    bounds: tuple[int, ...] = ()
 
     @property
     def exported_labels(self) -> tuple[str, ...]:
@@ -33,6 +36,15 @@ class Metric:
 COMMAND = "command"
 """The label that is `true` for commands, else `false`."""
 
+
+LATENCY_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000))
+STOPPING_BOUNDS_NS = tuple(
+    ms * 1_000_000 for ms in (20, 50, 100, 200, 500, 1000, 2000, 3000, 5000, 10_000, 20_000, 30_000)
+)
+"""Bounds of histograms, as in `native/counters.h`."""
+
+HISTOGRAM_CELLS = HISTOGRAM_BOUNDS + 2
+"""Consecutive indexes of a histogram: one for each bound, one for everything slower, and the sum (ns)."""
 
 METRICS = (
     Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
@@ -70,6 +82,7 @@ METRICS = (
         "histogram",
         ("route",),
         "Time from receipt of a message until it is forwarded, and delivered or queued for all other targets.",
+        bounds=LATENCY_BOUNDS_NS,
     ),
     Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last accepted a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
@@ -85,6 +98,19 @@ METRICS = (
         "Datagrams that the deadman sent, including those at the start.",
     ),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
+    Metric(
+        "deadman_disobeyed",
+        "number",
+        ("route", "endpoint"),
+        "1 while the deadman sends and the endpoint does not show within the time of `obeyed` that it has stopped.",
+    ),
+    Metric(
+        "deadman_stopping_seconds",
+        "histogram",
+        ("route", "endpoint"),
+        "Time from the first brake until the endpoint showed that it had stopped.",
+        bounds=STOPPING_BOUNDS_NS,
+    ),
     Metric("gateway_clients", "number", ("route",), "Current clients of a gateway."),
     Metric(
         "gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of the router's."
@@ -214,18 +240,12 @@ QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")
 UNKNOWN_CASE = "unknown"
 """The `payload_case` label of a field number that the envelope does not have."""
 
-HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000))
-
 
 class Series(NamedTuple):
     """A metric with its label values, in the metric's order."""
 
     metric: str
     labels: tuple[str, ...]
-
-
-HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
-"""Consecutive indexes of a histogram: one for each bound, one for everything slower, and the sum (ns)."""
 
 
 class Mismatch(NamedTuple):
@@ -252,6 +272,25 @@ class Report:
     detail: str = ""
     times: int = 1
     mismatch: Mismatch | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Whether an endpoint obeys the brake of a route's deadman, `after` ns from when the deadman tripped."""
+
+    route: str
+    endpoint: str
+    obeys: bool
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """A datagram that shows that an endpoint does not obey the brake of a route's deadman, or not yet."""
+
+    route: str
+    endpoint: str
+    data: bytes
 
 
 @dataclass(slots=True)

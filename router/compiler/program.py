@@ -79,6 +79,18 @@ class TargetPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ObeyedPlan:
+    """What shows that a deadman's brake is obeyed: a message of `case` from each of `endpoints`, `within` ns.
+
+    The condition on these messages is among the routines (`Lowered.obeyed`).
+    """
+
+    case: str
+    within: int
+    endpoints: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class DeadmanPlan:
     """A route's deadman: the datagrams that are sent if no fresh command was sent for `timeout` (all times in ns).
 
@@ -96,6 +108,7 @@ class DeadmanPlan:
     following: frozenset[str] = frozenset()
     disarmed_by: tuple[str, ...] = field(default=(), compare=False)
     watched: frozenset[tuple[str, str]] = field(default=frozenset(), compare=False)
+    obeyed: ObeyedPlan | None = None
 
 
 @dataclass(frozen=True, slots=True)

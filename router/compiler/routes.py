@@ -15,6 +15,7 @@ from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Va
 from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
+from router.compiler.obeyed import check_obeyed
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
@@ -105,7 +106,10 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         found = (topic_name_finding(topic), *qos_findings(topic, publishes=topic in route.topics))
         lookup.findings += [finding for finding in found if finding]
     checked = (check_outbound if route.is_outbound else check_inbound)(lookup, route, case)
-    return replace(checked, deadman=check_deadman(lookup, route))
+    deadman, obeyed = check_deadman(lookup, route), check_obeyed(lookup, route)
+    if deadman is not None and obeyed is not None:
+        deadman = replace(deadman, obeyed=obeyed.plan)
+    return replace(checked, deadman=deadman, obeyed=obeyed)
 
 
 def _sources(lookup: Lookup, route: Route) -> None:

@@ -95,6 +95,8 @@ def _open_deadman(counters: Counters, plan: DeadmanPlan) -> None:
     _open(counters, ("deadman_active", "deadman_trips"), plan.route)
     for to, _ in plan.datagrams:
         _open(counters, ("deadman_datagrams_sent", "deadman_send_errors"), plan.route, to)
+    for endpoint in plan.obeyed.endpoints if plan.obeyed else ():
+        _open(counters, ("deadman_disobeyed", "deadman_stopping_seconds"), plan.route, endpoint)
 
 
 def _open_gateway(counters: Counters, plan: GatewayPlan) -> None:

@@ -110,7 +110,7 @@ class HeadStart:
         if not isinstance(argument, list):
             return argument
         made = (c.DeadmanDestination * len(argument))()
-        for to, (sender, datagrams, sent, send_errors, number, follows) in zip(made, argument, strict=True):
+        for to, (sender, datagrams, sent, send_errors, number, follows, *obeyed) in zip(made, argument, strict=True):
             to.sender, to.datagrams, to.count = self._argument(sender, parts), datagrams_of(datagrams), len(datagrams)
             to.sent, to.send_errors, to.id, to.follows = sent, send_errors, number, follows
         return made

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import INTENDED_REASONS, Mismatch
+from router.observe.obedience import Said, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.table.model import ANY, EndpointKind
@@ -82,7 +83,8 @@ class Look:
 
     Times in seconds. `silence`: how long each endpoint has been silent, or has not been heard yet. `standing`: how long
     the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
-    `mismatches`: recent senders of messages that no route accepts from them.
+    `mismatches`: recent senders of messages that no route accepts from them. `said`: what boards report that do not
+    obey, by the deadman's route and the board.
     """
 
     program: Program
@@ -91,6 +93,7 @@ class Look:
     standing: float
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
+    said: Said = field(default_factory=dict)
 
     @property
     def now(self) -> Snapshot:
@@ -115,6 +118,7 @@ class Look:
             self._states(),
             self._silent(),
             self._tripped(),
+            self._disobeyed(),
             self._waiting(),
             *map(self._above, _GAUGES),
             *map(self._lost, _LOSSES),
@@ -235,6 +239,14 @@ class Look:
                 if silent := self.away[route]:
                     more += f", and {' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} silent"
             yield self._problem(kind, {"route": route}, more, (self._owner(route),))
+
+    def _disobeyed(self) -> Iterator[Problem]:
+        """Yield the boards that do not obey the brake of a deadman, with what was sent and what they report."""
+        for (route, endpoint), value in self.now.counts(Kind.DEADMAN_DISOBEYED.metric).items():
+            if value > Kind.DEADMAN_DISOBEYED.threshold:
+                labels = {"route": route, "endpoint": endpoint}
+                why = why_disobeyed(self.program, route, endpoint, self.said)
+                yield self._problem(Kind.DEADMAN_DISOBEYED, labels, f": {why}", (route,))
 
     def _waiting(self) -> Iterator[Problem]:
         """Yield topics whose publish calls are stuck, and messages that wait for a thread."""

@@ -11,7 +11,7 @@ from prometheus_client.metrics_core import Metric as Family
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 
-from router.compiler.metrics import COMMAND, HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, METRICS, Counters, Metric
+from router.compiler.metrics import COMMAND, HISTOGRAM_CELLS, METRICS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
 from router.observe.snapshot import BUCKETS, PREFIX
 
@@ -19,7 +19,6 @@ SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
 _EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
-_BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]
 """Returns the label values, in the metric's order, and the value of each current series."""
@@ -67,7 +66,8 @@ class CountersCollector(Collector):
             return
         for labels, index in self._indexes[metric.name]:
             if metric.kind == "histogram":
-                yield from _histogram(name, labels, [thread[index : index + HISTOGRAM_CELLS] for thread in threads])
+                cells = [thread[index : index + HISTOGRAM_CELLS] for thread in threads]
+                yield from _histogram(name, labels, metric.bounds, cells)
             elif metric.kind == "time":
                 yield Sample(name, labels, max(thread[index] for thread in threads) / 1e9)
             elif metric.kind == "number":
@@ -87,10 +87,12 @@ def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
         yield sample
 
 
-def _histogram(name: str, labels: dict[str, str], threads: Iterable[Sequence[int]]) -> Iterator[Sample]:
+def _histogram(
+    name: str, labels: dict[str, str], bounds: Sequence[int], threads: Iterable[Sequence[int]]
+) -> Iterator[Sample]:
     *cells, sum_ns = map(sum, zip(*threads, strict=True))
     cumulative = list(accumulate(cells))
-    for bound, count in zip(_BOUNDS, cumulative, strict=True):
+    for bound, count in zip((*(f"{each / 1e9:g}" for each in bounds), "+Inf"), cumulative, strict=True):
         yield Sample(f"{name}{BUCKETS}", {**labels, "le": bound}, count)
     yield Sample(f"{name}_count", labels, cumulative[-1])
     yield Sample(f"{name}_sum", labels, sum_ns / 1e9)

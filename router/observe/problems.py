@@ -60,6 +60,12 @@ class Kind(enum.Enum):
         "Stop the rover by other means. Nothing listens at {address}, or the network rejects the datagrams.",
         "deadman_send_errors",
     )
+    DEADMAN_DISOBEYED = (
+        Level.CRITICAL,
+        "{endpoint} does not obey the brake of {route}",
+        "Stop the rover by other means. Check that its firmware executes this; `router explain {route}` has `obeyed`.",
+        "deadman_disobeyed",
+    )
     COMMANDS_DROPPED = (
         Level.CRITICAL,
         "commands for {target} are dropped: {reason}",

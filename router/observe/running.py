@@ -41,6 +41,9 @@ class Running(Protocol):
     def mismatches(self) -> Mapping[Mismatch, int]:
         """Return messages from hosts that no route accepts them from, and their latest time (boot clock, ns)."""
 
+    def said(self) -> Mapping[tuple[str, str], str]:
+        """Return the last messages of boards that do not obey, by a deadman's route and the board: see `Obedience`."""
+
     def progress(self) -> int:
         """Return a number that changes at least every half second unless the receive thread is stuck."""
 

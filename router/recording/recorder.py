@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from router.clock import boottime_ns, wall_ns
@@ -36,6 +37,8 @@ STOP_SECONDS = 2.5
 _PATIENCE = 30.0
 """Timeout of `save`, s."""
 
+_NO_NOTES: Mapping[str, str] = {}
+
 
 class RecordError(RouterError):
     """The last datagrams could not be saved; the message says why."""
@@ -60,6 +63,15 @@ class Ring:
     def chunks(self) -> list[Chunk]:
         """Return the chunks, oldest first."""
         return list(self._chunks)
+
+
+@dataclass(slots=True)
+class _Trip:
+    """A deadman that has tripped: the route, the boards that have not answered yet, and the answers."""
+
+    route: str
+    awaited: set[str]
+    answers: list[str] = field(default_factory=list)
 
 
 class Recorder:
@@ -88,7 +100,8 @@ class Recorder:
         self._overflow = self._lost_by_faults = 0
         self._is_writing = True
         self._due = boottime_ns() + PERIOD
-        self._trips: deque[str] = deque()
+        self._trips: deque[_Trip] = deque()  # to save
+        self._unanswered: dict[str, _Trip] = {}  # by route
         self._trips_saved_at: int | None = None
         self._requests: deque[tuple[str, Future[Path]]] = deque()
         self._requesting = threading.Lock()
@@ -113,10 +126,28 @@ class Recorder:
         except NotInTime:
             raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
 
-    def deadman_tripped(self, route: str) -> None:
-        """Request to save the datagrams in memory. Returns at once."""
+    def deadman_tripped(self, route: str, awaited: Iterable[str] = ()) -> None:
+        """Request to save the datagrams in memory, once the `awaited` boards have answered. Returns at once."""
         if self._ring is not None:
-            self._trips.append(route)
+            self._unanswered[route] = trip = _Trip(route, set(awaited))
+            if not trip.awaited:
+                self.deadman_released(route)
+
+    def board_answered(self, route: str, board: str, answer: str) -> None:
+        """Note whether a board obeys the deadman of a route, for the metadata of the file that is saved then."""
+        trip = self._unanswered.get(route)
+        if trip is None or board not in trip.awaited:
+            return
+        trip.awaited.remove(board)
+        trip.answers.append(f"{route}: {board} {answer}")
+        if not trip.awaited:
+            self.deadman_released(route)
+
+    def deadman_released(self, route: str) -> None:
+        """Save what was requested when the deadman tripped, without waiting for more answers."""
+        trip = self._unanswered.pop(route, None)
+        if trip is not None:
+            self._trips.append(trip)
             self._wake()
 
     def samples(self) -> Mapping[str, Sequence[tuple[tuple[str, ...], float]]]:
@@ -189,6 +220,7 @@ class Recorder:
         if self._continuous is not None:
             self._continuous.close()
         self._save_requested()
+        self._trips.extend(self._unanswered.values())
         if self._trips:
             self._save_trips()
 
@@ -245,14 +277,15 @@ class Recorder:
         return True
 
     def _save_trips(self) -> None:
-        routes = sorted({self._trips.popleft() for _ in range(len(self._trips))})
+        trips = [self._trips.popleft() for _ in range(len(self._trips))]
+        answers = "; ".join(answer for trip in trips for answer in trip.answers)
         with suppress(RecordError):  # it has been logged
-            self._save(f"deadman-{routes[0]}")
+            self._save(f"deadman-{min(trip.route for trip in trips)}", {"obeyed": answers} if answers else {})
 
-    def _save(self, reason: str) -> Path:
-        """Write the ring to a file, and return its path. Raises RecordError, which has been logged."""
+    def _save(self, reason: str, notes: Mapping[str, str] = _NO_NOTES) -> Path:
+        """Write the ring to a file with these notes in its metadata. Raises RecordError, which has been logged."""
         try:
-            path = self._write_ring(reason)
+            path = self._write_ring(reason, notes)
         except OSError as error:
             logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
@@ -263,7 +296,7 @@ class Recorder:
         logger.info("saved the last datagrams", reason=reason, file=str(path))
         return path
 
-    def _write_ring(self, reason: str) -> Path:
+    def _write_ring(self, reason: str, notes: Mapping[str, str]) -> Path:
         """Write the ring to a file. Meanwhile, continuous recording continues."""
         assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` check
         self._write()
@@ -271,7 +304,7 @@ class Recorder:
         coming = sum(chunk.size_in_file for chunk in chunks)
         writing = self._continuous.path if self._continuous is not None else None
         self._directory.make_room(coming + (self._settings.max_size if writing is not None else 0), writing)
-        file = self._directory.new(reason, self._channels, self._about(reason))
+        file = self._directory.new(reason, self._channels, {**self._about(reason), **notes})
         try:
             for chunk in chunks:
                 file.write(chunk)

@@ -13,7 +13,17 @@ from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
 from router.rehearsal.describing import EventDescriber, Related, in_brackets, when
 from router.rehearsal.fields import Difference
-from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.rehearsal.rehearsal import (
+    Disobeyed,
+    Dropped,
+    Event,
+    Filtered,
+    Obeyed,
+    Published,
+    Received,
+    Rejected,
+    Sent,
+)
 from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
 from router.types.framing import restored, trimmed
 
@@ -70,12 +80,13 @@ class Comparison:
             yield from self._delivered(deliveries, actual, outcome, explained=explained)
         yield from self._dropped(outcome)
         yield from _filtered(expected, events)
+        yield from self._answers(expected, events)
 
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
         """Yield a failure for each place with an event between the previous step and this one."""
         related: dict[Related | None, list[Event]] = {}
         for event in outcome.early:
-            if isinstance(event, (Sent, Published, Dropped)):
+            if isinstance(event, (Sent, Published, Dropped, Obeyed, Disobeyed)):
                 related.setdefault(self.describer.related(event), []).append(event)
         for place, events in related.items():
             message = f"before this step, {self.describer.summarize(events)}; no step expects it"
@@ -177,6 +188,17 @@ class Comparison:
                 message = f"dropped for {target}: {_listed(counts)}, not {_listed(wanted.value)}{detail}"
                 related = self.describer.related(dropped[0]) if dropped else self._of_name(target, outcome)
                 yield Failure(wanted.span, message, related)
+
+    def _answers(self, expected: Expected, events: Sequence[Event]) -> Iterator[Failure]:
+        """Yield failures about endpoints that obey the brake of a deadman, or do not."""
+        kinds = (Obeyed, "obeyed", expected.obeyed), (Disobeyed, "disobeyed", expected.disobeyed)
+        for kind, word, expects in kinds:
+            wanted: Located[Counts] = expects or Located({}, expected.span)
+            actual = [event for event in events if isinstance(event, kind)]
+            counts = Counter(event.target for event in actual)
+            if counts != Counter(wanted.value):
+                message = f"{word}: {_listed(counts)}, not {_listed(wanted.value)}"
+                yield Failure(wanted.span, message, self.describer.related(actual[0]) if actual else None)
 
     # places and words
 

@@ -16,7 +16,17 @@ from router.compiler.expressions.tree import Node
 from router.compiler.program import Program
 from router.errors import SourceSpan
 from router.rehearsal.comparing import Outcome
-from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.rehearsal.rehearsal import (
+    Disobeyed,
+    Dropped,
+    Event,
+    Filtered,
+    Obeyed,
+    Published,
+    Received,
+    Rejected,
+    Sent,
+)
 from router.rehearsal.steps import Expected
 from router.table.model import ANY
 
@@ -112,6 +122,10 @@ def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
         for to in deadman.to:
             gap = f"no test checks what the deadman of {name} sends to {to.value}"
             yield ("deadman", name, to.value), Item("target", deadman.span, gap)
+    if (obeyed := route.obeyed) is not None:
+        for endpoint in obeyed.plan.endpoints:
+            gap = f"no test has {endpoint} obey the deadman of {name}"
+            yield ("obeyed", name, endpoint), Item("target", obeyed.when.span, gap)
 
 
 def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
@@ -122,6 +136,10 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
     if collect := route.route.collect:
         gap = f"no test has a frame of {name} that stays incomplete"
         yield ("incomplete", name), Item("rejection", collect.span, gap)
+    if (obeyed := route.obeyed) is not None:
+        for endpoint in obeyed.plan.endpoints:
+            gap = f"no test has {endpoint} disobey the deadman of {name}"
+            yield ("disobeyed", name, endpoint), Item("rejection", obeyed.when.span, gap)
     for target, condition in _with_conditions(route):
         if condition is not None:
             gap = f"no test has a message of {name} that this withholds from {target.label}"
@@ -147,8 +165,8 @@ def _keys(event: Event, expected: Expected) -> Iterator[Key]:
             yield "deadman" if event.by_deadman else "target", event.route, event.target
         case Published() if any(each.is_compared for each in expected.published.get(event.target, ())):
             yield "target", event.route, event.target
-        case Filtered():
-            yield "filtered", event.route, event.target
+        case Filtered() | Obeyed() | Disobeyed():
+            yield type(event).__name__.lower(), event.route, event.target
         case Rejected():
             yield event.reason, event.listener
         case Dropped(reason="queue_full"):

@@ -18,9 +18,11 @@ from router.rehearsal.rehearsal import (
     START,
     Collected,
     DeadmanChanged,
+    Disobeyed,
     Dropped,
     Event,
     Filtered,
+    Obeyed,
     Published,
     Received,
     Rejected,
@@ -78,6 +80,10 @@ class TableIndex:
         deadman = self._routes[route].route.deadman if route in self._routes else None
         return Related(deadman.span, "sent by this deadman") if deadman else None
 
+    def obeyed(self, route: str) -> Related | None:
+        deadman = self._routes[route].route.deadman if route in self._routes else None
+        return Related(deadman.obeyed.when.span, "shown by this condition") if deadman and deadman.obeyed else None
+
     def field(self, route: str, target: str, path: Path) -> Related | None:
         """Return what fills a field, or else the target that leaves it at its default."""
         for found in self._targets.get((route, target), ()):
@@ -127,6 +133,8 @@ class EventDescriber:
         match event:
             case Sent(by_deadman=True) | DeadmanChanged():
                 return self.index.deadman(event.route)
+            case Obeyed() | Disobeyed():
+                return self.index.obeyed(event.route)
             case Filtered():
                 return self.index.condition(event.route, event.target)
             case Sent() | Published() | Dropped() | Collected():
@@ -158,8 +166,8 @@ class EventDescriber:
                 return f"{at}{event.route} takes a message from {event.source}"
             case Rejected():
                 return f"{at}{event.listener} rejects a datagram as {event.reason}{in_brackets(event.detail)}"
-            case DeadmanChanged():
-                return f"{at}the deadman of {event.route} {'trips' if event.active else 'is released'}"
+            case DeadmanChanged() | Obeyed() | Disobeyed():
+                return at + _of_deadman(event)
         raise AssertionError(event)
 
     def _datagram(self, data: bytes) -> str:
@@ -174,6 +182,16 @@ def _kind(event: Event) -> tuple[object, ...]:
     """Return a key that is equal for events that differ only in time and content."""
     names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
     return type(event), *names
+
+
+def _of_deadman(event: DeadmanChanged | Obeyed | Disobeyed) -> str:
+    match event:
+        case DeadmanChanged():
+            return f"the deadman of {event.route} {'trips' if event.active else 'is released'}"
+        case Obeyed():
+            return f"{event.target} obeys the deadman of {event.route}, after {offset(event.after)}"
+        case Disobeyed():
+            return f"{event.target} does not obey the deadman of {event.route}"
 
 
 def in_brackets(detail: str) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from router.carrier.events import CountedReport, DeadmanChange
 from router.carrier.library import library
 from router.carrier.rehearsal import Increment, Output, Stage, Time
-from router.compiler.metrics import Series
+from router.compiler.metrics import Answer, Series
 from router.compiler.program import Program
 from router.datagrams import Peer
 
@@ -98,6 +98,23 @@ class DeadmanChanged(Event):
 
     route: str
     active: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Obeyed(Event):
+    """An endpoint has shown, `after` ns from the first brake of a route's deadman, that it obeys."""
+
+    route: str
+    target: str
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class Disobeyed(Event):
+    """An endpoint has not shown in time that it obeys the brake of a route's deadman."""
+
+    route: str
+    target: str
 
 
 EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
@@ -189,6 +206,10 @@ class Rehearsal:
                     self._count(counter)
                 case DeadmanChange(route, is_tripped):
                     self.events.append(DeadmanChanged(self._at, route, is_tripped))
+                case Answer(route, endpoint, True, after):
+                    self.events.append(Obeyed(self._at, route, endpoint, after))
+                case Answer(route, endpoint):
+                    self.events.append(Disobeyed(self._at, route, endpoint))
                 case CountedReport(_, report):
                     self._report(report.detail or str(report.error or ""))
 

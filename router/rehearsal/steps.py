@@ -6,7 +6,7 @@ Every name must be in the table under test; otherwise InvalidValueError is raise
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -78,7 +78,8 @@ Deliveries = Mapping[str, tuple[Delivery, ...]]
 class Expected:
     """Everything that may happen in a step. With `anything`, nothing is compared.
 
-    `rejected`, `filtered` and `route` are None if the test does not mention them.
+    `rejected`, `filtered` and `route` are None if the test does not mention them. `obeyed` and `disobeyed` count
+    endpoints that begin to obey the brake of a deadman, or to disobey it.
     """
 
     span: SourceSpan
@@ -88,6 +89,8 @@ class Expected:
     dropped: Mapping[str, Located[Counts]] = field(default_factory=dict)
     rejected: Located[Counts] | None = None
     filtered: Located[Counts] | None = None
+    obeyed: Located[Counts] | None = None
+    disobeyed: Located[Counts] | None = None
     route: Located[str] | None = None
 
 
@@ -164,6 +167,11 @@ class Names:
         """Return an endpoint that something is sent to."""
         self._known(name, self._table.endpoints, span, "endpoint", Code.UNKNOWN_ENDPOINT)
         return self._known(name, self._destinations, span, "route to the endpoint", Code.UNKNOWN_ENDPOINT)
+
+    def watched(self, name: str, span: SourceSpan) -> str:
+        """Return an endpoint that shows whether it obeys a deadman."""
+        watched = [each for plan in self._program.deadmen if plan.obeyed for each in plan.obeyed.endpoints]
+        return self._known(name, watched, span, "deadman with `obeyed` for the endpoint", Code.UNKNOWN_ENDPOINT)
 
     def route(self, name: str, span: SourceSpan) -> str:
         return self._known(name, [route.name for route in self._table.routes if not route.ignore], span, "route")
@@ -301,14 +309,16 @@ class ExpectedReader:
         if isinstance(node, ScalarNode):
             return Expected(span, anything=node.text == ANY)
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
-        route, rejected, filtered = (node.entries.get(key) for key in ("route", "rejected", "filtered"))
+        route, rejected = node.entries.get("route"), node.entries.get("rejected")
         return Expected(
             span=span,
             sent=self._sent(node.get("sent"), given),
             published=self._published(node.get("published"), given),
             dropped=self._dropped(node.get("dropped")),
             rejected=Located(_reasons(rejected.value, REJECT_REASONS), rejected.key.span) if rejected else None,
-            filtered=Located(self._filtered(filtered.value), filtered.key.span) if filtered else None,
+            filtered=self._counted(node.entries.get("filtered"), self._names.target),
+            obeyed=self._counted(node.entries.get("obeyed"), self._names.watched),
+            disobeyed=self._counted(node.entries.get("disobeyed"), self._names.watched),
             route=Located(self._names.route(*_name(route.value)), route.value.span) if route else None,
         )
 
@@ -374,11 +384,15 @@ class ExpectedReader:
             for name, entry in entries
         }
 
-    def _filtered(self, node: Node) -> Counts:
+    def _counted(self, entry: Entry | None, known: Callable[[str, SourceSpan], str]) -> Located[Counts] | None:
+        """Return a name, a list of them, or how many of each."""
+        if entry is None:
+            return None
+        node = entry.value
         if isinstance(node, MappingNode):
-            counts = {name: _count(entry.value) for name, entry in node.entries.items()}
-            return {self._names.target(name, node.entries[name].key.span): count for name, count in counts.items()}
-        return Counter(self._names.target(*_name(item)) for item in _listed(node))
+            counts = {known(name, each.key.span): _count(each.value) for name, each in node.entries.items()}
+            return Located(counts, entry.key.span)
+        return Located(Counter(known(*_name(item)) for item in _listed(node)), entry.key.span)
 
 
 def _reasons(node: Node, known: Iterable[str]) -> Counts:

@@ -38,6 +38,7 @@ from router.table.model import (
     Listener,
     Networks,
     NodeSettings,
+    Obeyed,
     Payload,
     RecordSettings,
     Route,
@@ -384,6 +385,14 @@ def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
     return structure(Deadman, settings, span=entry.key.span, payloads=payloads, **own)
 
 
+def _obeyed(node: Node, span: SourceSpan) -> Obeyed:
+    """Build `obeyed`: one payload case with its condition, and `within`."""
+    settings = mapping(node)
+    [shown] = [entry for name, entry in settings.entries.items() if name != "within"]
+    when = _expression(shown.value, shown.key.span)
+    return structure(Obeyed, settings, span=span, case=located(shown.key), when=when)
+
+
 def _with_timeout(deadman: Entry) -> MappingNode:
     """Return the settings of a deadman. Raises InvalidValueError if neither they nor the defaults have a timeout."""
     settings = mapping(deadman.value)
@@ -541,6 +550,7 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     Expression: _expression,
     FieldMap: _fields,
     Inbound: _inbound,
+    Obeyed: _obeyed,
     Topic: _topic,
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,

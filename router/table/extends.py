@@ -3,8 +3,9 @@
 Mappings merge key by key; everything else is replaced. These mappings are also replaced: values that may be a list
 (such as the topics of a route) or a name (a QoS); a `map` of values; a route or gateway that only one of the two files
 ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and the
-reverse; the payloads of a deadman, unless both files have the same cases in the same order; and the transport of a
-gateway. `topic` and `topics` of a route replace each other. Every node keeps the span of its own file.
+reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a deadman is
+obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace each other.
+Every node keeps the span of its own file.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _WHOLE = ("source", "destinations", *_ALTERNATIVES)
 """Keys of a route that take a single value or a list."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 """Parts of a route or gateway whose keys select their kind."""
+_OBEYED = ("deadman", "obeyed")
+"""A part of a route with a payload case and `within`."""
 
 
 def load_chain(
@@ -88,6 +91,8 @@ def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
         return True
     if path[_DEPTH:] == _OF_ONE_KIND[path[0]]:
         return [*over.entries] != [*base.entries]
+    if path[_DEPTH:] == _OBEYED:
+        return not over.entries.keys() <= base.entries.keys()
     word = _WORDS_FOR_NONE.get(path[_DEPTH:]) if len(path) >= _DEPTH else None
     if word is not None and (word in over.entries) != (word in base.entries):
         return True

@@ -304,6 +304,19 @@ class DeadmanKeys:
 
 
 @dataclass(frozen=True, slots=True)
+class Obeyed:
+    """What shows that the rover has stopped: a message of `case`, from each board, that meets the condition `when`.
+
+    `span` is the key `obeyed`. `within` (ns) is the longest time from the first brake to that message.
+    """
+
+    span: SourceSpan
+    case: Located[str]
+    when: Expression
+    within: Annotated[Located[int], DURATION]
+
+
+@dataclass(frozen=True, slots=True)
 class Payload:
     """A payload of constants: a payload `case` with `fields`."""
 
@@ -326,6 +339,7 @@ class Deadman(DeadmanKeys):
     payloads: Annotated[tuple[Payload, ...], Named("send")]
     to: tuple[Located[str], ...]
     disarmed_by: tuple[Located[str], ...] | None = None
+    obeyed: Obeyed | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -121,6 +121,12 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"{duration(settings.timeout.value)}, again every {duration(settings.repeat.value)}, "
             f"{_at_start(settings.at_start)}"
         )
+        if settings.obeyed is not None and deadman.obeyed is not None:
+            obeyed = settings.obeyed
+            yield (
+                f"    obeyed when {obeyed.case.value} of {', '.join(deadman.obeyed.endpoints)} says {obeyed.when}, "
+                f"within {duration(obeyed.within.value)}"
+            )
         if deadman.disarmed_by:
             yield f"    disarmed by commands of {', '.join(deadman.disarmed_by)}"
     if route.no_deadman is not None:

@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, INTENDED_REASONS
+from router.compiler.metrics import INTENDED_REASONS, LATENCY_BOUNDS_NS
 from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered
 from router.values import age_text, rate_text, shortened
@@ -149,5 +149,5 @@ def latency_text(seconds: float | None) -> str:
     if seconds is None:
         return "-"
     if math.isinf(seconds):
-        return f"> {duration(HISTOGRAM_BOUNDS_NS[-1])}"
+        return f"> {duration(LATENCY_BOUNDS_NS[-1])}"
     return f"{seconds * 1e6:.0f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"

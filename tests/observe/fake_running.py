@@ -82,6 +82,9 @@ class FakeRunning:
         }
         return CountersCollector(self.program.counters, lambda: [self.counts], computed, {"version": "1"}).collect()
 
+    def said(self) -> dict[tuple[str, str], str]:
+        return {}
+
     def mismatches(self) -> dict[Mismatch, int]:
         return self.seen
 

@@ -13,7 +13,7 @@ from typing import cast
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, METRICS, Counters
+from router.compiler.metrics import LATENCY_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
@@ -122,8 +122,8 @@ def test_what_is_not_counted_is_asked_for_at_each_scrape(scraped: Scraped) -> No
 def test_histogram_buckets_are_cumulative_and_in_seconds(scraped: Scraped) -> None:
     first = scraped.indexes["route_duration_seconds"]
     for counts, elapsed_ns in ((scraped.threads[0], 9_000), (scraped.threads[1], 9_000), (scraped.threads[0], 10**9)):
-        counts[first + bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)] += 1
-        counts[first + len(HISTOGRAM_BOUNDS_NS) + 1] += elapsed_ns
+        counts[first + bisect_left(LATENCY_BOUNDS_NS, elapsed_ns)] += 1
+        counts[first + len(LATENCY_BOUNDS_NS) + 1] += elapsed_ns
     assert scraped.value("router_route_duration_seconds_bucket", le="1e-05") == 2
     assert scraped.value("router_route_duration_seconds_bucket", le="0.05") == 2
     assert scraped.value("router_route_duration_seconds_bucket", le="+Inf") == 3

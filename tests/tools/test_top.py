@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
+from router.compiler.metrics import LATENCY_BOUNDS_NS
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
 from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
@@ -20,7 +20,7 @@ from router.tools.top_table import latency_text, reasons_text, targets_text
 from router.tools.top_view import Page, Screen, keys
 from router.values import age_text
 
-BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
+BOUNDS = (*(f"{bound / 1e9:g}" for bound in LATENCY_BOUNDS_NS), "+Inf")
 NOW = 1_000_000.0
 PATIENCE = 30.0
 

@@ -109,7 +109,7 @@ static void handle(struct carrier *carrier, struct received *received) {
     received->received_at = wall_ns();
     int reason = route_datagram(&carrier->routing, received);
     if (received->route)
-        count_duration(carrier->routing.stage.counters, received->route->duration, boottime_ns() - received->now);
+        count_duration(carrier->routing.stage.counters, received->route->duration, LATENCY, boottime_ns() - received->now);
     struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
     if (observed) mirror(carrier, observed, received, reason);
     edition_end(&carrier->edition);

@@ -372,7 +372,7 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
     struct value by, count, order;
     char detail[LONGEST_DETAIL], numbers[2][24];
     uint32_t at;
-    if (!read_datagram(machine, to, message->datagram)) return refuse_value(stage, to, message, LOSS_MAPPING_ERROR);
+    if (!read_datagram(machine, to->layout, to->sources, message->datagram)) return refuse_value(stage, to, message, LOSS_MAPPING_ERROR);
     part->name.sender = of->senders[message->datagram->column];
     int outcome = evaluate_value(machine, &of->by, &by, &at);
     if (outcome == EVALUATED && !set_name(&part->name, of, &by)) {
@@ -411,7 +411,7 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
                        const struct datagram *last) {
     const struct collect *of = to->collect;
     struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
-    begin_datagram(machine, to, last);
+    begin_datagram(machine, to->layout, to->sources, last);
     if (!machine_read(machine, first.bytes, first.size)) return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
         if (!list_add(machine, &items, payload_of(of->collector, frame, index)))

@@ -15,15 +15,18 @@ static inline void counter_add(counter *counters, uint32_t index, int64_t amount
     atomic_store_explicit(&counters[index], now + amount, memory_order_relaxed);
 }
 
-/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for longer durations and one for the sum follow. */
+/* The bounds of histograms, in ns: LATENCY_BOUNDS_NS and STOPPING_BOUNDS_NS in compiler/metrics.py. A cell for longer
+ * durations and one for the sum follow. */
 enum { HISTOGRAM_BOUNDS = 12 };
+static const int64_t LATENCY[HISTOGRAM_BOUNDS] = {10000,   20000,   50000,   100000,  200000,   500000,
+                                                  1000000, 2000000, 5000000, 10000000, 20000000, 50000000};
+static const int64_t STOPPING[HISTOGRAM_BOUNDS] = {20000000,   50000000,   100000000,  200000000,   500000000,   1000000000,
+                                                   2000000000, 3000000000, 5000000000, 10000000000, 20000000000, 30000000000};
 
 /* Count a duration in ns in the histogram that begins at this counter. */
-static inline void count_duration(counter *counters, uint32_t histogram, int64_t elapsed) {
-    static const int64_t BOUNDS[HISTOGRAM_BOUNDS] = {10000,   20000,   50000,   100000,  200000,   500000,
-                                                     1000000, 2000000, 5000000, 10000000, 20000000, 50000000};
+static inline void count_duration(counter *counters, uint32_t histogram, const int64_t *bounds, int64_t elapsed) {
     uint32_t cell = 0;
-    while (cell < HISTOGRAM_BOUNDS && elapsed > BOUNDS[cell]) cell++;
+    while (cell < HISTOGRAM_BOUNDS && elapsed > bounds[cell]) cell++;
     counter_add(counters, histogram + cell, 1);
     counter_add(counters, histogram + HISTOGRAM_BOUNDS + 1, elapsed);
 }

@@ -12,6 +12,17 @@
  * publisher. */
 static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 500000000;
 
+/* ns from one message that is reported as evidence to the next. */
+static const int64_t EVIDENCE = 1000000000;
+
+/* What a destination has shown since the deadman tripped. */
+struct answer {
+    int64_t owed_since;  /* it must show within `within` from here that it obeys; NEVER while it does, 0: not awaited */
+    int64_t evidence_at; /* when evidence may be reported next */
+    bool is_timed;       /* its stopping time is counted */
+    bool disobeys;
+};
+
 struct deadman {
     struct timer timer;      /* not due while unarmed, unless it repeats the start, and never once replaced */
     struct deadman *acting;  /* the last deadman that has replaced it, or itself */
@@ -22,24 +33,31 @@ struct deadman {
     uint64_t followers;
     uint64_t own;            /* all, without those that have passed to the deadman that has replaced it */
     uint64_t unstarted;      /* get the datagrams of the start when it is served next */
-    bool has_tripped;
+    uint64_t watched;        /* may show whether they obey */
+    bool has_tripped;        /* written by `set_tripped` */
     bool starts;             /* sends when the router starts */
     bool is_ending;          /* ends when it is served next */
+    int64_t tripped_at;      /* while tripped: since when */
     int64_t greets_until;    /* until then, and while unarmed, it greets new subscribers */
     int64_t greets_again;    /* the due time after the next one, while unarmed; or NEVER */
     uint32_t active, trips, id;
     uint32_t count;
+    struct answer *answers; /* of the destinations */
     struct deadman_destination destinations[];
 };
 
 /* The functions up to the public ones are called with the lock held. */
 
 /* Report an event without a limit: if there is no room, drop the oldest event. */
-static void report_with(struct timers *timers, struct deadman_event event, const char *why) {
-    struct deadman_event oldest;
+static void report_event(struct timers *timers, void *event, size_t size, const char *text) {
+    struct event_head oldest;
     struct ring *events = timers->stage->reporter.events;
     if (!events) return;
-    while (!put_event(events, &event, sizeof event, why)) ring_drop(events, &oldest, sizeof oldest);
+    while (!put_event(events, event, size, text)) ring_drop(events, &oldest, sizeof oldest);
+}
+
+static void report_with(struct timers *timers, struct deadman_event event, const char *why) {
+    report_event(timers, &event, sizeof event, why);
 }
 
 static void report(struct timers *timers, enum event_kind kind, const struct deadman *deadman) {
@@ -81,9 +99,71 @@ static struct outcome send_all(struct timers *timers, struct deadman *deadman, u
     return outcome;
 }
 
+/* ---- answers ---- */
+
+static void report_answer(struct timers *timers, const struct deadman *deadman, enum event_kind kind, uint32_t destination,
+                          int64_t after) {
+    struct answer_event event = {.size = sizeof event, .kind = kind, .deadman = deadman->id, .destination = destination,
+                                 .after = after};
+    report_event(timers, &event, sizeof event, "");
+}
+
+static void set_disobeys(struct timers *timers, struct deadman *deadman, uint32_t index, bool disobeys) {
+    if (deadman->answers[index].disobeys == disobeys) return;
+    deadman->answers[index].disobeys = disobeys;
+    counter_set(timers->stage->counters, deadman->destinations[index].disobeyed, disobeys);
+}
+
+/* Await answers of destinations from `now` on; 0: no longer. */
+static void await_answers(struct timers *timers, struct deadman *deadman, uint64_t destinations, int64_t now) {
+    for (uint64_t left = destinations & deadman->watched; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        set_disobeys(timers, deadman, index, false);
+        deadman->answers[index] = (struct answer){.owed_since = now};
+    }
+}
+
+static void check_answers(struct timers *timers, struct deadman *deadman, int64_t now) {
+    for (uint64_t left = deadman->watched; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        const struct deadman_destination *to = &deadman->destinations[index];
+        const struct answer *answer = &deadman->answers[index];
+        bool is_owed = answer->owed_since && answer->owed_since != NEVER && !answer->disobeys;
+        if (!is_owed || now - answer->owed_since < to->within) continue;
+        set_disobeys(timers, deadman, index, true);
+        report_answer(timers, deadman, EVENT_DISOBEYED, to->id, now - deadman->tripped_at);
+    }
+}
+
+static void take_obedience(struct timers *timers, struct deadman *deadman, uint32_t index, int64_t arrived) {
+    struct answer *answer = &deadman->answers[index];
+    const struct deadman_destination *to = &deadman->destinations[index];
+    int64_t after = arrived - deadman->tripped_at;
+    if (!answer->is_timed) count_duration(timers->stage->counters, to->stopping, STOPPING, after);
+    if (!answer->is_timed || answer->disobeys) report_answer(timers, deadman, EVENT_OBEYED, to->id, after);
+    set_disobeys(timers, deadman, index, false);
+    answer->is_timed = true;
+    answer->owed_since = NEVER;
+}
+
+static bool take_disobedience(struct deadman *deadman, uint32_t index, int64_t arrived) {
+    struct answer *answer = &deadman->answers[index];
+    if (answer->owed_since == NEVER) answer->owed_since = arrived;
+    if (arrived < answer->evidence_at) return false;
+    answer->evidence_at = arrived + EVIDENCE;
+    return true;
+}
+
+/* ---- arming ---- */
+
+static void set_tripped(struct deadman *deadman, bool is_tripped) {
+    __atomic_store_n(&deadman->has_tripped, is_tripped, __ATOMIC_RELAXED);
+}
+
 static void release(struct timers *timers, struct deadman *deadman) {
     if (!deadman->has_tripped) return;
-    deadman->has_tripped = false;
+    set_tripped(deadman, false);
+    await_answers(timers, deadman, deadman->own, 0);
     counter_set(timers->stage->counters, deadman->active, 0);
     report(timers, EVENT_RELEASED, deadman);
 }
@@ -99,6 +179,7 @@ static void disarm(struct timers *timers, struct deadman *deadman, uint64_t to) 
     bool was_armed = deadman->armed;
     deadman->armed &= ~to;
     deadman->unstarted &= ~to;
+    await_answers(timers, deadman, to, 0);
     if (deadman->armed & ~deadman->followers) return;
     deadman->armed = 0;
     if (was_armed || !deadman->unstarted) timer_set_due(timers, &deadman->timer, NEVER);
@@ -163,8 +244,10 @@ static void arm_one(struct timers *timers, const struct feed *feed, int64_t now)
     if (feed->disarms) return;
     uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
     if (!to) return;
+    to |= deadman->followers;
     if (!deadman->armed) timer_set_due(timers, &deadman->timer, now + deadman->timeout);
-    deadman->armed |= to | deadman->followers;
+    if (deadman->has_tripped) await_answers(timers, deadman, to & ~deadman->armed, now);
+    deadman->armed |= to;
 }
 
 /* Send the datagrams of the start. If that fails, for example because the network is not up yet, repeat it. */
@@ -202,9 +285,12 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     timer_set_due(timers, timer, timer->due + deadman->repeat * ((now - timer->due) / deadman->repeat + 1));
     if (deadman->has_tripped) {
         send_all(timers, deadman, deadman->armed);
+        check_answers(timers, deadman, now);
         return;
     }
-    deadman->has_tripped = true;
+    set_tripped(deadman, true);
+    deadman->tripped_at = now;
+    await_answers(timers, deadman, deadman->armed, now);
     counter_set(timers->stage->counters, deadman->active, 1);
     stage_count(timers->stage, deadman->trips, 1);
     send_all(timers, deadman, deadman->armed);
@@ -244,6 +330,22 @@ static void inherit_start(struct timers *timers, struct deadman *next, struct de
     timer_set_due(timers, &next->timer, due);
 }
 
+/* Let `next` await the answers that `earlier` awaits; of a destination that `earlier` does not watch, from now on. */
+static void pass_answers(struct timers *timers, struct deadman *next, struct deadman *earlier) {
+    next->tripped_at = earlier->tripped_at;
+    await_answers(timers, next, next->armed, timers->stage->now(timers->stage));
+    for (uint64_t left = earlier->watched; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        struct answer passed = earlier->answers[index];
+        await_answers(timers, earlier, bit(index), 0);
+        uint64_t same = passed.owed_since ? next->watched & named(next, earlier->destinations[index].id) : 0;
+        if (!same) continue;
+        uint32_t other = (uint32_t)__builtin_ctzll(same);
+        set_disobeys(timers, next, other, passed.disobeys);
+        next->answers[other] = passed;
+    }
+}
+
 /* Pass on that destinations are armed. If `next` is armed, because of a later command or because it also replaces another
  * deadman, it trips at the later deadline. */
 static void inherit_deadline(struct timers *timers, struct deadman *next, struct deadman *earlier, uint64_t armed,
@@ -260,8 +362,9 @@ static void inherit_deadline(struct timers *timers, struct deadman *next, struct
     release(timers, next);
     timer_set_due(timers, &next->timer, due);
     if (!has_tripped) return;
-    earlier->has_tripped = false;
-    next->has_tripped = true;
+    set_tripped(earlier, false);
+    set_tripped(next, true);
+    pass_answers(timers, next, earlier);
     counter_set(timers->stage->counters, earlier->active, 0);
     counter_set(timers->stage->counters, next->active, 1);
 }
@@ -288,7 +391,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     for (uint32_t index = 0; index < count; index++)
         for (uint32_t each = 0; each < destinations[index].count; each++, datagrams++)
             bytes += destinations[index].datagrams[each].size;
-    size_t own = sizeof(struct deadman) + count * sizeof *destinations;
+    size_t own = sizeof(struct deadman) + count * (sizeof *destinations + sizeof(struct answer));
     struct deadman *deadman = calloc(1, own + datagrams * sizeof(struct deadman_datagram) + bytes);
     if (!deadman) return NULL;
     *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER}, .acting = deadman, .timeout = timeout,
@@ -298,8 +401,10 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     for (uint32_t index = 0; index < count; index++) {
         deadman->own |= bit(index);
         if (destinations[index].follows) deadman->followers |= bit(index);
+        if (destinations[index].within) deadman->watched |= bit(index);
     }
-    struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->destinations[count];
+    deadman->answers = (struct answer *)&deadman->destinations[count];
+    struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->answers[count];
     uint8_t *data = (uint8_t *)(copy + datagrams);
     for (uint32_t index = 0; index < count; index++) {
         const struct deadman_destination *from = &destinations[index];
@@ -356,6 +461,25 @@ void deadman_replace(struct timers *timers, struct deadman *next, struct deadman
     pthread_mutex_lock(&timers->lock);
     take_over(timers, next, earlier);
     pthread_mutex_unlock(&timers->lock);
+}
+
+bool deadman_is_tripped(const struct deadman *deadman) {
+    return __atomic_load_n(&deadman->has_tripped, __ATOMIC_RELAXED);
+}
+
+bool deadman_is_shown(struct timers *timers, struct deadman *deadman, uint32_t id, bool obeys, int64_t arrived) {
+    bool is_evidence = false;
+    pthread_mutex_lock(&timers->lock);
+    deadman = deadman->acting;
+    bool counts = deadman->has_tripped && arrived > deadman->tripped_at;
+    for (uint64_t left = counts ? deadman->watched & named(deadman, id) : 0; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        if (!deadman->answers[index].owed_since) continue;
+        if (obeys) take_obedience(timers, deadman, index, arrived);
+        else is_evidence |= take_disobedience(deadman, index, arrived);
+    }
+    pthread_mutex_unlock(&timers->lock);
+    return is_evidence;
 }
 
 void command_has_left(struct timers *timers, const struct feed *feeds, uint32_t count, int refused, int64_t now) {

@@ -14,7 +14,11 @@
  *
  * A failed command changes nothing: the deadman trips unless another one is sent. If the receiver refused an earlier
  * command, a sent command arms the destination but does not extend the deadline. Datagrams sent at router start change no
- * state. */
+ * state.
+ *
+ * While a deadman is tripped, messages of its destinations may show whether they obey (`deadman_is_shown`). A destination
+ * disobeys if for `within` no message has shown that it does: since the deadman tripped, or since the first message that
+ * showed the contrary after one that showed it. Only messages that arrived after the deadman tripped count. */
 #ifndef DEADMAN_H
 #define DEADMAN_H
 
@@ -44,6 +48,9 @@ struct deadman_destination {
     uint32_t id;                /* of its name: in events, and the same in the next program */
     uint32_t follows;           /* 1: the route never commands it */
     const void *publisher;      /* rcl_publisher_t of the topic, for a gateway's deadman, which has no sender */
+    int64_t within;             /* ns in which it obeys a brake; 0 if no message shows that (program.h: struct witness) */
+    uint32_t disobeyed;         /* counter: 1 while it does not obey */
+    uint32_t stopping;          /* histogram: time from the brake until it obeyed */
 };
 
 struct deadman;
@@ -97,6 +104,13 @@ int command_send(struct timers *timers, struct sender *sender, const void *data,
 /* Like `command_send` at the time `now`, for callers that hold the lock if there are feeds. */
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                     const struct feed *feeds, uint32_t count, int64_t now);
+
+/* Whether the deadman is tripped. May be called without the lock. */
+bool deadman_is_tripped(const struct deadman *deadman);
+
+/* A message of the destination `id`, which arrived at `arrived`, shows whether it obeys the deadman. Return whether to
+ * report the message as evidence that it does not: at most once a second. Takes the lock. */
+bool deadman_is_shown(struct timers *timers, struct deadman *deadman, uint32_t id, bool obeys, int64_t arrived);
 
 /* A message was published at `now` on the only topic of a deadman that publishes. Takes the lock. */
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now);

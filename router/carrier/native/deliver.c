@@ -66,14 +66,16 @@ static bool refuse(const struct delivery *of, int reason, uint32_t place) {
 
 /* ---- fields ---- */
 
-void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
-    machine_begin(machine, to->layout);
+void begin_datagram(struct machine *machine, const struct layout *layout, const struct value *sources,
+                    const struct datagram *from) {
+    machine_begin(machine, layout);
     machine->slots[SLOT_RECEIVED_AT].integer = from->received_at;
-    machine->slots[SLOT_SOURCE] = to->sources[from->column];
+    machine->slots[SLOT_SOURCE] = sources[from->column];
 }
 
-bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from) {
-    begin_datagram(machine, to, from);
+bool read_datagram(struct machine *machine, const struct layout *layout, const struct value *sources,
+                   const struct datagram *from) {
+    begin_datagram(machine, layout, sources, from);
     const uint8_t *payload = from->data + from->start;
     return from->is_single ? machine_read(machine, payload, from->length)
                            : machine_read_pieces(machine, payload, from->length);
@@ -83,7 +85,7 @@ bool read_datagram(struct machine *machine, const struct targets *to, const stru
 static bool is_readable(const struct delivery *of) {
     struct message *message = of->message;
     if (!message->is_read) {
-        bool is_well_formed = read_datagram(&of->stage->machine, of->to, message->datagram);
+        bool is_well_formed = read_datagram(&of->stage->machine, of->to->layout, of->to->sources, message->datagram);
         message->outcome = is_well_formed ? EVALUATED : LOSS_MAPPING_ERROR;
         message->is_read = true;
     }

@@ -137,11 +137,14 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
     if (stage->counted) stage->counted(stage, index, amount);
 }
 
-/* Begin with a datagram: set the slots of its time and its sender, and the others to their defaults. */
-void begin_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
+/* Begin with a datagram: set the slots of its time and its sender, and the others to their defaults. `sources` are names of
+ * senders, by column. */
+void begin_datagram(struct machine *machine, const struct layout *layout, const struct value *sources,
+                    const struct datagram *from);
 
-/* Likewise, then read the fields that routines of the route use. Return false if the datagram is malformed. */
-bool read_datagram(struct machine *machine, const struct targets *to, const struct datagram *from);
+/* Likewise, then read the fields of the layout. Return false if the datagram is malformed. */
+bool read_datagram(struct machine *machine, const struct layout *layout, const struct value *sources,
+                   const struct datagram *from);
 
 /* Count and report the loss of a message for a target. `lost` has the reason, and details if there are any. */
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,

@@ -5,7 +5,16 @@
 
 #include <stdint.h>
 
-enum event_kind { EVENT_TRIPPED = 1, EVENT_RELEASED, EVENT_DEADMAN_ERROR, EVENT_REJECTED, EVENT_LOST };
+enum event_kind {
+    EVENT_TRIPPED = 1,
+    EVENT_RELEASED,
+    EVENT_DEADMAN_ERROR,
+    EVENT_REJECTED,
+    EVENT_LOST,
+    EVENT_OBEYED,
+    EVENT_DISOBEYED,
+    EVENT_EVIDENCE
+};
 
 /* The beginning of every event. */
 struct event_head {
@@ -17,6 +26,13 @@ struct deadman_event {
     uint32_t deadman, destination; /* `destination`: for errors only */
     int32_t error;                 /* errno; 0 if a text follows, up to a NUL */
     uint32_t counter;              /* of such errors */
+};
+
+/* Whether a destination obeys the brake of a deadman. EVENT_EVIDENCE: what it has sent instead; the datagram follows. */
+struct answer_event {
+    uint32_t size, kind; /* EVENT_OBEYED, EVENT_DISOBEYED or EVENT_EVIDENCE */
+    uint32_t deadman, destination;
+    int64_t after;       /* ns since the deadman tripped; for evidence, the length of the datagram */
 };
 
 struct rejected_event {

@@ -12,9 +12,22 @@
 #include "deliver.h"
 #include "envelope.h"
 
+/* A condition on the messages of a route from one sender. If it holds, the sender obeys the brake of this deadman. */
+struct witness {
+    struct deadman *deadman;
+    struct routine condition;
+    const struct layout *layout; /* the fields that it reads */
+    const struct value *sources; /* names of senders, by column */
+    uint32_t column;             /* of the sender */
+    uint32_t deadman_id, endpoint_id; /* in events */
+    uint32_t reserved;
+};
+
 struct route {
     struct targets sends;     /* destinations, which the receive thread serves */
     struct targets publishes; /* topics, which the publish thread serves */
+    const struct witness *witnesses;
+    uint32_t witness_count, reserved;
     uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
 };
 

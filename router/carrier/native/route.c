@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "collect.h"
+#include "evaluate.h"
 #include "events.h"
 
 /* ---- events ---- */
@@ -27,11 +28,15 @@ static void reject(struct routing *routing, const struct received *received, enu
 
 /* ---- targets ---- */
 
-static void send_to_all(struct routing *routing, const struct targets *to, const struct received *received) {
+static struct datagram datagram_of(const struct routing *routing, const struct received *received) {
     const struct envelope *envelope = &received->envelope;
-    struct datagram datagram = {.data = routing->datagram, .size = envelope->size, .start = envelope->start,
-                                .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
-                                .received_at = received->received_at};
+    return (struct datagram){.data = routing->datagram, .size = envelope->size, .start = envelope->start,
+                             .length = envelope->length, .is_single = envelope->is_single, .column = received->column,
+                             .received_at = received->received_at};
+}
+
+static void send_to_all(struct routing *routing, const struct targets *to, const struct received *received) {
+    struct datagram datagram = datagram_of(routing, received);
     struct message message = {.datagram = &datagram, .now = received->now, .times = received->times,
                               .since = REFUSED_ARRIVAL};
     deliver_to_all(&routing->stage, to, &message);
@@ -80,6 +85,37 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
     while (!ring_put(routing->published, record, record->size)) drop_oldest(routing, received->now);
 }
 
+/* ---- witnesses ---- */
+
+static bool meets_condition(struct machine *machine, const struct witness *witness, const struct datagram *datagram) {
+    bool is_true = false;
+    uint32_t at;
+    return read_datagram(machine, witness->layout, witness->sources, datagram)
+           && evaluate_condition(machine, &witness->condition, &is_true, &at) == EVALUATED && is_true;
+}
+
+/* Report what the sender of the datagram sends instead of obeying. */
+static void report_evidence(struct routing *routing, const struct witness *witness, const struct datagram *datagram) {
+    struct answer_event *event = (struct answer_event *)routing->record;
+    *event = (struct answer_event){.size = padded_to_word(sizeof *event + datagram->size), .kind = EVENT_EVIDENCE,
+                                   .deadman = witness->deadman_id, .destination = witness->endpoint_id,
+                                   .after = datagram->size};
+    memcpy(event + 1, datagram->data, datagram->size);
+    ring_put(routing->stage.reporter.events, event, event->size);
+}
+
+/* Show the datagram to deadmen that send to its sender. A condition without a result is not met. */
+static void show_to_deadmen(struct routing *routing, const struct route *route, const struct received *received) {
+    struct datagram datagram = datagram_of(routing, received);
+    for (uint32_t index = 0; index < route->witness_count; index++) {
+        const struct witness *witness = &route->witnesses[index];
+        if (witness->column != received->column || !deadman_is_tripped(witness->deadman)) continue;
+        bool obeys = meets_condition(&routing->stage.machine, witness, &datagram);
+        if (deadman_is_shown(routing->stage.timers, witness->deadman, witness->endpoint_id, obeys, received->times.oldest))
+            report_evidence(routing, witness, &datagram);
+    }
+}
+
 /* ---- routing ---- */
 
 /* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. */
@@ -121,6 +157,7 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     stage_count(&routing->stage, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
+    if (chosen->witness_count) show_to_deadmen(routing, chosen, received);
     counter_set(routing->stage.counters, chosen->last_message, received->received_at);
     return ROUTED;
 }

@@ -129,6 +129,6 @@ void route_ros_message(struct ros_routing *routing, const struct ros_topic *topi
         const struct ros_route *route = &topic->routes[index];
         route_ros(routing, route, taken);
         counter_set(stage->counters, route->last_message, taken->received_at);
-        count_duration(stage->counters, route->duration, stage->now(stage) - taken->now);
+        count_duration(stage->counters, route->duration, LATENCY, stage->now(stage) - taken->now);
     }
 }

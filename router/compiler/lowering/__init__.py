@@ -41,6 +41,7 @@ def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnosti
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}
+    obeyed: dict[str, LoweredCondition] = {}
     findings: list[Diagnostic] = []
     for checked in routes:
         filtered = [target for target in checked.targets if not target.topic and target.when is not None]
@@ -57,11 +58,16 @@ def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnosti
                 from_ros[topic] = (*from_ros.get(topic, ()), RosMessage(feed.type, topic).lowered(checked, feed))
             except TooLargeError as error:
                 findings.append(error.diagnostic)
-    return Lowered(to_destinations, to_topics, from_ros), findings
+        try:
+            if checked.obeyed is not None:
+                obeyed[checked.route.name] = lower_condition(checked.obeyed.when, checked.obeyed.case, is_bounded=True)
+        except TooLargeError as error:
+            findings.append(error.diagnostic)
+    return Lowered(to_destinations, to_topics, from_ros, obeyed), findings
 
 
-def lower_condition(condition: Node, case: PayloadCase) -> LoweredCondition:
-    """Lower a single condition on a payload. Raises TooLargeError."""
+def lower_condition(condition: Node, case: PayloadCase, *, is_bounded: bool = False) -> LoweredCondition:
+    """Lower a single condition on a payload. Raises TooLargeError. `is_bounded`: the receive thread evaluates it."""
     source = Datagram(case)
-    routine, _ = source.condition(source.lowering(), [condition])
+    routine, _ = source.condition(source.lowering(), [condition], is_bounded=is_bounded)
     return LoweredCondition(routine, source.layout(condition.span))

@@ -95,9 +95,11 @@ class Lowered:
     """All routines of a table.
 
     For datagrams, by route: `to_destinations` has the destinations with a condition, `to_topics` the topics. `from_ros`
-    is by topic, in the order of the table.
+    is by topic, in the order of the table. `obeyed` has the conditions that show that a deadman's brake is obeyed, by
+    the deadman's route.
     """
 
     to_destinations: Mapping[str, LoweredRoute]
     to_topics: Mapping[str, LoweredRoute]
     from_ros: Mapping[str, tuple[LoweredFeed, ...]]
+    obeyed: Mapping[str, LoweredCondition]
