@@ -25,7 +25,7 @@ from router.compiler.topics import DIAGNOSTICS
 from router.kept.head_start import HeadStart
 from router.log import logger
 from router.net.udp import Listener
-from router.observe.obedience import Obedience, Said
+from router.observe.obedience import Obedience, Replies
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
@@ -160,8 +160,8 @@ class Router:
     def mismatches(self) -> Mapping[Mismatch, int]:
         return self._reporter.mismatches()
 
-    def said(self) -> Said:
-        return self._obedience.said()
+    def replies(self) -> Replies:
+        return self._obedience.replies()
 
     def progress(self) -> int:
         return self._runtime.plane.turns + self.total("datagrams_received")

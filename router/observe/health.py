@@ -14,7 +14,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import INTENDED_REASONS, Mismatch
-from router.observe.obedience import Said, why_disobeyed
+from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.table.model import ANY, EndpointKind
@@ -83,8 +83,8 @@ class Look:
 
     Times in seconds. `silence`: how long each endpoint has been silent, or has not been heard yet. `standing`: how long
     the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
-    `mismatches`: recent senders of messages that no route accepts from them. `said`: what boards report that do not
-    obey, by the deadman's route and the board.
+    `mismatches`: recent senders of messages that no route accepts from them. `replies`: what boards have shown
+    about the brakes of active deadmen.
     """
 
     program: Program
@@ -93,7 +93,7 @@ class Look:
     standing: float
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
-    said: Said = field(default_factory=dict)
+    replies: Replies = field(default_factory=dict)
 
     @property
     def now(self) -> Snapshot:
@@ -238,14 +238,21 @@ class Look:
                 kind, more = Kind.HALTED, f" for {age_text(seconds)}"
                 if silent := self.away[route]:
                     more += f", and {' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} silent"
+            more += "".join(f"; {board} stopped after {time:.2f} s" for board, time in self._stopped(route))
             yield self._problem(kind, {"route": route}, more, (self._owner(route),))
+
+    def _stopped(self, route: str) -> Iterator[tuple[str, float]]:
+        """Yield the boards that have obeyed the deadman of a route, with their stopping times in seconds."""
+        for (of, board), reply in self.replies.items():
+            if of == route and reply.stopped is not None:
+                yield board, reply.stopped
 
     def _disobeyed(self) -> Iterator[Problem]:
         """Yield the boards that do not obey the brake of a deadman, with what was sent and what they report."""
         for (route, endpoint), value in self.now.counts(Kind.DEADMAN_DISOBEYED.metric).items():
             if value > Kind.DEADMAN_DISOBEYED.threshold:
                 labels = {"route": route, "endpoint": endpoint}
-                why = why_disobeyed(self.program, route, endpoint, self.said)
+                why = why_disobeyed(self.program, route, endpoint, self.replies)
                 yield self._problem(Kind.DEADMAN_DISOBEYED, labels, f": {why}", (route,))
 
     def _waiting(self) -> Iterator[Problem]:

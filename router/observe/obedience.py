@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from router.compiler.metrics import Answer, Evidence
 from router.compiler.program import Program
@@ -16,53 +17,67 @@ MOST_FIELDS = 4
 """Maximum number of fields of a message that a text names."""
 _DIGITS = 3
 
-Said = Mapping[tuple[str, str], str]
-"""By a deadman's route and a board: the fields of `obeyed` in its last message that did not meet the condition."""
+
+class Reply(NamedTuple):
+    """What a board has shown since a deadman tripped.
+
+    `stopped`: seconds from the first brake until it had stopped, None if it has not. `said`: the fields of `obeyed` in
+    its last message that did not meet the condition, "" if there was none.
+    """
+
+    stopped: float | None = None
+    said: str = ""
+
+
+Replies = Mapping[tuple[str, str], Reply]
+"""By the deadman's route, and the board."""
 
 
 class Obedience:
-    """The last message of each board that has not obeyed, while its deadman sends. Thread-safe."""
+    """The replies of boards to the deadmen that send now. Thread-safe."""
 
     def __init__(self) -> None:
-        self._said: dict[tuple[str, str], str] = {}
+        self._replies: dict[tuple[str, str], Reply] = {}
         self._lock = threading.Lock()
 
-    def said(self) -> Said:
+    def replies(self) -> Replies:
         with self._lock:
-            return self._said.copy()
+            return self._replies.copy()
 
     def forget(self, route: str) -> None:
-        """Forget what boards have said about the deadman of a route: it trips, or is released."""
+        """Forget the replies to the deadman of a route, which trips or is released."""
         with self._lock:
-            self._said = {key: said for key, said in self._said.items() if key[0] != route}
+            self._replies = {key: reply for key, reply in self._replies.items() if key[0] != route}
 
     def note(self, evidence: Evidence, program: Program) -> None:
-        """Keep what a board says while it does not obey."""
+        """Note what a board says while it does not obey."""
         if said := _read_fields(evidence, program):
-            with self._lock:
-                self._said[evidence.route, evidence.endpoint] = said
+            self._set(evidence.route, evidence.endpoint, Reply(None, said))
 
     def answered(self, answer: Answer, program: Program) -> None:
-        """Log that a board obeys, or does not."""
-        after, key = f"{answer.after / 1e9:.2f} s", (answer.route, answer.endpoint)
+        """Note and log that a board obeys, or does not."""
+        after, place = f"{answer.after / 1e9:.2f} s", {"route": answer.route, "board": answer.endpoint}
         if answer.obeys:
-            with self._lock:
-                self._said.pop(key, None)
-            logger.info("the rover has stopped", route=answer.route, board=answer.endpoint, after=after)
-            return
-        why = why_disobeyed(program, *key, self.said())
-        what = "the board does not obey the brake; stop the rover by other means"
-        logger.error(what, route=answer.route, board=answer.endpoint, after=after, detail=why)
+            self._set(answer.route, answer.endpoint, Reply(answer.after / 1e9))
+            logger.info("the board has stopped", **place, after=after)
+        else:
+            why = why_disobeyed(program, answer.route, answer.endpoint, self.replies())
+            what = "the board does not obey the brake; stop the rover by other means"
+            logger.error(what, **place, after=after, detail=why)
+
+    def _set(self, route: str, board: str, reply: Reply) -> None:
+        with self._lock:
+            self._replies[route, board] = reply
 
 
-def why_disobeyed(program: Program, route: str, board: str, said: Said) -> str:
+def why_disobeyed(program: Program, route: str, board: str, replies: Replies) -> str:
     """Return what the deadman of a route sends, and what the board says to that."""
     deadman = next((each.deadman for each in program.table.routes if each.name == route), None)
     if deadman is None or deadman.obeyed is None:  # a reload has removed it meanwhile
         return ""
     sent, case = f"{deadman.case.value} {deadman.fields}", deadman.obeyed.case.value
-    answer = f"says {said[route, board]}" if (route, board) in said else f"has sent no {case} since"
-    return f"it was sent {sent}, and {answer}"
+    said = replies.get((route, board), Reply()).said
+    return f"it was sent {sent}, and {f'says {said}' if said else f'has sent no {case} since'}"
 
 
 def _read_fields(evidence: Evidence, program: Program) -> str:

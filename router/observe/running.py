@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.errors import Diagnostic
+from router.observe.obedience import Replies
 from router.recording.mirror import Mirror
 
 if TYPE_CHECKING:
@@ -41,8 +42,8 @@ class Running(Protocol):
     def mismatches(self) -> Mapping[Mismatch, int]:
         """Return messages from hosts that no route accepts them from, and their latest time (boot clock, ns)."""
 
-    def said(self) -> Mapping[tuple[str, str], str]:
-        """Return the last messages of boards that do not obey, by a deadman's route and the board: see `Obedience`."""
+    def replies(self) -> Replies:
+        """Return what boards have shown about the brakes of the deadmen that send now."""
 
     def progress(self) -> int:
         """Return a number that changes at least every half second unless the receive thread is stuck."""

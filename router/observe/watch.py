@@ -60,7 +60,7 @@ class Watch:
                 self._snapshots.append(latest)
         silence = {name: (now - then) / 1e9 for name, then in seen.items()}
         recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
-        return Look(program, snapshots, silence, self.standing(now), tripped, recent, self._running.said())
+        return Look(program, snapshots, silence, self.standing(now), tripped, recent, self._running.replies())
 
     def standing(self, now: int) -> float:
         """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""

@@ -40,8 +40,8 @@ foxglove: {{address: 127.0.0.1:@foxglove}}
 """The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
 
 MADE_BY_PROMETHEUS = {"up"}
-OF_OTHER_TABLES = {"router_messages_collected_total", "router_gateway_connections"}
-"""No route of the rover collects, no gateway of it is in a Zenoh network."""
+OF_OTHER_TABLES = {"router_messages_collected_total", "router_gateway_connections", "router_deadman_disobeyed"}
+"""No route of the rover collects, no gateway of it is in a Zenoh network, and no deadman has `obeyed`."""
 
 
 @dataclass

@@ -18,6 +18,7 @@ endpoints:
   arm_board: {{stale_after: never}}
 routes:
   ph_info: {{source: [sensor_board, arm_board]}}
+  manual_drive: {{deadman: {{obeyed: {{drive_diag: abs(front_left_motor.rpm) < 5, within: 2s}}}}}}
 gateways:
   dashboard:
     inbound:

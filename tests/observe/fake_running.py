@@ -20,6 +20,7 @@ from router.errors import SourceSpan
 from router.observe.health import Look
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
+from router.observe.obedience import Reply
 from router.observe.running import ReloadResult
 from router.observe.watch import LAST_SEEN, Health, Watch
 from router.recording.mirror import Classifier, Mirror, Mirrored
@@ -49,6 +50,7 @@ class FakeRunning:
         self.reloads = RELOADED
         self.failures: list[Exception] = []
         self.seen: dict[Mismatch, int] = {}
+        self.given_replies: dict[tuple[str, str], Reply] = {}
         self.collected = 0
         self.mirror = Mirror(self, self.failures.append)
         self.lost = 0
@@ -82,8 +84,8 @@ class FakeRunning:
         }
         return CountersCollector(self.program.counters, lambda: [self.counts], computed, {"version": "1"}).collect()
 
-    def said(self) -> dict[tuple[str, str], str]:
-        return {}
+    def replies(self) -> dict[tuple[str, str], Reply]:
+        return self.given_replies
 
     def mismatches(self) -> dict[Mismatch, int]:
         return self.seen

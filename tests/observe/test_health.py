@@ -11,6 +11,7 @@ from router.compiler import metrics
 from router.compiler.metrics import Mismatch
 from router.observe import watch
 from router.observe.health import PERIOD, REMEDIES, WINDOW
+from router.observe.obedience import Reply
 from router.observe.problems import PAGE, Kind, Level, Problem
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
@@ -40,6 +41,12 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
             "deadman_send_errors manual_drive driving_board",
             1,
             "the deadman of manual_drive cannot reach driving_board, 1 in 2 s",
+        ),
+        (
+            "deadman_disobeyed manual_drive driving_board",
+            1,
+            "driving_board does not obey the brake of manual_drive: it was sent manual_brake {brake: true}, and has sent "
+            "no drive_diag since",
         ),
         ("config_last_reload_successful", 0, "the last reload failed; the old table is still running"),
         (
@@ -86,6 +93,28 @@ def test_what_is_counted_is_a_problem_unless_the_table_asks_for_it(
     problems = router.look(2).problems
     assert [problem.text for problem in problems] == ([told] if told else [])
     assert all(problem.remedy and problem.page == f"{PAGE}#{problem.kind.alert.lower()}" for problem in problems)
+
+
+def test_a_board_that_does_not_obey_is_told_with_what_it_says(router: Counting) -> None:
+    router.count("deadman_disobeyed", "manual_drive", "driving_board", to=1)
+    router.given_replies["manual_drive", "driving_board"] = Reply(None, "drive_diag front_left_motor.rpm=300")
+    [problem] = router.look(1).problems
+    assert problem.kind.level is Level.CRITICAL
+    assert problem.text.endswith(
+        ": it was sent manual_brake {brake: true}, and says drive_diag front_left_motor.rpm=300"
+    )
+    assert problem.remedy.startswith("Stop the rover by other means.")
+    assert problem.routes == ("manual_drive",)
+
+
+def test_of_a_deadman_that_sends_the_stopping_times_are_told(router: Counting) -> None:
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("deadman_trips", "manual_drive", to=1)
+    router.given_replies["manual_drive", "driving_board"] = Reply(0.4321)
+    router.given_replies["drive_motor", "driving_board"] = Reply(9.0)
+    sent = "its deadman sends in their place; driving_board stopped after 0.43 s"
+    assert router.told(1) == [f"commands of manual_drive do not get through: {sent}"]
+    assert "manual_drive is halted: no commands for 61 s; driving_board stopped after 0.43 s" in router.told(61)
 
 
 def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
