@@ -75,7 +75,7 @@ def why_disobeyed(program: Program, route: str, board: str, replies: Replies) ->
     deadman = next((each.deadman for each in program.table.routes if each.name == route), None)
     if deadman is None or deadman.obeyed is None:  # a reload has removed it meanwhile
         return ""
-    sent, case = f"{deadman.case.value} {deadman.fields}", deadman.obeyed.case.value
+    sent, case = " and ".join(map(str, deadman.payloads)), deadman.obeyed.case.value
     said = replies.get((route, board), Reply()).said
     return f"it was sent {sent}, and {f'says {said}' if said else f'has sent no {case} since'}"
 

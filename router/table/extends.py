@@ -3,9 +3,9 @@
 Mappings merge key by key; everything else is replaced. These mappings are also replaced: values that may be a list
 (such as the topics of a route) or a name (a QoS); a `map` of values; a route or gateway that only one of the two files
 ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and the
-reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a deadman is
-obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace each other.
-Every node keeps the span of its own file.
+reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a deadman
+is obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace each
+other. Every node keeps the span of its own file.
 """
 
 from __future__ import annotations

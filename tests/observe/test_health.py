@@ -18,6 +18,7 @@ from tests.acceptance.site import wait_until
 from tests.observe.counting import SECOND, Counting
 
 STALLED = Kind.PUBLISH_STALLED.metric
+SENT = "it was sent manual_brake {brake: true}"
 
 
 def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting) -> None:
@@ -45,8 +46,7 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
         (
             "deadman_disobeyed manual_drive driving_board",
             1,
-            "driving_board does not obey the brake of manual_drive: it was sent manual_brake {brake: true}, and has sent "
-            "no drive_diag since",
+            f"driving_board does not obey the brake of manual_drive: {SENT}, and has sent no drive_diag since",
         ),
         ("config_last_reload_successful", 0, "the last reload failed; the old table is still running"),
         (
@@ -100,9 +100,7 @@ def test_a_board_that_does_not_obey_is_told_with_what_it_says(router: Counting) 
     router.given_replies["manual_drive", "driving_board"] = Reply(None, "drive_diag front_left_motor.rpm=300")
     [problem] = router.look(1).problems
     assert problem.kind.level is Level.CRITICAL
-    assert problem.text.endswith(
-        ": it was sent manual_brake {brake: true}, and says drive_diag front_left_motor.rpm=300"
-    )
+    assert problem.text.endswith(f": {SENT}, and says drive_diag front_left_motor.rpm=300")
     assert problem.remedy.startswith("Stop the rover by other means.")
     assert problem.routes == ("manual_drive",)
 
