@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
+
+from google.protobuf.message import Message
 
 from router.compiler.metrics import Answer, Evidence
 from router.compiler.program import Program
@@ -89,5 +91,14 @@ def _read_fields(evidence: Evidence, program: Program) -> str:
         return ""
     tree = protobuf_tree(decoded.message, decoded.case.type, _DIGITS)
     read = [word for word in words(tree) if word.partition("=")[0] in names]
+    read += [f"no {path}" for path in _absent(decoded.message, names)]
     more = [f"and {len(read) - MOST_FIELDS} more"] if len(read) > MOST_FIELDS else []
-    return f"{decoded.case.name} {' '.join(read[:MOST_FIELDS] + more) or 'with defaults only'}"
+    return f"{decoded.case.name} {', '.join(read[:MOST_FIELDS] + more) or 'with defaults only'}"
+
+
+def _absent(message: Message, names: Iterable[str]) -> Iterator[str]:
+    """Yield the fields that are not set, of those whose presence the condition reads: `has(front_left_motor)`."""
+    for name in names:
+        path = name.removeprefix("has(").removesuffix(")")
+        if path != name and path.isidentifier() and not message.HasField(path):
+            yield path

@@ -19,6 +19,9 @@ from router.values import compact
 TIMEOUT = 1.0
 """Seconds without a command after which a board stops on its own."""
 
+STOPPING = 0.4
+"""Seconds in which a board's motors stop from full speed."""
+
 MISSED_REPEATS = 3
 """A deadman counts as ended when this many of its repeats are missing."""
 
@@ -28,6 +31,9 @@ class State(enum.Enum):
     OBEYING = "obeying"
     HALTED = "halted"
     STOPPED = "stopped"
+
+
+_STANDING = {State.WAITING, State.HALTED, State.STOPPED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +105,7 @@ class Board:
         self._stops = stops
         self._changed = changed
         self._since = 0.0
+        self._moved_until = -STOPPING
         self._commanded_at = 0.0
         self._halted_until = 0.0
         self._halt = ""
@@ -121,6 +128,12 @@ class Board:
         if self.state in (State.OBEYING, State.HALTED) and now - self._commanded_at >= TIMEOUT:
             self._enter(now, State.STOPPED)
 
+    def pace(self, now: float) -> float:
+        """Return how fast the motors turn, from 0 to 1: a board that halts or stops slows down for STOPPING seconds."""
+        if self.state not in _STANDING:
+            return 1.0
+        return max(0.0, 1 - (now - self._moved_until) / STOPPING)
+
     def status(self, now: float) -> str:
         """Return the state as text for people."""
         if self.state is State.WAITING:
@@ -135,6 +148,8 @@ class Board:
         if state is self.state:
             return
         was, lasted = self.state, now - self._since
+        if was not in _STANDING:
+            self._moved_until = now
         self.state, self._since = state, now
         if state is State.HALTED:
             text = f"halted by a deadman: {self._halt}"

@@ -14,7 +14,7 @@ import socket
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from router.compiler.program import DeadmanPlan
 from router.datagrams import Wire
@@ -23,7 +23,7 @@ from router.table.addresses import Address
 from router.table.model import ANY, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
-from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, pose
+from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
 from router.tools.udp import LOOPBACK, listener_address, open_udp
 from router.types.protobuf import PayloadCase
 
@@ -251,7 +251,7 @@ class Simulator:
         if any(silence.covers(stream, at) for silence in self._silences):
             return
         message = stream.case.message_class()
-        self._models[index].fill(message, pose(at, epoch))
+        self._models[index].fill(message, self._pose(stream.endpoint, at, epoch))
         try:
             to = self._destinations.get(stream.endpoint, self._router)
             self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message), to)
@@ -259,6 +259,13 @@ class Simulator:
             self.statistics.unsent += 1
         else:
             self.statistics.sent[stream.endpoint][stream.case.name] += 1
+
+    def _pose(self, endpoint: str, at: float, epoch: float) -> Pose:
+        """Return the rover's pose as an endpoint reports it: the motors of a board that has halted do not turn."""
+        now, inbox = pose(at, epoch), self.statistics.inboxes.get(endpoint)
+        if inbox is None or inbox.board is None:
+            return now
+        return replace(now, speed=now.speed * inbox.board.pace(at))
 
     def _receive(self, receiver: socket.socket, inbox: Inbox, now: float) -> None:
         for _ in range(DRAIN):

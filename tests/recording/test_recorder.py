@@ -199,6 +199,38 @@ def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_pat
     assert len(read(files(tmp_path)[-1])) == 2
 
 
+def test_a_deadman_that_awaits_boards_is_saved_with_their_answers(tmp_path: Path) -> None:
+    with running_recorder(tmp_path, continuous=False, last=10**6) as (made, _):
+        made.deadman_tripped("drive", ["left", "right"])
+        made.deadman_tripped("arm", ["arm"])
+        made.deadman_tripped("mast", ["mast"])
+        made.board_answered("drive", "left", "stopped after 0.43 s")
+        made.board_answered("drive", "left", "stopped after 0.90 s")  # it moved again
+        made.board_answered("drive", "right", "did not obey for 2.00 s")
+        wait_for_file(tmp_path, "deadman-drive")
+        made.deadman_released("arm")
+        wait_for_file(tmp_path, "deadman-arm")
+    notes = {path.name.partition("Z_")[2]: about(path).get("obeyed") for path in files(tmp_path)}
+    assert notes == {
+        "deadman-drive.mcap": "drive: left stopped after 0.43 s; drive: right did not obey for 2.00 s",
+        "deadman-arm.mcap": None,
+        "deadman-mast.mcap": None,  # at the end
+    }
+
+
+def wait_for_file(folder: Path, reason: str) -> None:
+    deadline = monotonic() + PATIENCE
+    while not any(reason in path.name for path in files(folder)):
+        assert monotonic() < deadline, "it was never saved"
+        sleep(0.01)
+
+
+def about(path: Path) -> dict[str, str]:
+    with closing(Recording(path)) as recording:
+        assert list(recording.datagrams()) == []
+        return recording.about
+
+
 def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
     with running_recorder(tmp_path) as (made, _):
         made.deadman_tripped("drive_motor")

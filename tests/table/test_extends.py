@@ -59,6 +59,26 @@ routes:
 
 
 @pytest.mark.parametrize(
+    ("over", "case", "within"),
+    [
+        ("{within: 3s}", "drive_diag", 3),
+        ("{drive_diag: x < 2}", "drive_diag", 2),
+        ("{arm_diag: x < 2, within: 1s}", "arm_diag", 1),
+    ],
+)
+def test_what_shows_that_a_deadman_is_obeyed_merges_unless_it_is_another_case(
+    base: Path, over: str, case: str, within: int
+) -> None:
+    own = "{drive_diag: x < 1, within: 2s}"
+    (base / "shown.yaml").write_text(f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{obeyed: {own}}}}}\n")
+    table = good(base, f"extends: shown.yaml\nroutes:\n  manual_drive: {{deadman: {{obeyed: {over}}}}}\n")
+    [deadman] = [route.deadman for route in table.routes if route.name == "manual_drive"]
+    assert deadman is not None
+    assert deadman.obeyed is not None
+    assert (deadman.obeyed.case.value, deadman.obeyed.within.value) == (case, within * 10**9)
+
+
+@pytest.mark.parametrize(
     ("send", "sent"),
     [
         ("{manual_brake: {brake: false}}", ["manual_brake {brake: false, by.who: 'router'}"]),

@@ -120,3 +120,13 @@ def test_frames_are_counted_when_their_last_part_comes_or_it_is_too_late() -> No
 def test_parts_are_known_by_their_fields() -> None:
     cases = wire_of_protos(PROTOS).envelope.cases
     assert [name for name, case in cases.items() if is_part(case.type)] == ["detected_object"]
+
+
+def test_the_motors_turn_while_it_obeys_and_need_a_moment_to_stop(wire: Wire, board: Board) -> None:
+    assert board.pace(0.0) == 0
+    board.take(1.0, decoded(wire, "plain"))
+    assert board.pace(1.5) == 1
+    board.take(2.0, decoded(wire, "every_kind", "i32=1"))
+    assert [round(board.pace(at), 3) for at in (2.0, 2.1, 2.4, 3.0)] == [1, 0.75, 0, 0]
+    board.advance(3.0)
+    assert (board.state, board.pace(3.1)) == (State.STOPPED, 0)
