@@ -19,12 +19,13 @@ from router.compiler.metrics import (
     DROP_REASONS,
     GATEWAY_DROP_REASONS,
     GATEWAY_REJECT_REASONS,
-    HISTOGRAM_BOUNDS_NS,
+    LATENCY_BOUNDS_NS,
     METRICS,
     RECORD_DROP_REASONS,
     REJECT_REASONS,
     RELOAD_RESULTS,
     STARTS,
+    STOPPING_BOUNDS_NS,
     TOPIC_STATES,
 )
 from router.errors import Code
@@ -109,7 +110,8 @@ def functions_page() -> str:
 
 def metrics_page() -> str:
     """Every metric with its labels, from the counters."""
-    bounds = ", ".join(f"{bound / 1000:g}" for bound in HISTOGRAM_BOUNDS_NS)
+    latency = ", ".join(f"{bound / 1000:g}" for bound in LATENCY_BOUNDS_NS)
+    stopping = ", ".join(f"{bound / 1e9:g}" for bound in STOPPING_BOUNDS_NS)
     lines = ["# Metrics", "", _MADE, "| metric | type | labels | meaning |", "|---|---|---|---|"]
     for metric in METRICS:
         kind = metric.kind if metric.kind in ("counter", "histogram") else "gauge"
@@ -146,7 +148,7 @@ def metrics_page() -> str:
         "",
         fill(_LOG, WIDTH),
         "",
-        fill(f"{_DURATION} {bounds}.", WIDTH),
+        fill(f"{_DURATION} {latency}. `router_deadman_stopping_seconds` has those at {stopping} s.", WIDTH),
         "",
     ]
     return "\n".join(lines)
