@@ -143,6 +143,7 @@ def destinations_of(
             id=names.number(name),
             follows=name in plan.following,
             **{kind: outlet.address},
+            **(_heard(name, counters) if kind == "sender" else {}),
             **_obeyed(plan, name, counters),
         )
         for (name, datagrams), outlet in zip(plan.datagrams, outlets, strict=True)
@@ -163,6 +164,11 @@ def feed_of(plan: DeadmanPlan, deadman: Addressed, endpoint: str, *, disarms: bo
 def datagrams_of(datagrams: Collection[bytes]) -> ctypes.Array[c.DeadmanDatagram]:
     """Return the datagrams for one destination."""
     return (c.DeadmanDatagram * len(datagrams))(*(c.DeadmanDatagram(data=each, size=len(each)) for each in datagrams))
+
+
+def _heard(name: str, counters: Counters) -> Mapping[str, int]:
+    """Return the fields of a destination that say when it was last heard."""
+    return {"is_heard": 1, "last_seen": counters.index("endpoint_last_seen_timestamp_seconds", name)}
 
 
 def _obeyed(plan: DeadmanPlan, name: str, counters: Counters) -> Mapping[str, int]:

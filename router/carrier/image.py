@@ -140,7 +140,7 @@ def _plain(argument: object) -> object:
     if isinstance(argument, ctypes.Array):
         return [
             (_plain(each.sender), [_bytes(datagram) for datagram in each.datagrams[: each.count]], each.sent,
-             each.send_errors, each.id, each.follows, each.within,
+             each.send_errors, each.id, each.follows, each.is_heard, each.last_seen, each.within,
              each.disobeyed, each.stopping)
             for each in argument
         ]  # fmt: skip

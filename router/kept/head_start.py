@@ -110,9 +110,13 @@ class HeadStart:
         if not isinstance(argument, list):
             return argument
         made = (c.DeadmanDestination * len(argument))()
-        for to, (sender, datagrams, sent, send_errors, number, follows, *obeyed) in zip(made, argument, strict=True):
+        for to, (sender, datagrams, sent, send_errors, number, follows, is_heard, last_seen, *obeyed) in zip(
+            made, argument, strict=True
+        ):
             to.sender, to.datagrams, to.count = self._argument(sender, parts), datagrams_of(datagrams), len(datagrams)
             to.sent, to.send_errors, to.id, to.follows = sent, send_errors, number, follows
+            to.is_heard, to.last_seen = is_heard, last_seen
+            to.within, to.disobeyed, to.stopping = obeyed
         return made
 
     def _symbols(self, parts: Mapping[str, Any]) -> list[tuple[tuple[str | None, ...], int]]:

@@ -23,6 +23,7 @@ _SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_lock": (None, (c_void_p,)),
     "seam_next_due": (c_int64, (c_void_p,)),
     "seam_refuse": (None, (c_void_p, c_int)),
+    "seam_hear": (None, (c_void_p, c_void_p)),
     "seam_timer": (c_int, (c_void_p,)),
     "seam_unlock": (None, (c_void_p,)),
     "seam_wakes_at": (c_int64, (c_void_p,)),

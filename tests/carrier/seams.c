@@ -10,6 +10,8 @@ void seam_hide(struct timers *timers, bool hides) {
     if (hides) first = timers->first;
     timers->first = hides ? (struct timer *)sizeof(void *) : first;
 }
+/* As if these counters said when endpoints were heard. */
+void seam_hear(struct timers *timers, const counter *heard) { timers->heard = heard; }
 int seam_timer(struct timers *timers) { return timers->timer; }
 void seam_lock(struct timers *timers) { pthread_mutex_lock(&timers->lock); }
 void seam_unlock(struct timers *timers) { pthread_mutex_unlock(&timers->lock); }

@@ -103,6 +103,8 @@ class NativeSide:
         self._plans: WeakKeyDictionary[NativeDeadman, DeadmanPlan] = WeakKeyDictionary()
         self._ring = Ring(library, event_bytes)
         self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
+        self._heard = (ctypes.c_int64 * 100)()
+        seams.seam_hear(self.deadmen.address, self._heard)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
         made = self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
@@ -150,6 +152,9 @@ class NativeSide:
 
     def refuses(self, endpoint: str) -> None:
         self._seams.seam_refuse(self._outlets[endpoint].address, errno.ECONNREFUSED)
+
+    def hears(self, endpoint: str) -> None:
+        self._heard[self._counters.index("endpoint_last_seen_timestamp_seconds", endpoint)] += 1
 
     def await_subscribers(self, deadman: NativeDeadman, now: int) -> None:
         self._library.deadman_await_subscribers(self.deadmen.address, deadman.address, now)
@@ -209,6 +214,7 @@ steps = st.one_of(
     st.tuples(st.just("end_when_served"), chosen),
     st.tuples(st.just("break"), st.tuples(endpoints, st.booleans())),
     st.tuples(st.just("refuse"), endpoints),
+    st.tuples(st.just("hear"), endpoints),
 )
 
 Plan = tuple[int, int, list[str], bool, int]
@@ -317,6 +323,32 @@ class Comparison:
         self._native.refuses(endpoint)
 
 
+    def do_hear(self, endpoint: str) -> None:
+        self._plain.heard[endpoint] += 1
+        self._native.hears(endpoint)
+
+
+@example(
+    steps=[
+        ("start", "drive"),
+        ("hear", "wheels"),
+        ("pass", START_AGAIN),
+        ("command", ("wheels", [("drive", False, 0)])),
+        ("pass", START_AGAIN),
+        ("hear", "arm"),
+        ("pass", START_AGAIN),
+        ("pass", START_AGAIN),
+    ]
+)
+@example(
+    steps=[
+        ("start", "drive"),
+        ("hear", "arm"),
+        ("replace", ("drive", (50, 10, ["arm", "mast"], True, 0))),
+        ("pass", START_AGAIN),
+        ("pass", START_AGAIN),
+    ]
+)
 @example(
     steps=[
         ("greet", ("stop", 0)),

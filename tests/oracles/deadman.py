@@ -6,6 +6,9 @@ time. Endpoints are armed one by one, and a deadman sends to those that are. A c
 any state, one of a route that it hands over to disarms it; endpoints that the route never commands go with the others.
 A command that failed changes nothing, and one that left though an earlier one was refused arms what is unarmed and puts
 off nothing.
+
+At the start, and each second from then on, an endpoint gets the payloads until a command goes to it, or once more after
+it was heard.
 """
 
 from __future__ import annotations
@@ -28,9 +31,12 @@ class Deadman:
     outlets: dict[str, tuple[bytes, ...]]
     armed: set[str] = field(default_factory=set)
     unstarted: set[str] = field(default_factory=set)
-    """What gets the payloads of the start at the next attempt."""
+    """What gets the payloads of the start when that is due next."""
+    started: dict[str, int] = field(default_factory=dict)
+    """What has got them, and how often it had been heard before."""
     has_tripped: bool = False
     due: int | None = None
+    start_due: int | None = None
     greets_until: int = 0
     greets_again: int | None = None
     ends_when_due: bool = False
@@ -43,6 +49,15 @@ class Deadman:
     @property
     def names(self) -> set[str]:
         return {name for name, _ in self.plan.datagrams}
+
+    @property
+    def dues(self) -> list[int]:
+        return [due for due in (self.due, self.start_due) if due is not None]
+
+    def end_start(self, to: set[str]) -> None:
+        self.unstarted -= to
+        if not self.unstarted:
+            self.start_due = None
 
     def with_followers(self, armed: set[str]) -> set[str]:
         return armed | self.plan.following if armed - self.plan.following else armed
@@ -58,6 +73,7 @@ class Deadmen:
     counts: Counter[tuple[str, ...]] = field(default_factory=Counter)
     broken: set[str] = field(default_factory=set)
     refused: set[str] = field(default_factory=set)
+    heard: Counter[str] = field(default_factory=Counter)
 
     def add(self, plan: DeadmanPlan) -> Deadman:
         deadman = Deadman(plan, dict(plan.datagrams))
@@ -69,7 +85,7 @@ class Deadmen:
 
     @property
     def next_due(self) -> int | None:
-        return min((each.due for each in self.deadmen if each.due is not None), default=None)
+        return min((due for each in self.deadmen for due in each.dues), default=None)
 
     def command(self, now: int, feeds: list[tuple[Deadman, bool]], endpoint: str, data: bytes) -> None:
         error = self._send(endpoint, data)
@@ -92,6 +108,7 @@ class Deadmen:
         if disarms:
             self._disarm(deadman, to)
             return
+        deadman.end_start(to | deadman.plan.following)
         if not (is_refused and deadman.armed):
             deadman.due = now + deadman.plan.timeout
         deadman.armed |= to | deadman.plan.following
@@ -99,26 +116,24 @@ class Deadmen:
             self._release(deadman)
 
     def _disarm(self, deadman: Deadman, to: set[str]) -> None:
-        was_armed = bool(deadman.armed)
+        deadman.end_start(to)
         deadman.armed -= to
-        deadman.unstarted -= to
         if deadman.armed - deadman.plan.following:
             return
         deadman.armed = set()
-        if was_armed or not deadman.unstarted:
-            deadman.due = None
+        deadman.due = None
         self._release(deadman)
 
     def serve(self, now: int) -> None:
         for deadman in self.deadmen:
+            if deadman.start_due is not None and deadman.start_due <= now:
+                self._send_at_start(deadman, now)
             if deadman.due is not None and deadman.due <= now:
                 self.serve_one(deadman, deadman.due, now)
 
     def serve_one(self, deadman: Deadman, due: int, now: int) -> None:
         if deadman.ends_when_due:
             self.end(deadman)
-        elif not deadman.armed:
-            self._send_at_start(deadman, now)
         else:
             repeat, trips = deadman.plan.repeat, not deadman.has_tripped
             deadman.due = due + repeat * (1 + (now - due) // repeat)  # repeats missed by a stalled process are skipped
@@ -132,17 +147,19 @@ class Deadmen:
         """Send the payload at the router's start, without changing the state. Return the endpoints reached."""
         if not deadman.plan.at_start:
             return []
-        deadman.unstarted = {*deadman.outlets}
+        deadman.unstarted, deadman.started = {*deadman.outlets}, {}
         return self._send_at_start(deadman, now)
 
     def _send_at_start(self, deadman: Deadman, now: int) -> list[str]:
-        errors = self._send_all(deadman, deadman.unstarted)
-        times = [deadman.greets_again]
+        to, before, started = deadman.unstarted, Counter(self.heard), dict(deadman.started)
+        errors = self._send_all(deadman, to)
         failed = {name for name, each in errors.items() if {*each} - {0, errno.ECONNREFUSED}}
-        deadman.unstarted = failed if deadman.greets_again is None else {*deadman.outlets}
-        if failed:
-            times.append(now + START_AGAIN)
-        deadman.due = min((time for time in times if time is not None), default=None)
+        for name in to - failed - started.keys():
+            deadman.started[name] = before[name]
+        again = {name for name in to if name in failed or started.get(name, before[name]) == before[name]}
+        times = [deadman.greets_again, now + START_AGAIN if again else None]
+        deadman.unstarted = again if deadman.greets_again is None else {*deadman.outlets}
+        deadman.start_due = min((time for time in times if time is not None), default=None)
         deadman.greets_again = None
         return [endpoint for endpoint, each in errors.items() if not any(each)]
 
@@ -154,7 +171,7 @@ class Deadmen:
         if now >= deadman.greets_until or deadman.armed:
             return False
         deadman.unstarted = {*deadman.outlets}
-        deadman.due, deadman.greets_again = now, now + GREETING
+        deadman.start_due, deadman.greets_again = now, now + GREETING
         return True
 
     def replace(self, next_one: Deadman, earlier: Deadman) -> None:
@@ -167,11 +184,16 @@ class Deadmen:
         if was_armed:
             assert due is not None
             self._pass_on(next_one, earlier, next_one.with_followers(passed), due)
-        elif due is not None and next_one.plan.at_start and not next_one.armed:
-            unstarted = earlier.unstarted & next_one.names
-            if unstarted:
-                next_one.unstarted |= unstarted
-                next_one.due, next_one.greets_again = due, earlier.greets_again
+        unstarted, start_due = earlier.unstarted & next_one.names - next_one.armed, earlier.start_due
+        earlier.end_start(earlier.unstarted)
+        if not next_one.plan.at_start:
+            return
+        next_one.unstarted |= unstarted
+        next_one.started |= {name: earlier.started[name] for name in unstarted & earlier.started.keys()}
+        if next_one.unstarted:
+            for name, value in (("start_due", start_due), ("greets_again", earlier.greets_again)):
+                times = [time for time in (value, getattr(next_one, name)) if time is not None]
+                setattr(next_one, name, min(times, default=None))
 
     def _pass_on(self, next_one: Deadman, earlier: Deadman, passed: set[str], due: int) -> None:
         was_armed = bool(next_one.armed)
@@ -196,11 +218,13 @@ class Deadmen:
         """Send a last time to what is armed; also when replaced by a deadman that does not send there."""
         armed, deadman.armed = deadman.armed, set()
         deadman.due, deadman.greets_until = None, 0
+        deadman.end_start(deadman.names)
         self._send_all(deadman, armed)
 
     def end_when_served(self, deadman: Deadman) -> None:
         deadman.ends_when_due, deadman.greets_until = bool(deadman.armed), 0
         deadman.due = 0 if deadman.ends_when_due else None
+        deadman.end_start(deadman.names)
 
     def _send_all(self, deadman: Deadman, to: set[str]) -> dict[str, list[int]]:
         errors = {

@@ -276,6 +276,7 @@ struct carrier *carrier_open(struct timers *timers, counter *counters, struct ri
     if (!carrier) return NULL;
     bool is_open = stage_open(&carrier->routing.stage, counters, events, timers);
     carrier->routing.published = published;
+    timers->heard = counters;
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);

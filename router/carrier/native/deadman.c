@@ -7,7 +7,7 @@
 #include "defer.h"
 #include "deliver.h"
 
-/* In ns: the delay before a failed datagram of the start is sent again; how long after the start a newly discovered
+/* In ns: the delay before the datagrams of the start are sent again; how long after the start a newly discovered
  * subscriber may be one that already existed, as discovery takes less; and the time in which it also discovers the
  * publisher. */
 static const int64_t START_AGAIN = 1000000000, START = 10000000000, GREETING = 500000000;
@@ -24,7 +24,8 @@ struct answer {
 };
 
 struct deadman {
-    struct timer timer;      /* not due while unarmed, unless it repeats the start, and never once replaced */
+    struct timer timer;      /* not due while unarmed, and never once replaced */
+    struct timer starting;   /* due while `unstarted` */
     struct deadman *acting;  /* the last deadman that has replaced it, or itself */
     struct deadman *fellow;  /* the next one with the same `acting`, in a circular list */
     int64_t timeout, repeat; /* ns */
@@ -32,17 +33,19 @@ struct deadman {
     uint64_t armed;          /* get datagrams when it trips, and when it ends */
     uint64_t followers;
     uint64_t own;            /* all, without those that have passed to the deadman that has replaced it */
-    uint64_t unstarted;      /* get the datagrams of the start when it is served next */
+    uint64_t unstarted;      /* get the datagrams of the start when `starting` is served next */
+    uint64_t started;        /* have got the datagrams of the start */
     uint64_t watched;        /* may show whether they obey */
     bool has_tripped;        /* written by `set_tripped` */
     bool starts;             /* sends when the router starts */
     bool is_ending;          /* ends when it is served next */
     int64_t tripped_at;      /* while tripped: since when */
     int64_t greets_until;    /* until then, and while unarmed, it greets new subscribers */
-    int64_t greets_again;    /* the due time after the next one, while unarmed; or NEVER */
+    int64_t greets_again;    /* the due time of `starting` after the next one; or NEVER */
     uint32_t active, trips, id;
     uint32_t count;
     struct answer *answers; /* of the destinations */
+    int64_t *heard_at;      /* when each was last heard before the first datagrams of the start */
     struct deadman_destination destinations[];
 };
 
@@ -168,21 +171,27 @@ static void release(struct timers *timers, struct deadman *deadman) {
     report(timers, EVENT_RELEASED, deadman);
 }
 
+static void end_start(struct timers *timers, struct deadman *deadman, uint64_t destinations) {
+    deadman->unstarted &= ~destinations;
+    if (!deadman->unstarted) timer_set_due(timers, &deadman->starting, NEVER);
+}
+
 static void arm(struct timers *timers, struct deadman *deadman, uint64_t to, int64_t now) {
-    deadman->armed |= to | deadman->followers;
+    to |= deadman->followers;
+    end_start(timers, deadman, to);
+    deadman->armed |= to;
     timer_set_due(timers, &deadman->timer, now + deadman->timeout);
     release(timers, deadman);
 }
 
 /* Destinations that stay armed keep the deadline. */
 static void disarm(struct timers *timers, struct deadman *deadman, uint64_t to) {
-    bool was_armed = deadman->armed;
+    end_start(timers, deadman, to);
     deadman->armed &= ~to;
-    deadman->unstarted &= ~to;
     await_answers(timers, deadman, to, 0);
     if (deadman->armed & ~deadman->followers) return;
     deadman->armed = 0;
-    if (was_armed || !deadman->unstarted) timer_set_due(timers, &deadman->timer, NEVER);
+    timer_set_due(timers, &deadman->timer, NEVER);
     release(timers, deadman);
 }
 
@@ -245,17 +254,43 @@ static void arm_one(struct timers *timers, const struct feed *feed, int64_t now)
     uint64_t to = deadman == feed->deadman ? feed->to : redirected(feed);
     if (!to) return;
     to |= deadman->followers;
+    end_start(timers, deadman, to);
     if (!deadman->armed) timer_set_due(timers, &deadman->timer, now + deadman->timeout);
     if (deadman->has_tripped) await_answers(timers, deadman, to & ~deadman->armed, now);
     deadman->armed |= to;
 }
 
-/* Send the datagrams of the start. If that fails, for example because the network is not up yet, repeat it. */
+static int64_t last_heard(const struct timers *timers, const struct deadman *deadman, uint32_t index) {
+    const struct deadman_destination *to = &deadman->destinations[index];
+    bool is_known = to->is_heard && timers->heard;
+    return is_known ? atomic_load_explicit(&timers->heard[to->last_seen], memory_order_relaxed) : 0;
+}
+
+/* Return the destinations that get the datagrams of the start for the last time: they were heard since they got the first
+ * ones, or nobody can hear them. */
+static uint64_t reachable(const struct timers *timers, const struct deadman *deadman) {
+    uint64_t found = 0;
+    for (uint64_t left = deadman->unstarted; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        bool was_heard = last_heard(timers, deadman, index) != deadman->heard_at[index];
+        if (!deadman->destinations[index].is_heard || (deadman->started & bit(index) && was_heard)) found |= bit(index);
+    }
+    return found;
+}
+
+/* Send the datagrams of the start, and determine when to repeat it. */
 static uint64_t start(struct timers *timers, struct deadman *deadman, int64_t now) {
+    uint64_t are_last = reachable(timers, deadman);
+    for (uint64_t left = deadman->unstarted & ~deadman->started; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        deadman->heard_at[index] = last_heard(timers, deadman, index);
+    }
     struct outcome outcome = send_all(timers, deadman, deadman->unstarted);
-    int64_t again = outcome.failed ? now + START_AGAIN : NEVER;
-    deadman->unstarted = deadman->greets_again == NEVER ? outcome.failed : deadman->own;
-    timer_set_due(timers, &deadman->timer, again < deadman->greets_again ? again : deadman->greets_again);
+    deadman->started |= deadman->unstarted & ~outcome.failed;
+    uint64_t again = deadman->unstarted & (outcome.failed | ~are_last);
+    int64_t due = again ? now + START_AGAIN : NEVER;
+    deadman->unstarted = deadman->greets_again == NEVER ? again : deadman->own;
+    timer_set_due(timers, &deadman->starting, due < deadman->greets_again ? due : deadman->greets_again);
     deadman->greets_again = NEVER;
     return outcome.reached;
 }
@@ -267,6 +302,7 @@ static void end(struct timers *timers, struct timer *timer, int64_t now) {
     uint64_t armed = deadman->armed;
     deadman->armed = 0;
     timer_set_due(timers, timer, NEVER);
+    end_start(timers, deadman, deadman->own);
     deadman->greets_until = 0;
     send_all(timers, deadman, armed);
 }
@@ -275,10 +311,6 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     struct deadman *deadman = (struct deadman *)timer;
     if (deadman->is_ending) {
         end(timers, timer, now);
-        return;
-    }
-    if (!deadman->armed) {
-        start(timers, deadman, now);
         return;
     }
     /* Skip repetitions that a stalled process has missed. */
@@ -297,7 +329,19 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     report(timers, EVENT_TRIPPED, deadman);
 }
 
-static const struct timer_kind DEADMAN = {.serve = serve, .end = end};
+static struct deadman *starting(struct timer *timer) {
+    return (struct deadman *)((char *)timer - offsetof(struct deadman, starting));
+}
+
+static void serve_start(struct timers *timers, struct timer *timer, int64_t now) { start(timers, starting(timer), now); }
+
+static void leave_start(struct timers *timers, struct timer *timer, int64_t now) {
+    (void)now;
+    struct deadman *deadman = starting(timer);
+    end_start(timers, deadman, deadman->own);
+}
+
+static const struct timer_kind DEADMAN = {.serve = serve, .end = end}, STARTING = {.serve = serve_start, .end = leave_start};
 
 static void leave_fellows(struct deadman *deadman) {
     struct deadman *before = deadman;
@@ -322,12 +366,26 @@ static void leave_others(const struct deadman *next, struct deadman *earlier) {
     earlier->armed &= earlier->own;
 }
 
-static void inherit_start(struct timers *timers, struct deadman *next, struct deadman *earlier, int64_t due) {
-    uint64_t unstarted = renumbered(next, earlier, earlier->unstarted);
-    if (!next->starts || next->armed || !unstarted) return;
-    next->unstarted |= unstarted;
-    next->greets_again = earlier->greets_again;
-    timer_set_due(timers, &next->timer, due);
+/* Pass on that destinations get the datagrams of the start. One whose address has changed gets them as for the first time. */
+static void inherit_start(struct timers *timers, struct deadman *next, struct deadman *earlier) {
+    int64_t due = earlier->starting.due;
+    uint64_t unstarted = earlier->unstarted;
+    end_start(timers, earlier, unstarted);
+    if (!next->starts) return;
+    for (uint64_t left = unstarted; left; left &= left - 1) {
+        uint32_t index = (uint32_t)__builtin_ctzll(left);
+        const struct deadman_destination *from = &earlier->destinations[index];
+        uint64_t same = named(next, from->id) & ~next->armed;
+        if (!same) continue;
+        next->unstarted |= same;
+        if (earlier->started & bit(index) && same & placed(next, from->sender)) {
+            next->started |= same;
+            next->heard_at[__builtin_ctzll(same)] = earlier->heard_at[index];
+        }
+    }
+    if (!next->unstarted) return;
+    if (earlier->greets_again < next->greets_again) next->greets_again = earlier->greets_again;
+    if (due < next->starting.due) timer_set_due(timers, &next->starting, due);
 }
 
 /* Let `next` await the answers that `earlier` awaits; of a destination that `earlier` does not watch, from now on. */
@@ -379,7 +437,7 @@ static void take_over(struct timers *timers, struct deadman *next, struct deadma
     next->greets_until = next->starts ? earlier->greets_until : 0;
     timer_set_due(timers, &earlier->timer, NEVER);
     if (was_armed) inherit_deadline(timers, next, earlier, armed, due);
-    else if (due != NEVER) inherit_start(timers, next, earlier, due);
+    inherit_start(timers, next, earlier);
 }
 
 /* ---- public ---- */
@@ -391,10 +449,11 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     for (uint32_t index = 0; index < count; index++)
         for (uint32_t each = 0; each < destinations[index].count; each++, datagrams++)
             bytes += destinations[index].datagrams[each].size;
-    size_t own = sizeof(struct deadman) + count * (sizeof *destinations + sizeof(struct answer));
+    size_t own = sizeof(struct deadman) + count * (sizeof *destinations + sizeof(struct answer) + sizeof(int64_t));
     struct deadman *deadman = calloc(1, own + datagrams * sizeof(struct deadman_datagram) + bytes);
     if (!deadman) return NULL;
-    *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER}, .acting = deadman, .timeout = timeout,
+    *deadman = (struct deadman){.timer = {.kind = &DEADMAN, .due = NEVER},
+                                .starting = {.kind = &STARTING, .due = NEVER}, .acting = deadman, .timeout = timeout,
                                 .repeat = repeat, .starts = starts, .active = active, .trips = trips, .id = id,
                                 .count = count, .greets_again = NEVER};
     deadman->fellow = deadman;
@@ -404,7 +463,8 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
         if (destinations[index].within) deadman->watched |= bit(index);
     }
     deadman->answers = (struct answer *)&deadman->destinations[count];
-    struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->answers[count];
+    deadman->heard_at = (int64_t *)&deadman->answers[count];
+    struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->heard_at[count];
     uint8_t *data = (uint8_t *)(copy + datagrams);
     for (uint32_t index = 0; index < count; index++) {
         const struct deadman_destination *from = &destinations[index];
@@ -418,6 +478,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     }
     pthread_mutex_lock(&timers->lock);
     timers_add(timers, &deadman->timer);
+    timers_add(timers, &deadman->starting);
     pthread_mutex_unlock(&timers->lock);
     return deadman;
 }
@@ -425,6 +486,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
 void deadman_close(struct timers *timers, struct deadman *deadman) {
     pthread_mutex_lock(&timers->lock);
     timers_remove(timers, &deadman->timer);
+    timers_remove(timers, &deadman->starting);
     leave_fellows(deadman);
     pthread_mutex_unlock(&timers->lock);
     free(deadman);
@@ -434,6 +496,7 @@ uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t n
     if (!deadman->starts) return 0;
     pthread_mutex_lock(&timers->lock);
     deadman->unstarted = deadman->own;
+    deadman->started = 0;
     uint64_t reached = start(timers, deadman, now);
     pthread_mutex_unlock(&timers->lock);
     return reached;
@@ -450,7 +513,7 @@ bool deadman_greet(struct timers *timers, struct deadman *deadman, int64_t now) 
     bool greets = now < deadman->greets_until && !deadman->armed;
     if (greets) {
         deadman->unstarted = deadman->own;
-        timer_set_due(timers, &deadman->timer, now);
+        timer_set_due(timers, &deadman->starting, now);
         deadman->greets_again = now + GREETING;
     }
     pthread_mutex_unlock(&timers->lock);
@@ -497,9 +560,11 @@ void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
 }
 
 void deadman_schedule_end(struct timers *timers, struct timer *timer) {
+    if (timer->kind == &STARTING) return; /* with its deadman */
     struct deadman *deadman = (struct deadman *)timer;
     deadman->is_ending = deadman->armed;
     timer_set_due(timers, timer, deadman->armed ? 0 : NEVER);
+    end_start(timers, deadman, deadman->own);
     deadman->greets_until = 0;
 }
 
@@ -519,12 +584,12 @@ void deadman_settle(struct timers *timers, struct timer *timer, const struct dea
                     int64_t now) {
     stage_count(timers->stage, why ? to->send_errors : to->sent, 1);
     if (!why || !is_served(timers, timer)) return;
-    struct deadman *deadman = (struct deadman *)timer;
+    struct deadman *deadman = timer->kind == &STARTING ? starting(timer) : (struct deadman *)timer;
     report_error(timers, deadman, to, 0, why);
     deadman = deadman->acting;
-    if (deadman->armed || now >= deadman->greets_until || deadman->timer.due <= now + START_AGAIN) return;
+    if (deadman->armed || now >= deadman->greets_until || deadman->starting.due <= now + START_AGAIN) return;
     deadman->unstarted = deadman->own;
-    timer_set_due(timers, &deadman->timer, now + START_AGAIN);
+    timer_set_due(timers, &deadman->starting, now + START_AGAIN);
 }
 
 int command_send_at(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,

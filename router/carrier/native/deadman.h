@@ -47,6 +47,7 @@ struct deadman_destination {
     uint32_t sent, send_errors; /* counters */
     uint32_t id;                /* of its name: in events, and the same in the next program */
     uint32_t follows;           /* 1: the route never commands it */
+    uint32_t is_heard, last_seen; /* 1: it may send, and this counter of `heard` in struct timers says when it last did */
     const void *publisher;      /* rcl_publisher_t of the topic, for a gateway's deadman, which has no sender */
     int64_t within;             /* ns in which it obeys a brake; 0 if no message shows that (program.h: struct witness) */
     uint32_t disobeyed;         /* counter: 1 while it does not obey */
@@ -75,8 +76,9 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
 void deadman_close(struct timers *timers, struct deadman *deadman);
 
 /* Send the datagrams at router start, if the deadman does so. Return a bit for each destination that all of its datagrams
- * have reached. Destinations for which one failed get all again each second, until a command arms the deadman, or disarms
- * them. */
+ * have reached. A destination gets them again each second until a command to it arms or disarms it, or until they were sent
+ * once more after it was heard: what the kernel accepts may be lost while the destination cannot be reached. One that is
+ * never heard gets them until there is a command. */
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now);
 
 /* Like `deadman_start`, for a deadman that publishes. It reaches no subscriber that is not discovered yet, so for some

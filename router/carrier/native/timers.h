@@ -48,6 +48,7 @@ struct timers {
     bool has_own_stage;
     int64_t arrived;   /* when the message that is being delivered arrived, if it was held or queued; otherwise NEVER */
     bool is_abandoned; /* publishing returned ABANDONED: use nothing that belongs to others */
+    const counter *heard; /* of the thread that receives: when endpoints were heard; NULL if none does */
     int timer;    /* timerfd, readable from `wakes_at` on; -1 if the thread of the group waits without it */
     /* Nothing is due before this time (boot clock, ns); NEVER if nothing is due at all. May be read without the lock. It moves
      * back only when timers are served, so the cost of a command that extends a deadline is independent of other timers. */
