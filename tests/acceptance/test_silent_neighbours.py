@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
 
 import pytest
 
 from tests.acceptance.site import wait_until
-from tests.acceptance.two_networks import BRAKE, DRIVE, LAN, RADIO, Rover
+from tests.acceptance.two_networks import BRAKE, DRIVE, RADIO, Rover
 from tests.namespaces import Computer
 
 TABLE = """\
@@ -26,6 +25,7 @@ routes:
     destinations: driving_board
     deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}}}
 """
+losses = pytest.mark.parametrize("loses_link", [False, True], ids=["neighbour", "link and neighbour"])
 FAILED = 4.0
 """Seconds after which the kernel has given up on a neighbour, and has dropped what waited for it."""
 
@@ -34,9 +34,11 @@ def answers_arp(computer: Computer, *, does: bool) -> None:
     computer.run("sysctl", "-qw", f"net.ipv4.conf.eth0.arp_ignore={0 if does else 8}")
 
 
-def lose_neighbour(site: Rover) -> None:
+def lose(site: Rover, *, loses_link: bool) -> None:
     answers_arp(site.lan, does=False)
     site.rover.ip("neigh", "flush", "dev", "lan0")
+    if loses_link:
+        site.rover.ip("link", "set", "lan0", "down")
 
 
 def taken(site: Rover) -> list[bytes]:
@@ -48,20 +50,13 @@ def taken(site: Rover) -> list[bytes]:
     return found
 
 
-def lose_link(site: Rover) -> None:
-    site.rover.ip("link", "set", "lan0", "down")
-
-
 def regain_link(site: Rover) -> None:
     site.rover.ip("link", "set", "lan0", "up")
 
 
-@pytest.mark.parametrize("lose", [lambda site: None, lose_link], ids=["neighbour", "link and neighbour"])
-def test_a_board_that_is_not_reached_at_the_start_gets_the_brake_when_it_is(
-    site: Rover, lose: Callable[[Rover], None]
-) -> None:
-    lose_neighbour(site)
-    lose(site)
+@losses
+def test_a_board_that_is_not_reached_at_the_start_gets_the_brake_when_it_is(site: Rover, loses_link: bool) -> None:
+    lose(site, loses_link=loses_link)
     with site.router(TABLE):
         time.sleep(1.5)
         regain_link(site)
@@ -71,15 +66,14 @@ def test_a_board_that_is_not_reached_at_the_start_gets_the_brake_when_it_is(
         wait_until(lambda: taken(site) != [], "the brake")
 
 
-@pytest.mark.parametrize("lose", [lambda site: None, lose_link], ids=["neighbour", "link and neighbour"])
+@losses
 def test_a_board_that_is_lost_while_the_deadman_sends_gets_the_brake_when_it_is_back(
-    site: Rover, lose: Callable[[Rover], None]
+    site: Rover, loses_link: bool
 ) -> None:
     with site.router(TABLE):
         site.basestation.sendto(DRIVE, RADIO)
         wait_until(lambda: DRIVE in taken(site), "the command")
-        lose_neighbour(site)
-        lose(site)
+        lose(site, loses_link=loses_link)
         time.sleep(1.5)
         regain_link(site)
         time.sleep(FAILED)

@@ -322,7 +322,6 @@ class Comparison:
         self._plain.refused.add(endpoint)
         self._native.refuses(endpoint)
 
-
     def do_hear(self, endpoint: str) -> None:
         self._plain.heard[endpoint] += 1
         self._native.hears(endpoint)
