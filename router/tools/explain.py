@@ -264,7 +264,7 @@ def _quality(topic: Topic) -> str:
 
 def _at_start(sends: bool) -> str:
     """Return what a deadman does when the router starts."""
-    return "and once when the router starts" if sends else "but not when the router starts"
+    return "and when the router starts" if sends else "but not when the router starts"
 
 
 # Gateways
