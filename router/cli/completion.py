@@ -69,6 +69,13 @@ def silences(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     yield from (f"{name}:" for name in _names(args, "endpoints", "routes"))
 
 
+def obedience(args: argparse.Namespace, prefix: str) -> Iterator[str]:
+    """Yield each endpoint with a colon, and after it payload cases, separated by commas."""
+    end = max(prefix.rfind(":"), prefix.rfind(",")) + 1
+    names = _names(args, "routes") if end else (f"{name}:" for name in _names(args, "endpoints"))
+    yield from (prefix[:end] + name for name in names)
+
+
 def topics(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     """Yield the topics of routes and gateways by their full names, as gateways send them."""
     from router.compiler.topics import resolved

@@ -9,7 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb
-from router.cli.completion import completes, silences
+from router.cli.completion import completes, obedience, silences
 from router.cli.tool_options import add_for, add_table, factor, good_table, integer, table_path
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ belong to this computer, as in routes/sim.yaml."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",
+    "router sim -t routes/sim.yaml --obey driving_board:manual_drive",
     "router sim -t routes/sim.yaml --speed 10x --for 1min --json",
 )
 
@@ -52,18 +53,32 @@ def add_parser(subparsers: Subparsers) -> None:
         ),
         silences,
     )
+    completes(
+        parser.add_argument(
+            "--obey",
+            action="append",
+            default=[],
+            metavar="NAME:CASE[,CASE]",
+            help="this board obeys these payload cases only: it counts others as ignored, and does not stop by itself. "
+            "May be repeated",
+        ),
+        obedience,
+    )
     parser.add_argument("--json", action="store_true", help="print statistics as JSON lines; the last one is final")
 
 
 def run(args: argparse.Namespace) -> int:
     from router.datagrams import Wire
     from router.tools.sim_view import SimView
-    from router.tools.simulator import Simulator, parse_silence
+    from router.tools.simulator import Simulator, parse_obedience, parse_silence
 
     silences = [parse_silence(text) for text in args.silent]
+    obeys = parse_obedience(args.obey)
     _, program = good_table(table_path(args))
     wire = Wire(program.envelope)
-    simulator = Simulator(wire, program.table, args.seed, args.speed, deadmen=program.deadmen, silences=silences)
+    simulator = Simulator(
+        wire, program.table, args.seed, args.speed, deadmen=program.deadmen, silences=silences, obeys=obeys
+    )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: simulator.stop())
     view = SimView(wire, simulator.statistics)

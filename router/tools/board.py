@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +12,13 @@ from google.protobuf.message import Message
 
 from router.compiler.program import DeadmanPlan
 from router.datagrams import Decoded, Wire
-from router.errors import DecodeError
+from router.errors import DecodeError, UsageError, did_you_mean
 from router.table.model import EndpointKind, Priority, RouteTable
 from router.types.model import MessageType
 from router.values import compact
 
 TIMEOUT = 1.0
-"""Seconds without a command after which a board stops on its own."""
+"""Seconds without a command after which a board stops on its own, or is reported as continuing the last one."""
 
 STOPPING = 0.4
 """Seconds in which a board's motors stop from full speed."""
@@ -31,6 +32,7 @@ class State(enum.Enum):
     OBEYING = "obeying"
     HALTED = "halted"
     STOPPED = "stopped"
+    CONTINUING = "continuing"
 
 
 _STANDING = {State.WAITING, State.HALTED, State.STOPPED}
@@ -94,16 +96,26 @@ class Board:
 
     A halt ends with the first command after the deadman has ended, since commands of other routes may continue.
     `changed` is called with every new state.
+
+    With `obeys` it acts on these payload cases only, like firmware without a timeout: it continues the last command
+    until one of them changes it. `ignored` counts the others.
     """
 
     def __init__(
-        self, name: str, commands: Collection[str], stops: Sequence[Stop], changed: Callable[[Change], None]
+        self,
+        name: str,
+        commands: Collection[str],
+        stops: Sequence[Stop],
+        changed: Callable[[Change], None],
+        obeys: Collection[str] | None = None,
     ) -> None:
         self.state = State.WAITING
+        self.ignored: Counter[str] = Counter()
         self._name = name
         self._commands = commands
         self._stops = stops
         self._changed = changed
+        self._obeys = obeys
         self._since = 0.0
         self._moved_until = -STOPPING
         self._commanded_at = 0.0
@@ -113,6 +125,11 @@ class Board:
     def take(self, now: float, decoded: Decoded) -> None:
         """Process a received datagram."""
         case, message = decoded.case, decoded.message
+        if self._obeys is not None and case.name not in self._obeys:
+            self.ignored[case.name] += 1
+            if self.ignored[case.name] == 1:
+                self._changed(Change(now, self._name, self.state, f"ignores {case.name}, which it does not obey"))
+            return
         stop = next((stop for stop in self._stops if stop.case == case.name and stop.message == message), None)
         if stop is not None:
             self._commanded_at, self._halted_until = now, now + stop.hold
@@ -125,8 +142,12 @@ class Board:
 
     def advance(self, now: float) -> None:
         """Check for missing commands."""
-        if self.state in (State.OBEYING, State.HALTED) and now - self._commanded_at >= TIMEOUT:
+        if now - self._commanded_at < TIMEOUT:
+            return
+        if self._obeys is None and self.state in (State.OBEYING, State.HALTED):
             self._enter(now, State.STOPPED)
+        elif self._obeys is not None and self.state is State.OBEYING:
+            self._enter(now, State.CONTINUING)
 
     def pace(self, now: float) -> float:
         """Return how fast the motors turn, from 0 to 1: a board that halts or stops slows down for STOPPING seconds."""
@@ -140,6 +161,8 @@ class Board:
             return "no commands yet"
         if self.state is State.STOPPED:
             return f"no commands for {now - self._commanded_at:.1f} s: stopped"
+        if self.state is State.CONTINUING:
+            return f"no commands for {now - self._commanded_at:.1f} s: continues the last one"
         if self.state is State.HALTED:
             return f"halted by a deadman for {now - self._since:.1f} s: {self._halt}"
         return "obeys commands"
@@ -161,15 +184,27 @@ class Board:
 
 
 def boards(
-    wire: Wire, table: RouteTable, deadmen: Iterable[DeadmanPlan], changed: Callable[[Change], None]
+    wire: Wire,
+    table: RouteTable,
+    deadmen: Iterable[DeadmanPlan],
+    changed: Callable[[Change], None],
+    obeys: Mapping[str, Collection[str]],
 ) -> dict[str, Board]:
-    """Return the boards that the table sends commands to, by endpoint."""
+    """Return the boards that the table sends commands to, by endpoint; those in `obeys` obey these payload cases only.
+
+    Raises UsageError if `obeys` names a board or a payload case to which nothing is sent.
+    """
     plans = tuple(deadmen)
     found = {}
     for name, endpoint in table.endpoints.items():
         commands, stops = command_cases(table, name), stops_for(wire, plans, name)
         if endpoint.kind is EndpointKind.BOARD and (commands or stops):
-            found[name] = Board(name, commands, stops, changed)
+            found[name] = Board(name, commands, stops, changed, obeys.get(name))
+            sent = commands | {stop.case for stop in stops}
+            for case in sorted(set(obeys.get(name, ())) - sent):
+                raise UsageError(f"nothing sends '{case}' to {name}", did_you_mean(case, sent))
+    for name in obeys.keys() - found:
+        raise UsageError(f"no board that gets commands is called '{name}'", did_you_mean(name, found))
     return found
 
 

@@ -26,7 +26,13 @@ Key = tuple[str, str]
 PATIENCE = 2.0
 """Seconds without an answer after which the headline asks whether the router runs."""
 
-_STYLES = {State.WAITING: "dim", State.OBEYING: "green", State.HALTED: "bold yellow", State.STOPPED: "bold red"}
+_STYLES = {
+    State.WAITING: "dim",
+    State.OBEYING: "green",
+    State.HALTED: "bold yellow",
+    State.STOPPED: "bold red",
+    State.CONTINUING: "bold red",
+}
 
 
 class SimView:
@@ -90,6 +96,9 @@ class SimView:
         for endpoint, inbox in self._statistics.inboxes.items():
             if inbox.board is not None:
                 yield endpoint, inbox.board.status(self._seconds), _STYLES[inbox.board.state]
+                if ignored := inbox.board.ignored:
+                    counts = ", ".join(f"{count} {case}" for case, count in ignored.items())
+                    yield endpoint, f"ignored what it does not obey: {counts}", "bold red"
             for case, frames in inbox.frames.items():
                 text = f"{case}: {frames.complete} frames complete, {frames.incomplete} incomplete"
                 if frames.astray:
@@ -130,7 +139,8 @@ class SimView:
     def as_json(self, seconds: float, final: bool) -> dict[str, Any]:
         """Return all statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files.
 
-        Times and ages in seconds. `boards` are the states, `changes` their history, the newest last.
+        Times and ages in seconds. `boards` are the states, `changes` their history, the newest last, and `ignored` the
+        counts of what boards do not obey.
         """
         inboxes = self._statistics.inboxes
         received: dict[str, dict[str, Any]] = defaultdict(dict)
@@ -145,6 +155,9 @@ class SimView:
             "unsent": self._statistics.unsent,
             "received": received,
             "undecodable": {name: inbox.undecodable for name, inbox in inboxes.items() if inbox.undecodable},
+            "ignored": {
+                name: inbox.board.ignored for name, inbox in inboxes.items() if inbox.board and inbox.board.ignored
+            },
             "boards": {name: inbox.board.state.value for name, inbox in inboxes.items() if inbox.board},
             "frames": {
                 name: {

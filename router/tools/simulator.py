@@ -13,7 +13,7 @@ import selectors
 import socket
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from router.compiler.program import DeadmanPlan
@@ -64,6 +64,23 @@ def parse_silence(text: str) -> Silence:
     if silence.end <= silence.start:
         raise UsageError(f"'{text}' ends before it begins")
     return silence
+
+
+_OBEDIENCE = re.compile(r"(?P<board>\w+):(?P<cases>\w+(,\w+)*)")
+
+
+def parse_obedience(texts: Iterable[str]) -> dict[str, frozenset[str]]:
+    """Parse `driving_board:manual_drive,drive_motor`: boards, and the payload cases that each obeys.
+
+    Raises UsageError for other text.
+    """
+    obeys: dict[str, frozenset[str]] = {}
+    for text in texts:
+        found = _OBEDIENCE.fullmatch(text)
+        if found is None:
+            raise UsageError(f"'{text}' is not NAME:CASE, such as driving_board:manual_drive,drive_motor")
+        obeys[found["board"]] = obeys.get(found["board"], frozenset()) | set(found["cases"].split(","))
+    return obeys
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
@@ -131,7 +148,7 @@ class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
     Raises UsageError if one cannot be bound, and for a table without listeners. `deadmen` are those of the compiled
-    program; boards halt on what they send.
+    program; boards halt on what they send. Boards in `obeys` obey these payload cases only.
     """
 
     def __init__(
@@ -143,11 +160,12 @@ class Simulator:
         *,
         deadmen: Sequence[DeadmanPlan] = (),
         silences: Sequence[Silence] = (),
+        obeys: Mapping[str, Collection[str]] | None = None,
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
         self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
-        played = boards(wire, table, deadmen, self.statistics.changes.append)
+        played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
         self._streams = tuple(streams(wire, table, seed, speed))

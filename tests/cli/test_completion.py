@@ -68,6 +68,7 @@ BOARDS = ["arm_board", "container_board", "driving_board", "sensor_board"]
         ("router send imu_info --to ro", ["rover"]),
         ("router send imu_info --to rover --from sen", ["sensor_board"]),
         ("router sim --silent bas", ["basestation:"]),
+        ("router sim --obey driving_board:manual_drive,rock_measure_req", ["manual_drive,rock_measure_request"]),
         ("router listen ", ["envelope://", "tcp://", "topic://", "udp://", "ws://", "zenoh://"]),
         ("router listen topic://imu/", ["//imu/data_raw", "//imu/mag"]),
         ("router listen envelope://ro", ["//rover"]),

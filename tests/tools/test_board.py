@@ -73,13 +73,40 @@ def test_a_deadman_that_dies_and_what_is_neither_command_nor_stop_keep_no_board_
     assert board.state is State.STOPPED
 
 
+def test_a_board_that_does_not_obey_the_brake_continues_its_last_command(wire: Wire, changes: list[Change]) -> None:
+    stop = Stop("every_kind", payload(wire.case("every_kind"), ["i32=1"]), hold=0.3, text="every_kind i32=1")
+    board = Board("board", {"plain"}, [stop], changes.append, obeys={"plain"})
+    board.take(1.0, decoded(wire, "plain"))
+    for tenth in range(15, 30, 5):
+        board.take(tenth / 10, decoded(wire, "every_kind", "i32=1"))
+        board.advance(tenth / 10)
+    assert board.ignored == {"every_kind": 3}
+    assert board.status(60.0) == "no commands for 59.0 s: continues the last one"
+    board.take(60.0, decoded(wire, "plain"))
+    assert [str(change) for change in changes] == [
+        "1.0 s: board obeys commands",
+        "1.5 s: board ignores every_kind, which it does not obey",
+        "2.0 s: board no commands for 1.0 s: continues the last one",
+        "60.0 s: board obeys commands again, after 58.0 s",
+    ]
+
+
+def test_a_board_without_a_timeout_stays_halted_by_a_brake_that_it_obeys(wire: Wire, changes: list[Change]) -> None:
+    stop = Stop("every_kind", payload(wire.case("every_kind"), ["i32=1"]), hold=0.3, text="every_kind i32=1")
+    board = Board("board", {"plain"}, [stop], changes.append, obeys={"every_kind"})
+    board.take(1.0, decoded(wire, "plain"))
+    board.take(1.5, decoded(wire, "every_kind", "i32=1"))
+    board.advance(60.0)
+    assert (board.state, board.ignored) == (State.HALTED, {"plain": 1})
+
+
 def test_only_boards_that_are_told_something_play_one_and_know_what_deadmen_send(
     wire: Wire, table: RouteTable, changes: list[Change]
 ) -> None:
     case = wire.case("every_kind")
     datagrams = tuple(wire.encode(case, payload(case, words)) for words in ([], ["i32=1"]))
     plan = DeadmanPlan("plain", timeout=500_000_000, repeat=100_000_000, datagrams=(("board", datagrams),))
-    [board] = boards(wire, table, [plan], changes.append).values()
+    [board] = boards(wire, table, [plan], changes.append, {}).values()
     board.take(0.0, decoded(wire, "every_kind", "i32=1"))
     board.take(0.31, decoded(wire, "plain"))
     assert [(change.board, change.state) for change in changes] == [("board", State.HALTED), ("board", State.OBEYING)]

@@ -21,7 +21,7 @@ from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
 from router.tools.sim_view import SimView
-from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_silence, streams
+from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_obedience, parse_silence, streams
 from router.tools.udp import LOOPBACK, open_udp, reachable
 
 FAST = 100.0
@@ -152,6 +152,30 @@ def test_names_of_nobody_are_told(wire: Wire, table_path: Callable[..., Path]) -
         Simulator(wire, read_table(table_path(source="bord")), seed=1)
 
 
+def test_a_board_ignores_what_it_was_not_told_to_obey(wire: Wire, table: RouteTable) -> None:
+    board = table.endpoints["board"].address.value
+    with (
+        closing(Simulator(wire, table, seed=1, obeys={"board": {"plain"}})) as simulator,
+        open_udp(reachable(board)._replace(port=0), "x") as router,
+    ):
+        router.sendto(wire.encode(wire.case("every_kind"), wire.case("every_kind").message_class()), board)
+        router.sendto(bytes.fromhex("1200"), board)
+        played = simulator.statistics.inboxes["board"].board
+        assert played is not None
+        simulate(simulator, lambda: played.state is State.OBEYING)
+        assert played.ignored == {"every_kind": 1}
+
+
+def test_obedience_is_a_board_and_payload_cases_sent_to_it(wire: Wire, table: RouteTable) -> None:
+    assert parse_obedience(["drive:a,b", "arm:a", "drive:c"]) == {"drive": {"a", "b", "c"}, "arm": {"a"}}
+    with pytest.raises(UsageError, match="'drive' is not NAME:CASE, such as driving_board:manual_drive,drive_motor"):
+        parse_obedience(["drive"])
+    with pytest.raises(UsageError, match="no board that gets commands is called 'bord'; did you mean 'board'"):
+        Simulator(wire, table, seed=1, obeys={"bord": {"plain"}})
+    with pytest.raises(UsageError, match="nothing sends 'plian' to board; did you mean 'plain'"):
+        Simulator(wire, table, seed=1, obeys={"board": {"plian"}})
+
+
 def test_a_taken_address_is_named_and_leaves_nothing_open(wire: Wire, table: RouteTable) -> None:
     with (
         open_udp(table.endpoints["station"].address.value, "other"),
@@ -206,6 +230,9 @@ def test_each_endpoint_and_case_has_a_line_with_its_last_value_and_boards_and_fr
     frames = statistics.inboxes["station"].frames["every_kind"] = Frames()
     frames.complete, frames.incomplete = 3, 1
     statistics.inboxes["board"].undecodable = 2
+    board = statistics.inboxes["board"].board
+    assert board is not None
+    board.ignored.update({"every_kind": 12, "plain": 1})
     view = SimView(wire, statistics)
     view.update(2.0)
     assert shown(view.table(10)) == [
@@ -217,6 +244,7 @@ def test_each_endpoint_and_case_has_a_line_with_its_last_value_and_boards_and_fr
     assert shown(view.statuses()) == [
         "station every_kind: 3 frames complete, 1 incomplete",
         "board no commands yet",
+        "board ignored what it does not obey: 12 every_kind, 1 plain",
         "board 2 undecodable datagrams",
     ]
 
