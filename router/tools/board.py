@@ -53,7 +53,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a board's state, with its time and its description."""
+    """A change of a board's state, or the first message of a case that it ignores, with its time and description."""
 
     at: float
     board: str
