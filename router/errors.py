@@ -221,7 +221,11 @@ class UsageError(OperatorError):
 
 
 class StartError(OperatorError):
-    """A socket or the ROS node could not be opened."""
+    """Something that the router needs cannot be opened now; a later attempt may succeed."""
+
+
+class ConfigurationError(StartError):
+    """A file, an argument or the environment must be corrected first: no attempt succeeds until then."""
 
 
 class DecodeError(RouterError):

@@ -1,7 +1,9 @@
 """The inputs of a compile: files, folders, links and variables. An open recording notes each with its value.
 
-A compile reads its inputs only through the functions here. A kept program is used if all of its inputs still have the
-same values (`changed`). A start checks them before it imports large modules, so this module imports only small ones.
+A compile reads its inputs only through the functions here. If descriptors or memory have run out, they raise
+StartError, so that this is not taken for a mistake in a file. A kept program is used if all of its inputs still have
+the same values (`changed`). A start checks them before it imports large modules, so this module imports only small
+ones.
 """
 
 from __future__ import annotations
@@ -118,6 +120,7 @@ def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
         with open(name, "rb") as stream:
             content = stream.read(most)
     except OSError as error:
+        _check_shortage(error)
         _note("file", name, error.errno)
         raise
     _note("file", name, content)
@@ -147,18 +150,33 @@ def exists(path: str | os.PathLike[str]) -> bool:
 def _noted_kind(path: str | os.PathLike[str]) -> str:
     name = os.fspath(path)
     kind = _kind(name)
+    error = OSError(kind, os.strerror(kind), name) if isinstance(kind, int) else None
+    if error is not None:
+        _check_shortage(error)
     _note("kind", name, kind)
-    if isinstance(kind, int):
-        raise OSError(kind, os.strerror(kind), name)
-    return kind
+    if error is not None:
+        raise error
+    return str(kind)
 
 
 def listing(path: str | os.PathLike[str]) -> Listing:
     """Return the folders and the other files in a folder, without hidden ones. Empty if it cannot be read."""
     name = os.fspath(path)
     found = _listing(name)
+    if isinstance(found, int):
+        _check_shortage(OSError(found, os.strerror(found), name))
     _note("folder", name, found)
     return ((), ()) if isinstance(found, int) else found
+
+
+def _check_shortage(error: OSError) -> None:
+    """Raise StartError if something has run out."""
+    from router.shortage import is_shortage
+
+    if is_shortage(error):
+        from router.errors import StartError
+
+        raise StartError(f"{error.filename} cannot be read now: {error.strerror}") from error
 
 
 def real_path(path: str | os.PathLike[str]) -> str:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
-import resource
 import select
 import sys
 import threading
@@ -13,6 +11,7 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 
 from router.clock import monotonic_ns
+from router.shortage import is_shortage
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -28,27 +27,6 @@ LEVELS = ("debug", "info", "warning", "error")
 
 SUMMARY_INTERVAL_NS = 10_000_000_000
 MOST_KEYS = 1000
-
-
-NO_THREAD = "can't start new thread"
-"""Python's message when the kernel refuses a thread."""
-
-
-def is_shortage(error: BaseException) -> bool:
-    """Return whether memory, threads or descriptors have run out: not a bug of the router, and perhaps temporary."""
-    if isinstance(error, OSError):
-        return error.errno in {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error) == NO_THREAD)
-
-
-ADDRESS_SPACE = 1 << 30
-"""Bytes that a router with a few topics maps (it uses a tenth of them); without ROS, a fifth is enough."""
-
-
-def address_space() -> int | None:
-    """Return how many bytes this process may map (`ulimit -v`), or None if there is no limit."""
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return None if limit == resource.RLIM_INFINITY else limit
 
 
 class Fault:

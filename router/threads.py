@@ -13,7 +13,8 @@ from queue import SimpleQueue
 from time import monotonic, sleep
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
-from router.log import NO_THREAD, is_shortage, logger
+from router.log import logger
+from router.shortage import NO_THREAD, is_shortage
 
 P = ParamSpec("P")
 T = TypeVar("T")

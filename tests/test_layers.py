@@ -10,17 +10,18 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors inputs assets lean clock log threads"
-LANGUAGE = "declared errors inputs assets lean table types compiler"
+GROUND = "declared errors shortage inputs assets lean clock log threads"
+LANGUAGE = "declared errors shortage inputs assets lean table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
-    "inputs": "declared",
+    "shortage": "",
+    "inputs": "declared errors shortage",
     "assets": "",
     "clock": "",
     "lean": "",
-    "log": "clock errors lean",
-    "threads": "clock log",
+    "log": "clock errors lean shortage",
+    "threads": "clock log shortage",
     "table": "errors inputs assets lean",
     "types": "declared errors inputs assets lean",
     "values": "errors types",

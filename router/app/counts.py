@@ -8,7 +8,7 @@ from typing import cast
 from router.carrier.forwarding import MOST_COUNTERS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
-from router.errors import StartError
+from router.errors import ConfigurationError
 
 
 class ThreadCounts:
@@ -44,9 +44,11 @@ class ThreadCounts:
         return sum(counts[index] for counts in self.lists for index in indexes)
 
     def make_room(self, counters: Counters) -> None:
-        """Make room for the counts of `counters`, which extend the present ones. Raises StartError."""
+        """Make room for the counts of `counters`, which extend the present ones. Raises ConfigurationError."""
         if counters.size > MOST_COUNTERS:
-            raise StartError(f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}")
+            raise ConfigurationError(
+                f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}"
+            )
         new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             counters.grow(counts)

@@ -34,7 +34,7 @@ from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.datagrams import Peer
-from router.errors import StartError
+from router.errors import ConfigurationError
 from router.kept.head_start import HeadStart
 from router.log import logger
 from router.net.udp import Listener
@@ -348,12 +348,15 @@ class Plane:
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:
-    """Return the addresses of rcl's functions to publish, to get its error, and to reset that. Raises StartError."""
+    """Return the addresses of rcl's functions to publish, to get its error, and to reset that.
+
+    Raises ConfigurationError.
+    """
     from router.ros.rcl import publish_functions  # rclpy is loaded: the topics are open
 
     functions = None if library.rcl_types_differ() else publish_functions()
     if functions is None:
-        raise StartError(
+        raise ConfigurationError(
             "the struct layout of rcl differs from what the carrier expects",
             "run the router with ROS 2 Jazzy, and run 'make setup' after each upgrade of ROS",
         )

@@ -17,10 +17,13 @@ from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.carrier.state import State
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
-from router.errors import SourceSpan, StartError
-from router.log import fault
+from router.errors import ConfigurationError, SourceSpan, StartError
+from router.log import fault, logger
+from router.net.dds import clashes, discovers_by_multicast
+from router.net.kernel import BELOW_ROS
 from router.observe.reports import Reporter
 from router.ros.environment import check_environment, ros_remedy
+from router.shortage import is_shortage
 from router.threads import background_threads
 
 if TYPE_CHECKING:
@@ -110,6 +113,7 @@ class Runtime:
         if self._unfinished and self.plane.wait_until_adopted():
             self._close_unfinished()  # before `program` opens the same addresses or topics
         with ExitStack() as undo:
+            _check_ports(program, os.environ)
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
                 _check_ros_arguments(program, self._ros_args)
@@ -269,6 +273,16 @@ def _needs_ros(program: Program) -> bool:
     return bool(program.publishers or program.subscriptions or program.gateways)
 
 
+def _check_ports(program: Program, variables: Mapping[str, str]) -> None:
+    """Warn of UDP ports that ROS uses. Raises ConfigurationError for one without which ROS in this router is blind."""
+    for clash in clashes(program, variables):
+        if clash.blinds and _needs_ros(program) and discovers_by_multicast(variables):
+            raise ConfigurationError(
+                f"{clash.span}: {clash}", f"{BELOW_ROS}; or give all ROS nodes another ROS_DOMAIN_ID"
+            )
+        logger.warning(str(clash), remedy=BELOW_ROS)
+
+
 def _check_ros_arguments(program: Program, ros_args: Sequence[str]) -> None:
     """Check the arguments. Loads ROS, which takes a while, only if there are any. Raises StartError."""
     if len(ros_args) > 1:
@@ -294,7 +308,8 @@ def _open_ros(
 
 
 def _missing_ros(program: Program, error: ImportError) -> StartError:
-    return StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
+    kind = StartError if is_shortage(error) else ConfigurationError
+    return kind(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
 
 
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:

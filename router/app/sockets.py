@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from router.carrier.sender import NativeSender
 from router.compiler.network import LOOPBACK, WILDCARD, sent_from
 from router.compiler.program import Program
-from router.errors import StartError
+from router.errors import ConfigurationError
 from router.log import logger
 from router.net.sockets import ListeningSocket, placed
 from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
@@ -43,13 +43,13 @@ def _log_absence(listener: model.Listener) -> None:
 
 
 def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
-    """Log why nothing can be sent to an endpoint now. Raises StartError for a new one with a broadcast address."""
+    """Log why nothing can be sent to an endpoint now. Raises ConfigurationError for a broadcast address."""
     address = endpoint.address.value
     try:
         found = why_unreachable(address)
     except BadAddressError as error:
         if is_new:
-            raise StartError(f"{endpoint.address.span}: {error.what}", error.hint) from error
+            raise ConfigurationError(f"{endpoint.address.span}: {error.what}", error.hint) from error
         found = error.what, error.hint
     if found:
         why, remedy = found

@@ -12,12 +12,13 @@ from collections.abc import Iterator
 from functools import cache
 
 from router import declared
+from router.shortage import is_shortage
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from router.errors import StartError
+    from router.errors import ConfigurationError
 
 _CARRIER = os.path.dirname(__file__)  # noqa: PTH120 - pathlib takes 5 ms to import
 NATIVE = f"{_CARRIER}/native"
@@ -27,12 +28,12 @@ LIBRARY = f"{NATIVE}/libcarrier.so"
 
 @cache
 def library() -> ctypes.CDLL:
-    """Return the library, loaded once. Raises StartError if it cannot be used."""
+    """Return the library, loaded once. Raises ConfigurationError if it cannot be used, or OSError."""
     return load()
 
 
 def load(path: str | Path = LIBRARY) -> ctypes.CDLL:
-    """Load the library and declare its functions. Raises StartError."""
+    """Load the library and declare its functions. Raises ConfigurationError, or OSError."""
     try:
         built = os.stat(path).st_mtime_ns  # noqa: PTH116 - as above
     except FileNotFoundError:
@@ -41,6 +42,8 @@ def load(path: str | Path = LIBRARY) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
         made_of = _text(library.carrier_checksum)
     except (OSError, AttributeError) as error:  # for another architecture, or not a carrier library at all
+        if is_shortage(error):
+            raise
         raise _refused(f"{path} cannot be loaded: {error}") from None
     if made_of != declared.CHECKSUM or (any(changed >= built for changed in _changes()) and made_of != _checksum()):
         raise _refused(f"{path} was built from other sources")
@@ -68,11 +71,11 @@ def _checksum() -> str:
     return checksum()
 
 
-def _refused(what: str) -> StartError:
+def _refused(what: str) -> ConfigurationError:
     from router.assets import asset, is_installed
-    from router.errors import StartError
+    from router.errors import ConfigurationError
 
     hint = "run 'make setup'"
     if is_installed(asset("schemas")):
         hint = "reinstall the router on a machine with a C compiler"
-    return StartError(what, hint)
+    return ConfigurationError(what, hint)

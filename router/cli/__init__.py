@@ -18,13 +18,28 @@ from types import ModuleType
 from typing import NoReturn, TextIO, TypeAlias
 
 from router import __version__
-from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
-from router.log import ADDRESS_SPACE, address_space  # imported here: imports fail once memory is short
+from router.errors import (
+    ConfigurationError,
+    OperatorError,
+    RouterError,
+    StartError,
+    TableError,
+    TransportError,
+    UsageError,
+    nearest,
+)
+from router.shortage import (  # imported here: imports fail once memory is short
+    ADDRESS_SPACE,
+    address_space,
+    is_shortage,
+)
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 OK = 0
 NETWORK_FAULT = 1
+NOT_NOW = 1
+"""Something cannot be opened now: a later attempt may succeed, so the systemd unit restarts after it."""
 BAD_USAGE = 2
 UNWRITTEN = 74
 """EX_IOERR: stdout is a file on a full disk."""
@@ -172,14 +187,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             return BAD_TABLE
         # Each of these errors can mean that memory could not be allocated.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
-            raise
+            if not is_shortage(error):
+                raise
+            what = f"memory, threads or descriptors have run out: {str(error) or 'no memory'}"
+            print(f"router {_verb(arguments)}: {what}", file=sys.stderr)
+            return NOT_NOW
         what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), which is not enough"
         print(
             f"router {_verb(arguments)}: {what}: {str(error).partition(chr(10))[0] or 'no memory'}",
             file=sys.stderr,
             flush=True,
         )
-        os._exit(BAD_TABLE)  # threads that did start would keep the process alive
+        os._exit(NOT_NOW)  # threads that did start would keep the process alive
     return code
 
 
@@ -231,10 +250,16 @@ def _run(arguments: Sequence[str]) -> int:
     except RouterError as error:
         what, hint = (error.what, error.hint) if isinstance(error, OperatorError) else (str(error), "")
         print(with_help(f"router {chosen}: {what}", hint), file=sys.stderr)
-        if isinstance(error, UsageError):
-            return BAD_USAGE
-        return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
+        return _code_of(error)
     return code
+
+
+def _code_of(error: RouterError) -> int:
+    if isinstance(error, UsageError):
+        return BAD_USAGE
+    if isinstance(error, StartError) and not isinstance(error, ConfigurationError):
+        return NOT_NOW
+    return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
 
 
 def _mistake(arguments: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router import NO_CACHE, inputs
-from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
+from router.cli import BAD_TABLE, BAD_USAGE, NOT_NOW, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, good_table, table_path
 from router.errors import UsageError
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
 saves the last datagrams, if the table keeps them ('record').
 
-Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
+Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table or the environment must be corrected,
+{NOT_NOW} something cannot be opened now, for example a port that another process has; a later start may succeed."""
 _PARAMETERS = """The ROS parameter routes_path also chooses the table. Any other parameter sets the table's variable of
 that name in upper case, and overrides the environment."""
 _ENDING = frozenset({signal.SIGINT, signal.SIGTERM})

@@ -178,7 +178,7 @@ class GatewayThread:
         try:
             await service.open()
         except StartError as error:
-            raise StartError(f"{settings.transport.span}: cannot open gateway '{settings.name}': {error}") from error
+            raise type(error)(f"{settings.transport.span}: cannot open gateway '{settings.name}': {error}") from error
         return service
 
     def _transport(self, settings: Gateway, events: Events) -> Transport:

@@ -19,6 +19,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from router.errors import StartError
+
 # Linux constants that the socket module does not name.
 SO_ATTACH_FILTER = 26
 SO_RCVBUFFORCE = 33
@@ -35,6 +37,10 @@ _IFREQ = struct.Struct("16s24s")
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
+FIRST_OF_ROS = 7000
+"""The lowest UDP port that ROS takes (`net.dds`)."""
+BELOW_ROS = f"choose a port below {FIRST_OF_ROS}, here and in what sends to it"
+
 _INODE = 9
 """Column of the inode in /proc/net/udp and /proc/net/tcp."""
 
@@ -156,19 +162,33 @@ def _ask_interface(name: str, request: int) -> bytes | None:
 def port_taken(protocol: str, port: int) -> tuple[str, str]:
     """Return which process has a port, and the remedy, for an error message. `protocol` is udp or tcp."""
     process = _process(protocol, port)
-    if process is not None and process.name == str(os.getpid()):
-        return f"the router itself (pid {process.name}) has the port", "restart it, or choose another port"
-    return f"{_described(process)} has the port", "stop it, or choose another port"
+    if not _is_this(process):
+        return f"{_described(process)} has the port", "stop it, or choose another port"
+    if protocol == "udp" and port >= FIRST_OF_ROS:
+        return f"the ROS node of the router itself (pid {os.getpid()}) has the port", BELOW_ROS
+    return f"the router itself (pid {os.getpid()}) has the port", "restart it, or choose another port"
 
 
-def why_not_bound(protocol: str, port: int, error: OSError) -> tuple[str, str]:
-    """Return why a socket cannot be bound, and the remedy, if any. `protocol` is udp or tcp."""
+def _is_this(process: Path | None) -> bool:
+    return process is not None and process.name == str(os.getpid())
+
+
+def why_not_bound(protocol: str, port: int, error: OSError) -> tuple[type[StartError], str, str]:
+    """Return why a socket cannot be bound: the class of error, the reason, and the remedy, if any.
+
+    `protocol` is udp or tcp. A missing privilege does not pass by itself, nor does a port that this process has.
+    """
+    from router.errors import ConfigurationError, StartError
+
     if error.errno == errno.EADDRINUSE:
-        return port_taken(protocol, port)
+        is_ours = _is_this(_process(protocol, port))
+        return ConfigurationError if is_ours else StartError, *port_taken(protocol, port)
     if error.errno == errno.EACCES:
-        return "ports below 1024 need a privilege", "choose a higher port, or grant CAP_NET_BIND_SERVICE"
+        remedy = "choose a higher port, or grant CAP_NET_BIND_SERVICE"
+        return ConfigurationError, "ports below 1024 need a privilege", remedy
     is_absent = error.errno == errno.EADDRNOTAVAIL
-    return "this machine has no such address" if is_absent else error.strerror or str(error), ""
+    kind = ConfigurationError if error.errno == errno.EPERM else StartError
+    return kind, "this machine has no such address" if is_absent else error.strerror or str(error), ""
 
 
 def port_holder(protocol: str, port: int) -> str:

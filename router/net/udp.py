@@ -128,11 +128,11 @@ class Listener:
 
 
 def _refused(settings: model.Listener, error: OSError) -> StartError:
-    why, hint = why_not_bound("udp", settings.address.value.port, error)
+    kind, why, hint = why_not_bound("udp", settings.address.value.port, error)
     if error.errno == errno.EPERM:
         why, hint = "before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"
     what = f"listener '{settings.name}' cannot use {settings.bound_to}"
-    return StartError(f"{settings.address.span}: {what}: {why}", hint)
+    return kind(f"{settings.address.span}: {what}: {why}", hint)
 
 
 def nobody_listens(address: Address) -> str:

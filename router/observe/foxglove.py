@@ -18,7 +18,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener, WebSocketSer
 from google.protobuf.descriptor import Descriptor
 
 from router.compiler.program import Program
-from router.errors import Located, StartError
+from router.errors import ConfigurationError, Located, StartError
 from router.log import fault, logger
 from router.net.kernel import is_listening, port_holder
 from router.observe.running import Running
@@ -176,7 +176,8 @@ def _started(address: Located[Address], name: str, context: Context, listener: S
         elif number == errno.EADDRNOTAVAIL:
             why = "no network interface of this computer has that address"
         what = f"{address.span}: cannot serve Foxglove at {address.value}: {why}"
-        raise StartError(what, "choose another foxglove.address") from error
+        kind = ConfigurationError if number == errno.EACCES else StartError
+        raise kind(what, "choose another foxglove.address") from error
 
 
 class _DebugLog(logging.Handler):

@@ -16,7 +16,6 @@ responses.
 
 from __future__ import annotations
 
-import errno
 import ipaddress
 import re
 import socket
@@ -36,9 +35,9 @@ from urllib.parse import parse_qs
 
 from prometheus_client.exposition import gzip_accepted
 
-from router.errors import SourceSpan, StartError
+from router.errors import SourceSpan
 from router.log import FloodLog, fault
-from router.net.kernel import port_holder
+from router.net.kernel import why_not_bound
 from router.observe.responses import SAVE, Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
@@ -94,10 +93,8 @@ class HttpServer:
         try:
             self._server = _Server(address, Responder(running, health, self._status, save))
         except OSError as error:
-            in_use = error.errno == errno.EADDRINUSE
-            why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
-            what = f"{span}: cannot serve HTTP at {address}: {why}"
-            raise StartError(what, "choose another http.address") from error
+            kind, why, _ = why_not_bound("tcp", address.port, error)
+            raise kind(f"{span}: cannot serve HTTP at {address}: {why}", "choose another http.address") from error
         self._thread = Thread(self._server.serve, "http")
         try:
             self._thread.start()

@@ -30,10 +30,11 @@ from mcap.writer import MCAP0_MAGIC
 
 from router import __version__
 from router.clock import wall_ns
-from router.errors import StartError
+from router.errors import ConfigurationError
 from router.log import logger
 from router.recording.channels import Channels
 from router.recording.encoder import Chunk
+from router.shortage import is_shortage
 from router.table.model import RecordSettings
 
 LIBRARY = "rover_router"
@@ -176,10 +177,10 @@ def _encoded(records: Iterable[McapRecord]) -> bytes:
 _DISK_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 
 
-def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
+def _cannot_record(settings: RecordSettings, why: str | None) -> ConfigurationError:
     there = settings.directory
     remedy = f"create it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
-    return StartError(f"{settings.span}: cannot record to {there}: {why}", remedy)
+    return ConfigurationError(f"{settings.span}: cannot record to {there}: {why}", remedy)
 
 
 class RecordingDirectory:
@@ -198,6 +199,8 @@ class RecordingDirectory:
                     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
                 raise _cannot_record(settings, "this user has no write permission there")
         except OSError as error:
+            if is_shortage(error):
+                raise
             if error.errno not in _DISK_FAILURES:
                 raise _cannot_record(settings, error.strerror) from error
             logger.error("nothing can be recorded now; routing all the same", where=str(there), problem=error.strerror)

@@ -15,7 +15,7 @@ import yaml
 from router import inputs
 from router.compiler.program import Program
 from router.compiler.topics import resolved
-from router.errors import StartError, nearest
+from router.errors import ConfigurationError, nearest
 from router.table.model import NodeSettings
 
 ROUTES_PATH = "routes_path"
@@ -156,7 +156,7 @@ def _read_yaml(path: Path) -> object:
     try:
         return yaml.safe_load(inputs.read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise StartError(f"the parameter file {path} cannot be read: {error}") from error
+        raise ConfigurationError(f"the parameter file {path} cannot be read: {error}") from error
 
 
 def _of_tree(node: str, tree: object) -> Iterator[Parameter]:

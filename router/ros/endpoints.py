@@ -17,10 +17,10 @@ from rclpy.node import Node
 
 from router.clock import monotonic_ns
 from router.compiler.program import TopicPlan
-from router.errors import SourceSpan, StartError
+from router.errors import ConfigurationError, SourceSpan
 from router.log import logger
 from router.ros.events import PeerEvents, WantedFlag
-from router.ros.node import RCL_ERRORS
+from router.ros.node import RCL_ERRORS, start_error
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
 from router.ros.rcl import RCL, ErrorString, SerializedMessage, function
 from router.ros.receiving import RawSubscription
@@ -162,7 +162,7 @@ def _refusing(problem: str) -> Iterator[None]:
     try:
         yield
     except RCL_ERRORS as error:
-        raise StartError(f"{problem}: {error}") from error
+        raise start_error(error, f"{problem}: {error}") from error
 
 
 Opened = TypeVar("Opened", Publication, Subscription)
@@ -193,7 +193,9 @@ def open_missing(
         if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
             kept = now[plan.label].plan.type_name  # DDS allows one type per topic in a process
             what = f"topic '{plan.label}' has the type {kept}, which cannot change to {plan.type_name}"
-            raise StartError(f"{spans[plan.label]}: {what} while the router runs", "restart it, or use another name")
+            raise ConfigurationError(
+                f"{spans[plan.label]}: {what} while the router runs", "restart it, or use another name"
+            )
         if plan.type_name not in classes:
             classes[plan.type_name] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []

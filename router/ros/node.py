@@ -13,8 +13,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
-from router.errors import StartError
+from router.errors import ConfigurationError, StartError
 from router.log import logger
+from router.ros.environment import unresolved_peers
 from router.ros.types import lean_interfaces
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
@@ -49,16 +50,34 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
         return node
     except RCL_ERRORS as error:
         context.try_shutdown()
-        raise StartError(f"the ROS node cannot be created: {error}") from error
+        for unresolved in unresolved_peers(os.environ):
+            raise unresolved from error
+        raise start_error(error, f"the ROS node cannot be created: {error}") from error
+
+
+def start_error(error: Exception, what: str) -> StartError:
+    """Return the error for one of RCL_ERRORS. A RuntimeError may mean that something has run out."""
+    return (StartError if isinstance(error, RuntimeError) else ConfigurationError)(what)
 
 
 def check_arguments(ros_args: Sequence[str]) -> None:
-    """Raise StartError for arguments that ROS rejects, without opening a node."""
-    context = Context()
+    """Raise ConfigurationError for arguments that ROS rejects, StartError if it also fails without arguments.
+
+    Opens no node.
+    """
     try:
-        context.init(list(ros_args), initialize_logging=False)
+        _try_context(ros_args)
     except RCL_ERRORS as error:
-        raise StartError(f"ROS rejects these arguments: {error}") from error
+        try:
+            _try_context(())
+        except RCL_ERRORS as cause:
+            raise StartError(f"ROS cannot be started: {cause}") from cause
+        raise ConfigurationError(f"ROS rejects these arguments: {error}") from error
+
+
+def _try_context(ros_args: Sequence[str]) -> None:
+    context = Context()
+    context.init(list(ros_args), initialize_logging=False)
     context.try_shutdown()
 
 

@@ -20,10 +20,11 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
     NamespacedType,
 )
 
-from router.errors import SourceSpan, StartError
+from router.errors import ConfigurationError, SourceSpan, StartError
 from router.lean import left_out, postponed
 from router.ros.environment import ros_package_remedy
 from router.ros.type_support import Definition, class_for_cdr
+from router.shortage import is_shortage
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
@@ -52,7 +53,7 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
     try:
         return usable_class(name, definitions)
     except StartError as error:
-        raise StartError(f"{span}: {error.what}", error.hint) from error
+        raise type(error)(f"{span}: {error.what}", error.hint) from error
 
 
 def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
@@ -69,7 +70,7 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
-            raise StartError(
+            raise ConfigurationError(
                 f"the installed {part} is not the one the table was compiled for; {_remedy(part)}\n"
                 f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
             )
@@ -84,7 +85,7 @@ def loaded_class(name: str) -> Any:
             check_is_valid_msg_type(message_class)
     except Exception as error:  # a library that cannot be loaded, or anything else
         why = f"{error}: {error.__context__}" if error.__context__ else str(error)  # the latter names the library
-        raise StartError(f"{name} cannot be used: {why}", _remedy(name)) from error
+        raise _kind(error)(f"{name} cannot be used: {why}", _remedy(name)) from error
     return message_class
 
 
@@ -96,22 +97,30 @@ def installed_class(name: str) -> Any:
     """
     package, kind, short = _parts(name)
     if not _has_part(package, kind):
-        raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name))
+        raise ConfigurationError(
+            f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name)
+        )
     try:
         with lean_interfaces():
             found = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
-        raise StartError(f"{name} cannot be loaded: {error}") from error
+        raise _kind(error)(f"{name} cannot be loaded: {error}") from error
     if not hasattr(found, "get_fields_and_field_types"):
-        raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
+        raise ConfigurationError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
     return found
+
+
+def _kind(error: Exception) -> type[StartError]:
+    """Return the class of error for a type that cannot be loaded because of `error`."""
+    causes = error, error.__context__  # rclpy's own error hides that of a library
+    return StartError if any(each is not None and is_shortage(each) for each in causes) else ConfigurationError
 
 
 def _parts(name: str) -> tuple[str, ...]:
     """Return package, kind and short name. Raises StartError for any other name."""
     parts = _NAME.fullmatch(name)
     if parts is None:
-        raise StartError(f"{name} is not installed (it is not the name of a ROS message)")
+        raise ConfigurationError(f"{name} is not installed (it is not the name of a ROS message)")
     return parts.groups()
 
 
@@ -166,5 +175,5 @@ def _type(slot: Any, place: str, known: dict[str, MessageType]) -> Type:
     if isinstance(slot, AbstractGenericString):
         return String(getattr(slot, "maximum_size", None), wide=isinstance(slot, AbstractWString))
     if (basic := _BASIC.get(slot.typename)) is None:
-        raise StartError(f"{place} is a {slot.typename}, which the router cannot read")
+        raise ConfigurationError(f"{place} is a {slot.typename}, which the router cannot read")
     return basic

@@ -28,6 +28,7 @@ from router.tools.doctor_checks import (
     receive_buffers,
     recordings,
     ros,
+    ros_ports,
     shared_memory,
     warning,
     ways,
@@ -47,6 +48,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     yield from ros(program)
     yield from listeners(program)
     yield from ports(program, running=running is not None)
+    yield from ros_ports(program, variables)
     yield from receive_buffers(program)
     if running is None:
         yield from recordings(program)
@@ -67,7 +69,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     program = checked.program
     if program is not None:
         needed += [carrier(), ros(program), ports(program, running=False, with_listeners=False)]
-        needed += [recordings(program)]
+        needed += [recordings(program), ros_ports(program, variables)]
     yield from (result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM)
     if program is not None:
         yield from (result for result in listeners(program) if result.grade is not Grade.FINE)

@@ -20,10 +20,11 @@ from typing import NamedTuple
 from router.carrier.library import load
 from router.compiler.program import Program
 from router.errors import Located, StartError, plural
-from router.net.kernel import interface_is_up, port_holder
+from router.net.dds import clashes, discovers_by_multicast
+from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable
 from router.recording.writer import recording_sizes
-from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy
+from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
 from router.table.model import Endpoint, Listener, Transport, bound_to
 
@@ -222,6 +223,14 @@ def listeners(program: Program) -> Iterator[CheckResult]:
             yield warning("listeners", what, f"run `ip link set {listener.interface} up`")
 
 
+def ros_ports(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+    """Check that no listener or gateway has a UDP port that ROS uses."""
+    uses_ros = bool(program.publishers or program.subscriptions or program.gateways)
+    for clash in clashes(program, variables):
+        grade = problem if clash.blinds and uses_ros and discovers_by_multicast(variables) else warning
+        yield grade("ports", str(clash), BELOW_ROS)
+
+
 def _absence(listener: Listener) -> tuple[str, str] | None:
     return absence(listener.address.value._replace(port=0), listener.interface)  # even if the port is in use
 
@@ -364,7 +373,7 @@ def ros(program: Program) -> Iterator[CheckResult]:
     plans = (*program.publishers, *program.subscriptions)
     if not plans and not program.gateways:
         return
-    found = [problem("ROS", what, remedy) for what, remedy in obstacles(os.environ)]
+    found = [problem("ROS", each.what, each.hint) for each in obstacles(os.environ)]
     yield from found
     if found:  # loading it would end this process
         return
@@ -385,7 +394,9 @@ def ros(program: Program) -> Iterator[CheckResult]:
         what = next(iter(errors.values())).removesuffix(f"; {remedy}")
         more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
         yield problem("ROS", f"{what}{more}", remedy)
-    if not wrong:
+    unresolved = list(unresolved_peers(os.environ))
+    yield from (problem("ROS", each.what, each.hint) for each in unresolved)
+    if not wrong and not unresolved:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         types = plural(len({plan.type_name for plan in plans}), "message type")
         yield fine("ROS", f"{middleware()} in domain {domain}, and {types} of the table")
@@ -423,8 +434,7 @@ def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Chec
     """Warn if the ROS domain is open to the networks of this computer."""
     if not (program.publishers or program.subscriptions or program.gateways):
         return
-    found_everywhere = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") in ("", "SUBNET", "SYSTEM_DEFAULT")
-    if variables.get("ROS_DOMAIN_ID", "") not in ("", "0") or not found_everywhere:
+    if variables.get("ROS_DOMAIN_ID", "") not in ("", "0") or not discovers_by_multicast(variables):
         return
     networks = [name for _, name in socket.if_nameindex() if name != "lo" and interface_is_up(name)]
     if networks:

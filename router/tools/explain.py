@@ -18,7 +18,7 @@ from router.compiler.program import GatewayPlan, InboundPlan, Program
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
-from router.errors import StartError, UsageError, plural, shown_path
+from router.errors import ConfigurationError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
 from router.rehearsal.describing import EventDescriber
 from router.rehearsal.fields import shown
@@ -386,7 +386,7 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
         from router.ros.node import close_node, open_node
         from router.ros.topics import RosTopics
     except ImportError as error:
-        raise StartError(f"--live needs ROS 2, which is not installed here ({error})", ros_remedy()) from error
+        raise ConfigurationError(f"--live needs ROS 2, which is not installed here ({error})", ros_remedy()) from error
     node = open_node("router_explain")
     try:
         sleep(seconds)

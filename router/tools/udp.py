@@ -100,7 +100,7 @@ def open_udp(address: Address, purpose: str) -> socket.socket:
         opened.bind(address)
     except OSError as error:
         opened.close()
-        why, remedy = why_not_bound("udp", address.port, error)
+        _, why, remedy = why_not_bound("udp", address.port, error)
         raise UsageError(f"{purpose}: cannot bind {address}: {why}", remedy) from error
     return opened
 

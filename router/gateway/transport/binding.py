@@ -66,8 +66,8 @@ class Binding:
                 return
 
     def _refusal(self, error: OSError) -> StartError:
-        why, remedy = why_not_bound(self._protocol, self._address.port, error)
-        return StartError(f"{self._address} cannot be used: {why}", remedy)
+        kind, why, remedy = why_not_bound(self._protocol, self._address.port, error)
+        return kind(f"{self._address} cannot be used: {why}", remedy)
 
 
 def listen_at(address: Address) -> socket.socket:

@@ -16,7 +16,7 @@ from typing import Union
 
 import zenoh
 
-from router.errors import StartError, TransportError
+from router.errors import TransportError
 from router.gateway.transport.arrival import LoopClock
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame, report_fault
 from router.gateway.transport.binding import RETRY_SECONDS
@@ -94,9 +94,9 @@ class ZenohTransport:
         try:
             await self._connect(config)
         except zenoh.ZError as error:
-            if why := permanent(self._settings, str(error)):
+            if refusal := permanent(self._settings, str(error)):
                 await self.close()
-                raise StartError(why) from None  # the library's error may quote passwords
+                raise refusal from None  # the library's error may quote passwords
             logger.warning("Zenoh is not reachable yet; retrying every second", key=self._key, why=short(error))
             self._tasks.append(self._loop.create_task(self._retry(config)))
 

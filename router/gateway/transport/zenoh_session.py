@@ -16,7 +16,7 @@ import zenoh
 
 from router.clock import wall_ns
 from router.compiler.zenoh_config import is_default, library_config, reason
-from router.errors import StartError
+from router.errors import ConfigurationError, StartError
 from router.net.kernel import port_taken
 from router.table.model import ZenohSettings
 
@@ -28,23 +28,23 @@ LOOK_SECONDS = 1.5
 """Timeout of a query for tokens. All reachable sessions answer at once, unless one is suspended. Shorter than the
 timeout for closing a session, which waits for the query."""
 
-_TEMPORARY = "Unable to connect|timeout|os error (?:19|99|100|101|110|113)\\b"
-"""Errors that end when others, or a network interface, appear."""
+_TEMPORARY = "Unable to connect|timeout|os error (?:12|19|23|24|99|100|101|105|110|113)\\b"
+"""Errors that end when others, or a network interface, appear, or when there is memory again, and so on."""
 
 _LONGEST = 64
 """Maximum characters shown of a host name."""
 
 
 def session_config(settings: ZenohSettings) -> zenoh.Config:
-    """Return the table's `config` with the gateway's own settings. Raises StartError."""
+    """Return the table's `config` with the gateway's own settings. Raises ConfigurationError."""
     try:
         zenoh.KeyExpr(settings.key.value)
     except zenoh.ZError as error:
-        raise StartError(f"'{settings.key.value}' is not a valid Zenoh key: {short(error)}") from error
+        raise ConfigurationError(f"'{settings.key.value}' is not a valid Zenoh key: {short(error)}") from error
     try:
         config = library_config(settings.config)
     except zenoh.ZError as error:  # a file that has changed since it was checked
-        raise StartError(_refused(settings, error)) from None
+        raise ConfigurationError(_refused(settings, error)) from None
     unless_said: dict[str, object] = {
         "scouting/multicast/enabled": not settings.connect and not settings.listen,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": LARGE_MESSAGE_US,
@@ -59,7 +59,7 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
         try:
             config.insert_json5(name, json.dumps(value))
         except zenoh.ZError as error:
-            raise StartError(f"Zenoh rejects {value!r} for {name}: {short(error)}") from error
+            raise ConfigurationError(f"Zenoh rejects {value!r} for {name}: {short(error)}") from error
     return config
 
 
@@ -68,18 +68,19 @@ def connections(session: zenoh.Session) -> int:
     return len(session.info.routers_zid()) + len(session.info.peers_zid())
 
 
-def permanent(settings: ZenohSettings, error: str) -> str:
-    """Return a message for an error that retrying does not solve, "" for others."""
+def permanent(settings: ZenohSettings, error: str) -> StartError | None:
+    """Return the error that ends the start; None if the gateway tries again while the router runs."""
     if "not supported" in error:
-        return f"Zenoh cannot use one of these: {', '.join((*settings.connect, *settings.listen))}: {short(error)}"
+        locators = ", ".join((*settings.connect, *settings.listen))
+        return ConfigurationError(f"Zenoh cannot use one of these: {locators}: {short(error)}")
     if "os error 98" not in error:
-        is_refused = settings.config is not None or "TLS" in error
-        return _refused(settings, error) if is_refused and not re.search(_TEMPORARY, error) else ""
+        is_refused = (settings.config is not None or "TLS" in error) and not re.search(_TEMPORARY, error)
+        return ConfigurationError(_refused(settings, error)) if is_refused else None
     for locator in settings.listen:
         port = re.search(r":(\d+)$", locator)
         if port and locator in error:
-            return f"{locator} cannot be used: {'; '.join(port_taken('tcp', int(port[1])))}"
-    return f"Zenoh cannot listen: {short(error)}"
+            return StartError(f"{locator} cannot be used: {'; '.join(port_taken('tcp', int(port[1])))}")
+    return StartError(f"Zenoh cannot listen: {short(error)}")
 
 
 def short(error: object) -> str:
