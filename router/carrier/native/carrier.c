@@ -90,9 +90,13 @@ static ssize_t receive(int fd, struct msghdr *message, int flags) {
     ssize_t length = recvmsg(fd, message, flags);
     if (length >= 0 || errno == EAGAIN || errno == EINTR) return length;
     bool is_about_sent = sender_note_errors(fd);
-    for (int left = ATTEMPTS; left && length < 0 && errno != EAGAIN; left--)
+    for (int left = ATTEMPTS; left; left--) {
         length = recvmsg(fd, message, flags | MSG_DONTWAIT);
-    if (length < 0 && errno != EAGAIN && !is_about_sent) usleep(1000); /* another error: avoid a busy loop */
+        if (length >= 0 || errno == EAGAIN) return length;
+    }
+    int error = errno;
+    if (!is_about_sent) usleep(1000); /* another error: avoid a busy loop */
+    errno = error;
     return length;
 }
 

@@ -1,0 +1,58 @@
+"""The UDP ports of DDS: a listener at one keeps ROS processes from finding each other, or finds the port taken."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from router.compiler.program import Program
+from router.errors import SourceSpan
+from router.net.kernel import FIRST_OF_ROS
+from router.table.addresses import Address
+
+_FIRST, _OF_DOMAIN = 7400, 250
+"""Domain D has the ports from 7400 + 250 D on. The first one is for multicast discovery, which all processes share."""
+
+_FLOWS = range(FIRST_OF_ROS, 7100)
+"""Fast DDS binds one more port per ROS process, in every domain: the first free one from 7000 on."""
+
+_EVERYWHERE = frozenset({"", "SUBNET", "SYSTEM_DEFAULT"})
+
+
+class Clash(NamedTuple):
+    """A UDP address of the table with a port of DDS. `blinds`: no ROS process on this computer discovers others."""
+
+    owner: str
+    span: SourceSpan
+    address: Address
+    domain: int
+    blinds: bool
+
+    def __str__(self) -> str:
+        if self.blinds:
+            why = f"the port through which ROS processes of domain {self.domain} find each other: with it taken, ROS "
+            return f"{self.owner} has {self.address}, {why}processes that start on this computer find nobody"
+        why = "one of those that ROS processes take when they start: whoever starts first has it"
+        return f"{self.owner} has {self.address}; this port is {why}"
+
+
+def clashes(program: Program, variables: Mapping[str, str]) -> Iterator[Clash]:
+    """Yield the UDP addresses of listeners and gateways with a port of DDS in the domain of the environment."""
+    domain = variables.get("ROS_DOMAIN_ID") or "0"
+    if variables.get("RMW_IMPLEMENTATION", "").startswith("rmw_zenoh") or not re.fullmatch("[0-9]{1,3}", domain):
+        return
+    discovery = _FIRST + _OF_DOMAIN * int(domain)
+    found = [(f"listener '{each.name}'", each.address) for each in program.listeners]
+    for name, gateway in program.table.gateways.items():
+        found += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
+    for owner, address in found:
+        blinds = address.value.port == discovery
+        if blinds or address.value.port in _FLOWS or address.value.port in range(discovery, discovery + _OF_DOMAIN):
+            yield Clash(owner, address.span, address.value, int(domain), blinds)
+
+
+def discovers_by_multicast(variables: Mapping[str, str]) -> bool:
+    """Return whether ROS processes with this environment discover those on other computers."""
+    discovery_range = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    return discovery_range in _EVERYWHERE and variables.get("ROS_LOCALHOST_ONLY") != "1"
