@@ -191,7 +191,9 @@ ABANDON_S = 1.0
 
 
 def join_or_abandon(thread: threading.Thread, timeout: float = ABANDON_S) -> bool:
-    """Wait for the end of a daemon thread. On timeout, log that and return False."""
+    """Wait for the end of a daemon thread, if it was started. On timeout, log that and return False."""
+    if thread.ident is None:  # its start has failed, which the caller of `start` reports
+        return True
     thread.join(timeout)
     if thread.is_alive():
         logger.error("thread did not stop in time; continuing", thread=thread.name)

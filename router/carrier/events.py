@@ -137,8 +137,7 @@ class EventThread:
         """Read the remaining events, and end the thread."""
         self._stopping = True
         os.eventfd_write(self._wakes[0], 1)
-        if self._thread.ident is not None:
-            join_or_abandon(self._thread)
+        join_or_abandon(self._thread)
 
     def _run(self) -> None:
         poll = select.poll()
