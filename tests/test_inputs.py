@@ -6,6 +6,7 @@ import argparse
 import ast
 import json
 import os
+import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from router.cli.tool_options import named_table, table_path
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
+from router.errors import StartError
 from router.ros.arguments import Variables, ros_parameters, table_variables
 
 if TYPE_CHECKING:
@@ -329,3 +331,19 @@ def _read_by(node: ast.AST) -> str:
         is_ours = isinstance(node.value, ast.Name) and node.value.id in {"inputs", "ast"}
         return "" if is_ours else node.attr
     return "open" if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "open" else ""
+
+
+def test_a_lack_of_descriptors_is_not_a_mistake_in_a_file(place: Path) -> None:
+    """As an OSError it would become a finding, and systemd would not start the router again."""
+    table = Path("routes/rover.yaml")
+    assert check_table(table, {}).program is not None
+    allowed = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, allowed[1]))
+    try:
+        for read in (inputs.read_bytes, inputs.listing):
+            with pytest.raises(StartError, match="cannot be read now: Too many open files"):
+                read("routes" if read is inputs.listing else table)
+        with pytest.raises(StartError, match=r"routes/rover.yaml cannot be read now: Too many open files"):
+            check_table(table, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, allowed)

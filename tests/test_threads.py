@@ -14,7 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from router import threads
-from router.threads import DaemonThread, StopStack, Thread, background_threads
+from router.threads import DaemonThread, StopStack, Thread, background_threads, join_or_abandon
 
 TIMEOUT_S = 20.0
 
@@ -31,6 +31,10 @@ def test_threads_started_inside_are_batch_and_those_after_are_not() -> None:
     with background_threads():
         inside = policy_of_a_new_thread()
     assert (inside, policy_of_a_new_thread()) == (os.SCHED_BATCH, os.SCHED_OTHER)
+
+
+def test_a_thread_whose_start_failed_needs_no_end() -> None:
+    assert join_or_abandon(Thread(lambda: None, "test"))
 
 
 def test_the_policy_returns_after_an_error() -> None:

@@ -31,10 +31,9 @@ class Clash(NamedTuple):
 
     def __str__(self) -> str:
         if self.blinds:
-            why = f"the port through which ROS processes of domain {self.domain} find each other: with it taken, ROS "
-            return f"{self.owner} has {self.address}, {why}processes that start on this computer find nobody"
-        why = "one of those that ROS processes take when they start: whoever starts first has it"
-        return f"{self.owner} has {self.address}; this port is {why}"
+            why = f"the port through which ROS processes of domain {self.domain} find each other"
+            return f"{self.owner} has {self.address}, {why}: those that start on this computer find nobody"
+        return f"{self.owner} has {self.address}, a port that a ROS process of this computer may take first"
 
 
 def clashes(program: Program, variables: Mapping[str, str]) -> Iterator[Clash]:

@@ -20,7 +20,9 @@ from pathlib import Path
 
 import pytest
 
-from router.ros.environment import SHM, obstacles, uses_shared_memory
+from router.carrier.build import compile_c
+from router.errors import ConfigurationError, StartError
+from router.ros.environment import SHM, obstacles, unresolved_peers, uses_shared_memory
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS, ROUTES
@@ -273,12 +275,12 @@ def test_a_table_with_errors_is_told_and_ends_with_78(table: Path) -> None:
     assert f"{table}:11:20: error[unknown-endpoint]" in text
 
 
-def test_a_port_in_use_is_told_and_ends_with_78(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_in_use_is_told_and_a_later_start_may_succeed(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         monkeypatch.setenv("LISTEN_PORT", str(taken.getsockname()[1]))
         code, [said, remedy] = ended("run", table)
-    assert (code, remedy) == (78, "help: stop it, or choose another port")
+    assert (code, remedy) == (1, "help: stop it, or choose another port")
     assert said.startswith(f"router run: {table}:4:20: listener 'rover' cannot use")
     assert f"(pid {os.getpid()}) has the port" in said
 
@@ -393,7 +395,7 @@ def may_map(mebibytes: int) -> Callable[[], None]:
 def test_too_little_address_space_is_told(table: Path, mebibytes: int) -> None:
     """It ends in the imports, while the table is compiled, or with the first thread."""
     code, said = ended("run", table, preexec_fn=may_map(mebibytes))
-    assert code == 78
+    assert code == 1
     assert len(said) == 1
     assert said[0].startswith(f"router run: this process may map {mebibytes} MiB of memory (ulimit -v), which is not")
 
@@ -402,8 +404,78 @@ def test_too_little_address_space_for_ros_is_told_before_ros_is_loaded(table: Pa
     pytest.importorskip("rclpy", reason="needs ROS 2")
     table.write_text(table.read_text() + TOPIC)
     code, said = ended("run", table, preexec_fn=may_map(300))
-    assert code == 78
+    assert code == 1
     assert said[0].startswith("router run: this process may map 300 MiB of memory (ulimit -v), but ROS 2 needs 1024")
+
+
+SHORT_OF_FILES = (4, 6, 9, 12, 16, 18, 19)
+"""Descriptors, of which a start needs 20: Python's own files, the protos, the carrier's events, sockets, threads."""
+
+
+@pytest.mark.parametrize("descriptors", SHORT_OF_FILES)
+def test_a_lack_of_descriptors_may_pass(table: Path, descriptors: int) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
+
+    assert ended("run", table, "--no-cache", preexec_fn=limit)[0] == 1
+
+
+@pytest.mark.parametrize("descriptors", [16, 20, 24, 28])
+def test_a_lack_of_descriptors_for_ros_may_pass(table: Path, descriptors: int) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
+
+    table.write_text(table.read_text() + TOPIC)
+    assert ended("run", table, "--no-cache", preexec_fn=limit)[0] == 1
+
+
+@pytest.fixture(scope="session")
+def failing_thread(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library to preload that makes the start of one thread fail."""
+    made = tmp_path_factory.mktemp("failing") / "thread.so"
+    compile_c(["-shared", "-fPIC", str(Path(__file__).with_name("failing_thread.c")), "-ldl", "-o", str(made)])
+    return made
+
+
+@pytest.mark.parametrize("thread", range(1, 8))
+def test_a_lack_of_threads_may_pass(
+    table: Path, thread: int, failing_thread: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LD_PRELOAD", str(failing_thread))
+    monkeypatch.setenv("FAILING_THREAD", str(thread))
+    code, said = ended("run", table, "--no-cache")
+    assert code == 1
+    assert re.search("can't start new thread|threads cannot be started: Resource temporarily unavailable", said[-1])
+
+
+def test_a_peer_that_does_not_resolve_may_be_known_later(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    table.write_text(table.read_text() + TOPIC)
+    monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1;base.invalid")
+    code, [said, remedy] = ended("run", table)
+    assert code == 1
+    assert said.startswith("router run: ROS_STATIC_PEERS names 'base.invalid', which does not resolve: ")
+    assert remedy == "help: correct it, or see that the name server or /etc/hosts knows it"
+    checked = start(MODULE, "doctor", "--pre-start", "-t", table)
+    told, _ = checked.communicate(timeout=60)
+    assert checked.returncode == 1
+    assert "problem  ROS        ROS_STATIC_PEERS names 'base.invalid', which does not resolve" in told
+
+    monkeypatch.setenv("ROS_STATIC_PEERS", "192.168.0.400")
+    assert ended("run", table)[0] == 78
+
+
+def test_peers_are_resolved_where_ros_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    peers = {"ROS_STATIC_PEERS": ";127.0.0.1;;x.invalid;x y;"}
+    assert [type(each) for each in unresolved_peers(peers)] == [StartError, ConfigurationError]
+    for ignoring in (
+        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"},
+        {"ROS_LOCALHOST_ONLY": "1"},
+        {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+    ):
+        assert list(unresolved_peers(peers | ignoring)) == []
 
 
 def test_an_environment_that_ros_does_not_take_is_told(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -424,7 +496,7 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
     within = ["unshare", "-m", "sh", "-c", f'{full} && exec "$@"', "sh"]
     command = [*within, sys.executable, "-m", "router", name, "-t", str(table)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert answer.returncode == {"run": 78, "doctor": 1}[name]
+    assert answer.returncode == 1
     assert f"{SHM} has 0 KiB free, but ROS 2 needs" in answer.stdout + answer.stderr
 
 
@@ -432,10 +504,10 @@ def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) 
     for domain in ("", "0", "7", "232"):
         assert list(obstacles({"ROS_DOMAIN_ID": domain})) == []
     for domain in ("233", "-5", "1e2", "4294967296", " 5", "five"):
-        [(what, _)] = obstacles({"ROS_DOMAIN_ID": domain})
-        assert what == f"ROS_DOMAIN_ID is '{domain}'"
-    [(what, _)] = obstacles({"RMW_IMPLEMENTATION": "rmw_dust"})
-    assert what == "RMW_IMPLEMENTATION is 'rmw_dust', which is not installed here"
+        [wrong] = obstacles({"ROS_DOMAIN_ID": domain})
+        assert wrong.what == f"ROS_DOMAIN_ID is '{domain}'"
+    [wrong] = obstacles({"RMW_IMPLEMENTATION": "rmw_dust"})
+    assert wrong.what == "RMW_IMPLEMENTATION is 'rmw_dust', which is not installed here"
     transports = "FASTDDS_BUILTIN_TRANSPORTS"
     assert all(uses_shared_memory({transports: each}) for each in ("", "DEFAULT", "SHM", "LARGE_DATA?max_msg_size=1MB"))
     assert not any(uses_shared_memory({transports: each}) for each in ("UDPv4", "UDPv6", "TCPv4", "NONE"))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 import subprocess
@@ -15,13 +16,23 @@ from router.cli import (
     BROKEN_PIPE,
     INTERRUPTED,
     NETWORK_FAULT,
+    NOT_NOW,
     OK,
     UNWRITTEN,
     VERBS,
     main,
     validate,
 )
-from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, TransportError, UsageError
+from router.errors import (
+    Code,
+    ConfigurationError,
+    Diagnostic,
+    SourceSpan,
+    StartError,
+    TableError,
+    TransportError,
+    UsageError,
+)
 from tests.tables import ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
@@ -57,8 +68,17 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     ("error", "code", "shown"),
     [
         (TableError([Diagnostic(SourceSpan("t.yaml", 3, 4), Code.BAD_YAML, "what")]), BAD_TABLE, "t.yaml:3:4: error"),
-        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken\n"),
-        (StartError("no port", "choose another"), BAD_TABLE, "router validate: no port\nhelp: choose another\n"),
+        (StartError("port 5000 is taken"), NOT_NOW, "router validate: port 5000 is taken\n"),
+        (StartError("no port", "choose another"), NOT_NOW, "router validate: no port\nhelp: choose another\n"),
+        (ConfigurationError("no such type"), BAD_TABLE, "router validate: no such type\n"),
+        (
+            RuntimeError("can't start new thread"),
+            NOT_NOW,
+            "descriptors have run out: can't start new thread",
+        ),
+        (MemoryError(), NOT_NOW, "have run out: no memory"),
+        (OSError(errno.EMFILE, "Too many open files"), NOT_NOW, "have run out: [Errno 24] Too many open files"),
+        (ImportError("x.so: cannot open shared object file: Too many open files"), NOT_NOW, "have run out: x.so: "),
         (UsageError("there is no x"), BAD_USAGE, "router validate: there is no x"),
         (TransportError("nobody answers"), NETWORK_FAULT, "router validate: nobody answers"),
         (KeyboardInterrupt(), INTERRUPTED, ""),

@@ -337,6 +337,20 @@ def test_a_reload_takes_a_good_table_and_refuses_a_bad_one(running: Machine) -> 
     assert "did you mean 'routes'?" in running.journal()
 
 
+def test_a_start_that_may_succeed_later_is_tried_again_until_it_does(running: Machine) -> None:
+    """Here another program has the port of its status page."""
+    listening = "import socket; s = socket.create_server(('127.0.0.1', 29108)); s.accept()"
+    running.run("systemctl", "stop", "rover-router")
+    running.run("systemd-run", "--unit", "holder", sys.executable, "-c", listening)
+    running.wait_for("ss -ltn | grep -q 127.0.0.1:29108")
+    running.run("systemctl", "start", "--no-block", "rover-router")
+    running.wait_for("test $(systemctl show --property NRestarts --value rover-router) -gt 2")
+    assert "has the port" in running.journal()
+    assert running.state() == "activating"
+    running.run("systemctl", "stop", "holder")
+    running.wait_for("systemctl is-active rover-router")
+
+
 def test_a_bad_table_stops_it_for_good_with_what_to_do_and_datagrams_do_not_start_it(running: Machine) -> None:
     running.shell(f"cp {SIM} /opt/sim.yaml; echo 'routs: {{}}' >> {SIM}")
     running.run("systemctl", "restart", "rover-router", check=False)
