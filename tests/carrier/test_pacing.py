@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from router.declared import MAX_DATAGRAM
 from router.table.model import Priority
 from tests.carrier.deferring import Deferring
-from tests.oracles.held_back import BURST, LEAST_OVERDRAFT, LEAST_ROOM, NS, OVERDRAFT
+from tests.oracles.held_back import BURST, LEAST_OVERDRAFT, LEAST_ROOM, NS, OVERDRAFT, Message, Pacer
 
 COMMAND, TELEMETRY, BULK = Priority
 MS = 1_000_000
@@ -197,6 +197,27 @@ def test_what_gets_too_old_while_it_waits_is_dropped_and_uses_up_nothing(link: C
     assert slow.sent[-1] == (190 * MS, fresh)
 
 
+@pytest.mark.parametrize(("late", "fate"), [(0, "sent"), (-1, "stale"), (5 * MS + 500_000, "sent")])
+def test_what_the_budget_pays_for_in_time_leaves_in_time(link: Callable[[int], Link], late: int, fate: str) -> None:
+    """The budget has paid for the second one after 99.5 ms."""
+    slow = link(10_000)
+    slow.offer(BULK, 200)
+    second = slow.offer(BULK, 995, expires=99 * MS + 500_000 + late)
+    slow.wait(NS)
+    assert slow.fate(second) == fate
+    if fate == "sent":
+        assert slow.sent[-1] == (99 * MS + 500_000, second)
+
+
+def test_what_waits_behind_one_that_never_expires_leaves_in_time(link: Callable[[int], Link]) -> None:
+    slow = link(10_000)
+    slow.offer(BULK, 200)
+    slow.offer(BULK, 500)
+    last = slow.offer(BULK, 20, expires=55 * MS)
+    slow.wait(NS)
+    assert slow.sent[1:] == [(50 * MS, 1), (52 * MS, last)]
+
+
 def test_what_the_network_refuses_is_counted_and_the_next_is_tried(link: Callable[[int], Link]) -> None:
     refusing = link(100_000)
     refusing.deferring.refuse(errno.ECONNREFUSED)
@@ -306,6 +327,36 @@ def test_in_no_time_goes_more_than_the_budget_and_what_was_saved_up_before(
         for until, number in link.sent[first:]:
             sent += sizes[number]
             assert sent <= budget * (until - since + BURST) / NS + max(sizes)
+    link.deferring.close()
+
+
+tight = st.tuples(
+    st.integers(1, 2),
+    st.integers(20, 30),
+    st.none() | st.integers(5, 25).map(MS.__mul__),
+    st.sampled_from((0, 0, 3 * MS)),
+)
+"""As `offers`, where many expire about when the budget has paid for them."""
+
+
+@given(st.integers(5_000, 10_000), st.lists(tight, min_size=10, max_size=40))
+def test_what_an_eager_pacer_sends_is_not_dropped_as_stale(
+    library: ctypes.CDLL, deferring: ctypes.CDLL, budget: int, messages: list[tuple[int, int, int | None, int]]
+) -> None:
+    """The oracle sends each datagram as soon as the budget has paid for it."""
+    fates: dict[int, str] = {}
+    eager = Pacer(budget, lambda _, message, fate: fates.update({message.number: fate}), slack=0)
+    link = Link(Deferring(library, deferring, budget))
+    for number, (rank, size, fresh_for, pause) in enumerate([*messages, (2, 10, None, NS)]):
+        expires = None if fresh_for is None else link.now + fresh_for
+        assert link.offer(RANKS[rank], size, expires) == number
+        eager.offer(link.now, Message(number, None, size, expires, rank))
+        until = link.now + pause
+        while eager.next_due is not None and eager.next_due <= until:
+            eager.serve(eager.next_due)
+        link.wait(until)
+    dropped = [number for number, fate in fates.items() if fate == "sent" and link.fate(number) == "stale"]
+    assert dropped == []
     link.deferring.close()
 
 

@@ -143,7 +143,10 @@ def test_a_start_that_would_blind_others_warns(tmp_path: Path) -> None:
 def test_the_doctor_names_a_port_that_ros_may_take_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["doctor", "-t", str(table(tmp_path, 7003))])
     said = capsys.readouterr().out
-    assert "warning  ports      listener 'trimmed' has 127.0.0.1:7003, a port that a ROS process of this computer may" in said
+    assert (
+        "warning  ports      listener 'trimmed' has 127.0.0.1:7003, a port that a ROS process of this computer may"
+        in said
+    )
     assert f"-> {BELOW_ROS}" in said
 
 

@@ -34,7 +34,8 @@ struct pacer {
     int64_t overdraft;
     int64_t bytes_left, datagrams_left; /* that may still wait; below 0 until the oldest is dropped */
     int64_t paid_at; /* when the budget has paid for everything sent; the time from then to now is accumulated */
-    bool has_ended;  /* datagrams no longer wait */
+    bool has_expiring; /* one that expires was queued since nothing waited */
+    bool has_ended;    /* datagrams no longer wait */
 };
 
 /* ---- lanes ---- */
@@ -132,13 +133,15 @@ static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64
             const struct waiting_datagram *first = first_of(lane);
             int64_t may_go_at = pacer->paid_at + (index == PRIORITY_COMMAND ? -pacer->overdraft : first->cost);
             if (now < may_go_at && now <= first->expires) {
-                int64_t due = may_go_at + BURST / 2; /* later than necessary: one call then sends several */
                 /* An expired one no longer raises the limit of the accumulated budget. */
-                return first->expires != NEVER && first->expires + 1 < due ? first->expires + 1 : due;
+                if (may_go_at > first->expires) return first->expires + 1;
+                /* If nothing expires meanwhile, later than necessary: one call then sends several. */
+                return pacer->has_expiring ? may_go_at : may_go_at + BURST / 2;
             }
             if (!send_first(timers, pacer, lane, now)) limit_savings(pacer, now);
         }
     }
+    pacer->has_expiring = false;
     return NEVER;
 }
 
@@ -188,6 +191,7 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target
     }
     limit_savings(pacer, now);
     put(&pacer->lanes[of->target->priority], &waiting, data);
+    pacer->has_expiring |= expires != NEVER;
     pacer->bytes_left -= (int64_t)size;
     pacer->datagrams_left--;
     of->queued++;
