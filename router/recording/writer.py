@@ -10,7 +10,7 @@ import os
 import re
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -184,10 +184,11 @@ def _cannot_record(settings: RecordSettings, why: str | None) -> ConfigurationEr
 
 
 class RecordingDirectory:
-    """The files `STEM_TIME[_REASON].mcap` in a table's `record.directory`; others are not touched.
+    """The files `STEM_NUMBER_TIME[_REASON].mcap` in a table's `record.directory`; others are not touched.
 
-    They have at most `retention` bytes in total. Creates the directory. Raises StartError, but not if the disk is full
-    or fails: that prevents no start, as it ends no router.
+    Later files have higher numbers: their order does not depend on the clock, which may be set back. They have at most
+    `retention` bytes in total. Creates the directory. Raises ConfigurationError, but not if the disk is full or fails:
+    that prevents no start, as it ends no router.
     """
 
     def __init__(self, settings: RecordSettings, stem: str) -> None:
@@ -209,19 +210,16 @@ class RecordingDirectory:
         self._retention = settings.retention
 
     def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
-        """Create a file. Equal names, as with a clock that restarts at each boot, get numbers. Raises OSError."""
+        """Create a file with the next number. Raises OSError."""
+        number = 1 + max((number for number, _ in _numbered(self.path, self._stem)), default=0)
         time = datetime.fromtimestamp(wall_ns() / 1e9, timezone.utc).strftime(_TIME)
-        words = [self._stem, time, *([re.sub(r"[^a-z0-9_.-]+", "-", reason.lower())] if reason else [])]
-        for number in range(1, 1000):
-            name = "_".join([*words, *([str(number)] if number > 1 else [])]) + SUFFIX
-            try:
-                return RecordingFile(self.path / name, channels, about)
-            except FileExistsError:
-                continue
-        raise FileExistsError(errno.EEXIST, f"there are already a thousand recordings of {time}", str(self.path))
+        words = [self._stem, f"{number:06}", time]
+        if reason:
+            words.append(re.sub(r"[^a-z0-9_.-]+", "-", reason.lower()))
+        return RecordingFile(self.path / f"{'_'.join(words)}{SUFFIX}", channels, about)
 
     def make_room(self, coming: int, writing: Path | None = None) -> None:
-        """Remove the oldest files, by name, until there is room for `coming` bytes in addition to the file `writing`.
+        """Remove the oldest files, by number, until there is room for `coming` bytes in addition to the file `writing`.
 
         Recreates the directory if it was removed. Raises OSError.
         """
@@ -238,15 +236,21 @@ class RecordingDirectory:
 
 def recording_sizes(path: Path, stem: str) -> dict[Path, int]:
     """Return the bytes of each recording of a table in `path`, oldest first."""
-    name = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
     sizes: dict[Path, int] = {}
-    for file in sorted(path.iterdir()) if path.is_dir() else ():
-        if name.fullmatch(file.name):
-            try:
-                sizes[file] = file.stat().st_size
-            except FileNotFoundError:  # removed meanwhile
-                continue
+    for _, file in sorted(_numbered(path, stem)):
+        with suppress(FileNotFoundError):  # removed meanwhile
+            sizes[file] = file.stat().st_size
     return sizes
+
+
+def _numbered(path: Path, stem: str) -> Iterator[tuple[int, Path]]:
+    """Yield each recording of a table in `path` with its number: 0 if it has none, like those of version 1.0.0."""
+    name = re.compile(
+        re.escape(stem) + r"(?:_(\d{6,}))?_\d{8}T\d{6}\.\d{6}Z(?:_[a-z0-9_.-]+)?" + re.escape(SUFFIX), re.ASCII
+    )
+    for file in path.iterdir() if path.is_dir() else ():
+        if found := name.fullmatch(file.name):
+            yield int(found[1] or 0), file
 
 
 class ContinuousWriter:

@@ -150,6 +150,31 @@ def test_the_oldest_recordings_go_and_files_of_others_stay(tmp_path: Path) -> No
     assert [len(read(path)) for path in ours] == [2, 2]
 
 
+@pytest.mark.parametrize("earlier", ["20990101T000000.000000Z", "000007_20990101T000000.000000Z"])
+def test_the_newest_recordings_stay_even_if_the_clock_was_set_back(tmp_path: Path, earlier: str) -> None:
+    """As on a computer without a battery for its clock. Only the recordings of 1.0.0 have no number."""
+    old = tmp_path / f"rover_{earlier}.mcap"
+    old.write_bytes(bytes(30_000))
+    with running_recorder(tmp_path, max_size=25_000, retention=60_000) as (made, mirror):
+        batches = [now(os.urandom(10_000)) for _ in range(8)]
+        for batch in batches:
+            show(made, mirror, batch)
+    assert old not in files(tmp_path)
+    assert [again(each) for path in files(tmp_path) for each in read(path)] == [
+        each for batch in batches[4:] for each in batch
+    ]
+
+
+def test_recordings_are_numbered_over_all_runs(tmp_path: Path) -> None:
+    (tmp_path / "rover_999999_20200101T000000.000000Z_http.mcap").touch()
+    (tmp_path / "other_1000007_20200101T000000.000000Z.mcap").touch()
+    for _ in range(2):
+        with running_recorder(tmp_path) as (made, mirror):
+            show(made, mirror, now(imu()))
+    names = [path.name.rpartition("_")[0] for path in files(tmp_path)]
+    assert {"rover_1000000", "rover_1000001"} <= set(names)
+
+
 def test_the_last_datagrams_are_saved_when_somebody_asks(tmp_path: Path) -> None:
     with running_recorder(tmp_path, continuous=False, last=60 * 10**9) as (made, mirror):
         mirror.show(first := now(imu(1), b"bad"))
