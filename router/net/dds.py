@@ -38,17 +38,29 @@ class Clash(NamedTuple):
 
 def clashes(program: Program, variables: Mapping[str, str]) -> Iterator[Clash]:
     """Yield the UDP addresses of listeners and gateways with a port of DDS in the domain of the environment."""
-    domain = variables.get("ROS_DOMAIN_ID") or "0"
-    if variables.get("RMW_IMPLEMENTATION", "").startswith("rmw_zenoh") or not re.fullmatch("[0-9]{1,3}", domain):
+    if (domain := _domain(variables)) is None:
         return
-    discovery = _FIRST + _OF_DOMAIN * int(domain)
     found = [(f"listener '{each.name}'", each.address) for each in program.listeners]
     for name, gateway in program.table.gateways.items():
         found += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
     for owner, address in found:
-        blinds = address.value.port == discovery
-        if blinds or address.value.port in _FLOWS or address.value.port in range(discovery, discovery + _OF_DOMAIN):
-            yield Clash(owner, address.span, address.value, int(domain), blinds)
+        if is_of_ros(address.value.port, variables):
+            blinds = address.value.port == _FIRST + _OF_DOMAIN * domain
+            yield Clash(owner, address.span, address.value, domain, blinds)
+
+
+def is_of_ros(port: int, variables: Mapping[str, str]) -> bool:
+    """Return whether ROS processes with this environment may take a UDP port."""
+    if (domain := _domain(variables)) is None:
+        return False
+    return port in _FLOWS or (port - _FIRST) // _OF_DOMAIN == domain
+
+
+def _domain(variables: Mapping[str, str]) -> int | None:
+    """Return the domain; None if there is none, or ROS does not use DDS."""
+    domain = variables.get("ROS_DOMAIN_ID") or "0"
+    is_dds = not variables.get("RMW_IMPLEMENTATION", "").startswith("rmw_zenoh")
+    return int(domain) if is_dds and re.fullmatch("[0-9]{1,3}", domain) else None
 
 
 def discovers_by_multicast(variables: Mapping[str, str]) -> bool:

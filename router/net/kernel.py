@@ -164,7 +164,9 @@ def port_taken(protocol: str, port: int) -> tuple[str, str]:
     process = _process(protocol, port)
     if not _is_this(process):
         return f"{_described(process)} has the port", "stop it, or choose another port"
-    if protocol == "udp" and port >= FIRST_OF_ROS:
+    from router.net.dds import is_of_ros
+
+    if protocol == "udp" and is_of_ros(port, os.environ):
         return f"the ROS node of the router itself (pid {os.getpid()}) has the port", BELOW_ROS
     return f"the router itself (pid {os.getpid()}) has the port", "restart it, or choose another port"
 

@@ -150,10 +150,11 @@ def test_the_doctor_names_a_port_that_ros_may_take_first(tmp_path: Path, capsys:
     assert f"-> {BELOW_ROS}" in said
 
 
-def test_a_port_that_the_routers_own_node_has_is_told_as_that() -> None:
+def test_a_port_that_the_routers_own_node_has_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
+        monkeypatch.setenv("ROS_DOMAIN_ID", str((port - 7400) // 250))
         kind, why, remedy = why_not_bound("udp", port, OSError(98, "Address already in use"))
     assert (kind, remedy) == (ConfigurationError, BELOW_ROS)
     assert why == f"the ROS node of the router itself (pid {os.getpid()}) has the port"
