@@ -11,6 +11,11 @@ from router.carrier.schema import wire_kind
 from router.declared import BoardFlag, WireKind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 
+_MOST_REQUIRED = 64
+"""Required fields of a message that are checked: those that nanopb checks, unless the firmware sets another number."""
+
+_UNBOUNDED = (1 << 32) - 1
+
 
 class NativeBoards:
     """A `struct board` for each endpoint that is a board. C may use them as long as this object lives."""
@@ -49,10 +54,16 @@ class _Tree:
         self._messages.append(c.BoardMessage())
         ordered = sorted(message.items())
         counters = {number: self._counter() for number, field in ordered if field.most is not None}
-        fields = [self._field(number, field, counters.get(number, 0)) for number, field in ordered]
+        required = [number for number, field in ordered if field.is_required][:_MOST_REQUIRED]
+        bits = {number: 1 << place for place, number in enumerate(required)}
+        fields = [self._field(number, field, counters.get(number, 0), bits.get(number, 0)) for number, field in ordered]
         array = self._arrays.array(c.BoardField, fields)
         self._messages[index] = c.BoardMessage(
-            fields=array, count=len(fields), first_counter=first, counter_count=self._counters - first
+            fields=array,
+            count=len(fields),
+            first_counter=first,
+            counter_count=self._counters - first,
+            required=sum(bits.values()),
         )
         return index
 
@@ -60,7 +71,7 @@ class _Tree:
         self._counters += 1
         return self._counters - 1
 
-    def _field(self, number: int, field: BoardField, counter: int) -> c.BoardField:
+    def _field(self, number: int, field: BoardField, counter: int, required: int) -> c.BoardField:
         flags = 0
         if field.is_float:
             flags |= BoardFlag.IS_FLOAT
@@ -72,11 +83,18 @@ class _Tree:
             flags |= BoardFlag.HAS_FIXED_COUNT
         return c.BoardField(
             number=number,
-            kind=WireKind.BYTES if field.longest is not None else wire_kind(field.descriptor),
+            kind=_kind(field),
             flags=flags,
             message=self._add(field.message) if field.message is not None else 0,
-            longest=field.longest or 0,
+            longest=field.longest if field.longest is not None else _UNBOUNDED,
             most=field.most or 0,
             counter=counter,
+            required=required,
             path=self._arrays.text(field.path.encode()),
         )
+
+
+def _kind(field: BoardField) -> WireKind:
+    kind = wire_kind(field.descriptor)
+    is_opaque = kind is WireKind.STRING or (kind is WireKind.MESSAGE and field.message is None)
+    return WireKind.BYTES if is_opaque else kind

@@ -168,6 +168,7 @@ DROP_REASONS: Mapping[str, str] = {
     "publish_error": "the ROS middleware rejected it",
     "incomplete": "a frame that was not complete within its timeout, or for which there was no room",
     "superseded": "a command was held until a newer one of another route, which disarms its deadman, was sent",
+    "missing_field": "a field is missing that the board's protos declare as `required`",
     "loop": "it came from this router: stays 0, because tables with loops are rejected",
 }
 """Reasons why a message was not delivered to a target, with their meaning."""

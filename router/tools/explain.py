@@ -196,13 +196,16 @@ def _waiting(served: CheckedTarget) -> Iterator[str]:
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
     """Yield the limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
-    payload = board.fields.get(case.number)
+    payload, prefix = board.fields.get(case.number), f"{case.name}."
     fields = list(_bounded(payload.message)) if payload is not None and payload.message is not None else []
     if any(field.is_float for field in fields):
         yield "NaN and infinity allowed" if board.allows_non_finite else "no NaN or infinity"
+    beside = [field for field in board.fields.values() if field is not payload]
+    if required := [field.path.removeprefix(prefix) for field in (*fields, *beside) if field.is_required]:
+        yield f"with {', '.join(required)}"
     for field in fields:
         if sizes := list(_sizes(field)):
-            yield f"{field.path.removeprefix(f'{case.name}.')} of {', each of '.join(sizes)}"
+            yield f"{field.path.removeprefix(prefix)} of {', each of '.join(sizes)}"
 
 
 def _sizes(field: BoardField) -> Iterator[str]:

@@ -28,7 +28,7 @@ class BoardField:
 
     `longest` is the limit of a string or bytes in bytes, `most` the limit of a list in elements; None means no limit.
     With `has_fixed_length` or `has_fixed_count` the size is exactly the limit, or zero. `message` has the fields of a
-    message.
+    message. With `is_required`, the board refuses a message without the field.
     """
 
     path: str
@@ -37,6 +37,7 @@ class BoardField:
     most: int | None = None
     has_fixed_length: bool = False
     has_fixed_count: bool = False
+    is_required: bool = False
     message: BoardMessage | None = None
 
     @property
@@ -77,21 +78,22 @@ class BoardLimits:
 def board_fields(
     message: Descriptor, options_of: OptionsOf, path: str = "", inside: frozenset[Descriptor] = frozenset()
 ) -> BoardMessage:
-    """Return the fields of a message that have bounds or contain floats, at any depth.
+    """Return the fields of a message that are required, have bounds or contain floats, at any depth.
 
-    Unbounded fields are omitted: no payload case with such a field may be sent to a board.
+    Nothing in an unbounded field is checked: no payload case with such a field may be sent to a board.
     """
     fields = {}
     for descriptor in message.fields:
         options = options_of(descriptor)
-        if why_unbounded(descriptor, options):
-            continue
         name = f"{path}.{descriptor.name}" if path else descriptor.name
+        is_recursive = descriptor.message_type is not None and descriptor.message_type in inside | {message}
+        if is_recursive or why_unbounded(descriptor, options):
+            if descriptor.is_required:
+                fields[descriptor.number] = BoardField(name, descriptor, is_required=True)
+            continue
         inner: BoardMessage | None = None
         longest: int | None = None
         if descriptor.message_type is not None:
-            if descriptor.message_type in inside | {message}:
-                continue
             inner = board_fields(message_of(descriptor), options_of, name, inside | {message})
         elif descriptor.type == FieldDescriptor.TYPE_STRING:
             longest = (options.string_size or 1) - 1  # without its final NUL
@@ -104,8 +106,9 @@ def board_fields(
             most=options.max_count if descriptor.is_repeated else None,
             has_fixed_length=options.fixed_length and longest is not None,
             has_fixed_count=options.fixed_count,
+            is_required=descriptor.is_required,
             message=inner,
         )
-        if inner or longest is not None or field.most is not None or field.is_float:
+        if inner or longest is not None or field.most is not None or field.is_float or field.is_required:
             fields[descriptor.number] = field
     return fields

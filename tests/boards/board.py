@@ -20,6 +20,9 @@ from tests.acceptance.ros_peer import PATIENCE
 PARTS = Path(__file__).parent / "protos"
 """Protos with bounded strings, bytes and lists, unlike the rover's."""
 
+REQUIRED = Path(__file__).parent / "required"
+"""Protos with required fields."""
+
 _HEADERS = (Path("/usr/include"), Path("/usr/include/nanopb"))
 """nanopb's folder in Debian's packages, by version."""
 

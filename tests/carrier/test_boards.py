@@ -20,14 +20,15 @@ from router.table.model import FieldMap
 from router.types.board_limits import BoardLimits, board_fields
 from router.types.model import MessageType
 from router.types.protobuf import find_envelope, load_protos
+from tests.boards.board import REQUIRED
 from tests.compiler.compiling import SPAN, field_map, scope_of
 from tests.envelopes import I32, I64, VARINT, framed, tag, varint
-from tests.oracles.boards import NON_FINITE, TOO_LARGE, Refusal, refusal
+from tests.oracles.boards import MISSING_FIELD, NON_FINITE, TOO_LARGE, Refusal, refusal
 
 PROTOS = Path(__file__).parent / "protos_of_boards"
 TEXTS, NUMBERS, TREE = 1, 2, 3
 LONGEST = 120
-REASONS = {Loss.NON_FINITE: NON_FINITE, Loss.TOO_LARGE: TOO_LARGE}
+REASONS = {Loss.NON_FINITE: NON_FINITE, Loss.TOO_LARGE: TOO_LARGE, Loss.MISSING_FIELD: MISSING_FIELD}
 """Those of `enum loss`."""
 
 ONE = b"\0\0\x80\x3f"
@@ -38,13 +39,14 @@ WIDE_INF = bytes(6) + b"\xf0\xff"
 class Boards:
     """A board that refuses numbers that are not finite, and one that takes them; as Python and as C know them."""
 
-    def __init__(self, library: ctypes.CDLL) -> None:
+    def __init__(self, library: ctypes.CDLL, protos: Path = PROTOS) -> None:
         span = SourceSpan("a test")
-        schema = load_protos(Located(PROTOS, span), Located("PBEnvelope", span))
+        schema = load_protos(Located(protos, span), Located("PBEnvelope", span))
         self.envelope = find_envelope(schema, Located("payload", span))
         fields = board_fields(schema.descriptor("PBEnvelope"), schema.board_options)
+        longest = min(LONGEST, self.envelope.max_size)
         self.limits = {
-            name: BoardLimits(fields, LONGEST, allows) for name, allows in {"strict": False, "lenient": True}.items()
+            name: BoardLimits(fields, longest, allows) for name, allows in {"strict": False, "lenient": True}.items()
         }
         self._native = NativeBoards(self.limits)
         self._takes = library.board_takes
@@ -65,6 +67,11 @@ class Boards:
 @pytest.fixture(scope="module")
 def boards(library: ctypes.CDLL) -> Boards:
     return Boards(library)
+
+
+@pytest.fixture(scope="module")
+def requiring(library: ctypes.CDLL) -> Boards:
+    return Boards(library, REQUIRED)
 
 
 TAKEN = {
@@ -140,6 +147,55 @@ def test_what_does_not_fit_is_refused_with_field_and_bound(boards: Boards, data:
 def test_a_number_that_is_not_finite_is_refused_unless_it_is_allowed(boards: Boards, data: bytes, text: str) -> None:
     assert boards.refusal(data) == Refusal(NON_FINITE, text)
     assert boards.refusal(data, "lenient") is None
+
+
+SPEED = tag(1, I32) + ONE
+LEFT, NAME = framed(1, SPEED), framed(4, b"a")
+DRIVE, STOP = framed(1, LEFT + NAME), framed(2, b"")
+BESIDE = tag(9, VARINT) + b"\1" + framed(10, b"")
+COMPLETE = {
+    "what is required": DRIVE + BESIDE,
+    "nothing is required in it": STOP + BESIDE,
+    "a required field of zero": framed(1, framed(1, tag(1, I32) + bytes(4)) + framed(4, b"")) + BESIDE,
+    "required fields in a list": framed(1, LEFT + NAME + framed(3, SPEED) * 2) + BESIDE,
+    "two payloads with everything": STOP + DRIVE + BESIDE,
+    "in each piece": DRIVE * 2 + BESIDE,
+    "the envelope's, on both sides": BESIDE[:2] + DRIVE + BESIDE[2:],
+}
+INCOMPLETE = {
+    "a text": (framed(1, LEFT) + BESIDE, "drive.name"),
+    "a message": (framed(1, NAME) + BESIDE, "drive.left"),
+    "a number in it": (framed(1, framed(1, b"") + NAME) + BESIDE, "drive.left.speed"),
+    "a number in an optional message": (framed(1, LEFT + NAME + framed(2, b"")) + BESIDE, "drive.right.speed"),
+    "a number in a list": (framed(1, LEFT + NAME + framed(3, SPEED) + framed(3, b"")) + BESIDE, "drive.others.speed"),
+    "a number in a choice": (framed(1, LEFT + NAME + framed(5, b"")) + BESIDE, "drive.turbo.speed"),
+    "of another wire type": (framed(1, framed(1, tag(1, I64) + bytes(8)) + NAME) + BESIDE, "drive.left.speed"),
+    "everything": (framed(1, b"") + BESIDE, "drive.left"),
+    "beside the payload": (STOP + BESIDE[2:], "robot"),
+    "a text beside the payload": (STOP + BESIDE[:2], "sender"),
+    "in a payload that another one follows": (framed(1, LEFT) + STOP + BESIDE, "drive.name"),
+    "in one of two pieces": (framed(1, LEFT) + framed(1, NAME) + BESIDE, "drive.name"),
+    "in one of two pieces of a message": (framed(1, LEFT + framed(1, b"") + NAME) + BESIDE, "drive.left.speed"),
+}
+
+
+@pytest.mark.parametrize("data", COMPLETE.values(), ids=COMPLETE)
+def test_a_message_with_all_required_fields_is_taken(requiring: Boards, data: bytes) -> None:
+    assert requiring.refusal(data) is None
+
+
+@pytest.mark.parametrize(("data", "field"), INCOMPLETE.values(), ids=INCOMPLETE)
+def test_a_missing_required_field_is_named(requiring: Boards, data: bytes, field: str) -> None:
+    assert requiring.refusal(data) == Refusal(MISSING_FIELD, f"{field} is missing; the board requires it")
+
+
+def test_a_required_field_without_a_bound_may_have_any_size(library: ctypes.CDLL, tmp_path: Path) -> None:
+    for name in ("envelope.proto", "envelope.options"):
+        text = (REQUIRED / name).read_text().replace("PBEnvelope.sender", "PBEnvelope.s*  type:FT_CALLBACK")
+        (tmp_path / name).write_text(text)
+    unbounded = Boards(library, tmp_path)
+    assert unbounded.refusal(STOP + BESIDE + framed(10, bytes(20))) is None
+    assert unbounded.refusal(STOP + BESIDE[:2]) == Refusal(MISSING_FIELD, "sender is missing; the board requires it")
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
 from router.observe.reports import Reporter
 from router.table.addresses import Address
+from tests.boards.board import REQUIRED
 from tests.small_tables import BASESTATION, HEAD, MS, SECOND, SENSOR_BOARD, STRANGER, enveloped, program
 
 START = 1_750_000_000 * SECOND
@@ -195,6 +196,8 @@ LOSING = """\
 """
 LARGE = bytes.fromhex("c201") + b"\xa6\x1f" + bytes.fromhex("1005") + b"\xfa\x3e\xa0\x1f" + bytes(4000)
 """A `manual_drive` with a field of 4000 bytes that no board knows."""
+REQUIRING = b"\x0a\0"
+"""A `drive` without the fields that REQUIRED requires."""
 PART = {"frame_id": 1, "total_count": 2, "index": 0}
 
 
@@ -226,6 +229,7 @@ DROPPED: Mapping[str, Callable[[Stage], None]] = {
     "queue_full": from_board(*[enveloped(load_cell_info={"force_newtons": 1})] * 5000),
     "incomplete": from_basestation(enveloped(detected_object=PART)),
     "superseded": from_basestation(*[enveloped(manual_arm={})] * 2, enveloped(manual_drive={})),
+    "missing_field": from_basestation(REQUIRING),
 }
 REJECTED: Mapping[str, Callable[[Stage], None]] = {
     "truncated": from_board(bytes(1 << 15)),
@@ -263,7 +267,10 @@ def logged(reports: Sequence[Report]) -> Sequence[Mapping[str, Any]]:
 @pytest.mark.parametrize("reason", DROPPED)
 def test_every_loss_has_a_line_with_what_shows_it(reason: str, tmp_path: Path) -> None:
     head = HEAD.replace("trim_trailing_zeros: true", "bandwidth: 1kB/s")
-    reports = told(program(tmp_path, LOSING, head), do=DROPPED[reason])
+    made = program(tmp_path, LOSING, head)
+    if reason == "missing_field":
+        made = program(tmp_path, "  drive: {source: basestation, destinations: driving_board}\n", protos=REQUIRED)
+    reports = told(made, do=DROPPED[reason])
     lines = logged([each for each in reports if each.kind == "drop"])
     if reason in INTENDED_REASONS:
         assert not lines

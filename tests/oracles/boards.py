@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 from router.errors import plural
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.wire import GROUP, GROUP_END, I32_SIZE, I64, I64_SIZE, LEN, VARINT, encoding_of, read_varint
 
-TOO_LARGE, NON_FINITE = "too_large", "non_finite"
+TOO_LARGE, NON_FINITE, MISSING_FIELD = "too_large", "non_finite", "missing_field"
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a board cannot take a datagram: TOO_LARGE or NON_FINITE, and a text."""
+    """Why a board cannot take a datagram: TOO_LARGE, NON_FINITE or MISSING_FIELD, and a text."""
 
     reason: str
     text: str
@@ -31,21 +31,32 @@ def refusal(limits: BoardLimits, datagram: bytes) -> Refusal | None:
 
 def _refusals(limits: BoardLimits, message: bytes, fields: BoardMessage, counts: dict[str, int]) -> Iterator[Refusal]:
     """`counts` are the elements of each list so far, by path, because repeated messages are merged."""
+    present = set()
     for number, wire_type, value in wire_fields(message):
         field = fields.get(number)
         if field is None:
             continue
         elements = _elements(field, wire_type, value)
+        if elements is not None:
+            present.add(number)
         if field.most is not None and elements is not None:
             counts[field.path] = total = counts.get(field.path, 0) + len(elements)
             if total > field.most or (field.has_fixed_count and not elements):
                 yield _too_many(field.path, total, "element", field.most)
         for element in elements or ():
             yield from _of_element(limits, field, element, counts)
+    yield from _missing(fields, present)
     for field in fields.values():
         count = counts.get(field.path, 0)
         if field.most is not None and field.has_fixed_count and count not in (0, field.most):
             yield _too_many(field.path, count, "element", field.most)
+
+
+def _missing(fields: BoardMessage, present: Container[int]) -> Iterator[Refusal]:
+    """Yield the required fields that are not present. nanopb expects them in each piece of a merged message."""
+    for number, field in sorted(fields.items()):
+        if field.is_required and number not in present:
+            yield Refusal(MISSING_FIELD, f"{field.path} is missing; the board requires it")
 
 
 def _of_element(limits: BoardLimits, field: BoardField, element: bytes, counts: dict[str, int]) -> Iterator[Refusal]:

@@ -12,6 +12,7 @@ enum { MOST_LEVELS = 100 /* the limit of envelope.c */ };
 struct level {
     const uint8_t *end;
     const struct board_message *message;
+    uint64_t seen; /* required fields */
 };
 
 struct check {
@@ -61,6 +62,17 @@ static bool takes_more(struct check *check, const struct board_field *field, uin
     return true;
 }
 
+/* Whether a completely read message has all required fields. Like nanopb, this requires them in each piece of a message. */
+static bool has_required_fields(struct check *check, const struct level *level) {
+    uint64_t missing = level->message->required & ~level->seen;
+    if (!missing) return true;
+    const struct board_field *field = level->message->fields;
+    while (!(field->required & missing)) field++;
+    check->refusal->reason = LOSS_MISSING_FIELD;
+    snprintf(check->refusal->text, sizeof check->refusal->text, "%s is missing; the board requires it", field->path);
+    return false;
+}
+
 /* Whether the lists of a completely read message have all their elements. */
 static bool has_all_elements(struct check *check, const struct board_message *message) {
     for (uint32_t index = 0; index < message->count; index++) {
@@ -104,7 +116,7 @@ static bool enter(struct check *check, const struct board_field *field, const ui
     if (check->depth == MOST_LEVELS) return too_large(check, field->path, MOST_LEVELS + 1, "level", MOST_LEVELS);
     if (field->flags & BOARD_IS_REPEATED)
         memset(&check->counts[message->first_counter], 0, message->counter_count * sizeof *check->counts);
-    check->levels[++check->depth] = (struct level){end, message};
+    check->levels[++check->depth] = (struct level){.end = end, .message = message};
     check->rest.end = end;
     return true;
 }
@@ -115,7 +127,19 @@ static bool takes_len(struct check *check, const struct board_field *field, stru
         check->rest.at = value.at;
         return takes_more(check, field, 1) && enter(check, field, value.end);
     case WIRE_BYTES: return takes_more(check, field, 1) && takes_length(check, field, left(&value));
-    default: return !(field->flags & BOARD_IS_REPEATED) || takes_packed(check, field, value);
+    default: return takes_packed(check, field, value);
+    }
+}
+
+/* Whether a field has the declared wire type. Otherwise protobuf skips it. */
+static bool is_known(const struct board_field *field, uint32_t wire_type) {
+    if (!field) return false;
+    switch (wire_type) {
+    case VARINT: return field->kind == WIRE_VARINT;
+    case I64: return field->kind == WIRE_I64;
+    case I32: return field->kind == WIRE_I32;
+    case LEN: return field->kind == WIRE_MESSAGE || field->kind == WIRE_BYTES || field->flags & BOARD_IS_REPEATED;
+    default: return false;
     }
 }
 
@@ -124,16 +148,14 @@ static bool takes_field(struct check *check) {
     struct bytes value;
     /* Neither fails, as the envelope is well formed. */
     if (!read_tag(&check->rest, &tag) || !read_value(&check->rest, tag & 7, &value)) return true;
-    const struct board_field *field = find_field(check->levels[check->depth].message, tag >> 3);
-    if (!field) return true;
+    struct level *level = &check->levels[check->depth];
+    const struct board_field *field = find_field(level->message, tag >> 3);
+    if (!is_known(field, tag & 7)) return true;
+    level->seen |= field->required;
     switch (tag & 7) {
     case LEN: return takes_len(check, field, value);
-    case VARINT: return field->kind != WIRE_VARINT || takes_more(check, field, 1);
-    case I64:
-        return field->kind != WIRE_I64 || (takes_more(check, field, 1) && takes_number(check, field, value.at));
-    case I32:
-        return field->kind != WIRE_I32 || (takes_more(check, field, 1) && takes_number(check, field, value.at));
-    default: return true;
+    case VARINT: return takes_more(check, field, 1);
+    default: return takes_more(check, field, 1) && takes_number(check, field, value.at);
     }
 }
 
@@ -142,7 +164,8 @@ static bool takes_fields(struct check *check) {
         if (check->rest.at < check->rest.end) {
             if (!takes_field(check)) return false;
         } else {
-            if (!has_all_elements(check, check->levels[check->depth].message)) return false;
+            const struct level *level = &check->levels[check->depth];
+            if (!has_required_fields(check, level) || !has_all_elements(check, level->message)) return false;
             if (check->depth == 0) return true;
             check->rest.end = check->levels[--check->depth].end;
         }
@@ -157,6 +180,6 @@ bool board_takes(const struct board *board, const uint8_t *data, size_t size, st
     memset(check.counts, 0, board->messages->counter_count * sizeof *check.counts);
     check.rest = (struct bytes){data, data + size};
     check.depth = 0;
-    check.levels[0] = (struct level){data + size, board->messages};
+    check.levels[0] = (struct level){.end = data + size, .message = board->messages};
     return takes_fields(&check);
 }

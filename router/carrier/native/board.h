@@ -1,7 +1,7 @@
 /* Checks datagrams for boards, whose firmware decodes with nanopb into structures of a fixed size.
  *
- * The checks cover the sizes of the envelope, of strings and bytes, the number of elements, and that numbers are finite.
- * They do not cover other data that nanopb rejects: a field with a wrong wire type, an integer with more bits than its
+ * The checks cover the sizes of the envelope, of strings and bytes, the number of elements, that numbers are finite, and
+ * that no required field is missing. They do not cover other data that nanopb rejects: a field with a wrong wire type, an integer with more bits than its
  * field, a negative number in an enum that declares none, an unknown group. tests/oracles/boards.py is a second
  * implementation. */
 #ifndef BOARD_H
@@ -32,6 +32,7 @@ struct board_field {
     uint32_t most;
     uint32_t counter; /* of elements */
     uint32_t reserved;
+    uint64_t required; /* its bit among the required fields of its message, or 0 */
     const char *path; /* from the payload case on: "arm_ctrl.name" */
 };
 
@@ -42,6 +43,7 @@ struct board_message {
     uint32_t count;
     uint32_t first_counter, counter_count;
     uint32_t reserved;
+    uint64_t required; /* the bits of its required fields: of the first 64 ones, like nanopb */
 };
 
 struct board {
@@ -51,7 +53,7 @@ struct board {
 };
 
 struct board_refusal {
-    enum loss reason; /* LOSS_TOO_LARGE or LOSS_NON_FINITE */
+    enum loss reason; /* LOSS_TOO_LARGE, LOSS_NON_FINITE or LOSS_MISSING_FIELD */
     char text[256];
 };
 

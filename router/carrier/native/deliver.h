@@ -6,7 +6,7 @@
  *     age         `ttl`                                               else stale
  *     rate        `max_rate`                                          else rate_limited
  *     message     the output of its routine, or the envelope as it was received
- *     board       the limits of the firmware                          else too_large or non_finite
+ *     board       what the firmware can decode                        else too_large, non_finite, missing_field
  *     defer       `on_limit: latest` and `bandwidth` (defer.h)
  *     send or publish, and feed deadmen
  *
