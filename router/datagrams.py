@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
+from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
@@ -16,7 +18,7 @@ from router.table.model import RouteTable
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
-from router.types.wire import read_varint
+from router.types.wire import LEN, read_varint
 
 Peer = tuple[str, int]
 """The IP address and port of a sender."""
@@ -24,11 +26,15 @@ Peer = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A payload and its case. `zeros` is the number of trailing zeros restored, or removed if negative."""
+    """A payload and its case. `zeros` is the number of trailing zeros restored, or removed if negative.
+
+    `superseded` has the cases of other payloads before it.
+    """
 
     case: PayloadCase
     message: Message
     zeros: int
+    superseded: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,8 @@ class Wire:
         if name is None:
             reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
-        return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram))
+        *superseded, _ = payloads(self.envelope, whole, repairs=False)
+        return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram), superseded)
 
 
 def wire_of_table(table: RouteTable) -> Wire:
@@ -119,6 +126,17 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
     if name is not None:
         return str(name)
     return _why_no_payload(envelope, outer, whole)[1]
+
+
+def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
+    """Return the payload cases of a datagram in order. The last one is its payload; consecutive pieces count as one.
+
+    Raises protobuf's DecodeError.
+    """
+    names = {case.number: case.name for case in envelope.cases.values()}
+    fields = UnknownFieldSet(Empty.FromString(restored(data) if repairs else data))
+    members = [fields[index].field_number for index in range(len(fields)) if fields[index].wire_type == LEN]
+    return [name for name, _ in groupby(names[number] for number in members if number in names)]
 
 
 def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tuple[str, str]:

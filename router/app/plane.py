@@ -27,7 +27,7 @@ from router.carrier.mirror import MirrorRing
 from router.carrier.outlets import Outlets, Publication
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
-from router.carrier.reasons import where_refused, why_rejected
+from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.carrier.ros_routes import NativeFromRos, Subscription, native_from_ros
 from router.carrier.sender import NativeSender
 from router.carrier.state import State
@@ -116,7 +116,7 @@ class Plane:
         for thread in threads:
             counts.add_thread(thread)
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
-        reader = EventReader(self._names, self._why_rejected, self._where_refused)
+        reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
         self._events = EventThread(threads, reader, reporter.report, of_deadmen, self._pulse)
 
     @property
@@ -340,6 +340,10 @@ class Plane:
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
         newest = next(reversed(self._programs.values()), None)
         return why_rejected(newest, listener, data, length) if newest is not None else ""
+
+    def _superseded(self, listener: str, data: bytes) -> str:
+        newest = next(reversed(self._programs.values()), None)
+        return superseded(newest, listener, data) if newest is not None else ""
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" if an earlier program refused the message."""

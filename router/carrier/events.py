@@ -14,7 +14,7 @@ from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
-from router.declared import NO_NAME, AnswerEvent, DeadmanEvent, EventHead, EventKind, LostEvent, Reason, RejectedEvent
+from router.declared import NO_NAME, AnswerEvent, DatagramEvent, DeadmanEvent, EventHead, EventKind, LostEvent, Reason
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
@@ -42,23 +42,26 @@ DeadmanEvents = Union[DeadmanChange, Answer, Evidence]
 class EventReader:
     """Converts records of `native/events.h` to reports.
 
-    `detail(listener, data, length)` describes why a datagram was rejected. `place(route, topic, target, generation,
+    `why_rejected(listener, data, length)` describes why a datagram was rejected, and `superseded(listener, data)` the
+    payloads of one that has several. `place(route, topic, target, generation,
     place)` returns the place of the table that refused a message of `topic` (None: a datagram), or "".
     """
 
     def __init__(
         self,
         names: Names,
-        detail: Callable[[str, bytes, int], str],
+        why_rejected: Callable[[str, bytes, int], str],
+        superseded: Callable[[str, bytes], str],
         place: Callable[[str, str | None, str, int, int], str],
     ) -> None:
         self._name = names.name
-        self._detail = detail
+        self._why_rejected = why_rejected
+        self._superseded = superseded
         self._place = place
 
     def read(self, kind: int, record: memoryview) -> DeadmanEvents | CountedReport:
-        if kind == EventKind.REJECTED:
-            return self._rejected(record)
+        if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
+            return self._of_datagram(record)
         if kind == EventKind.LOST:
             return self._lost(record)
         if kind in {EventKind.OBEYED, EventKind.DISOBEYED, EventKind.EVIDENCE}:
@@ -80,11 +83,16 @@ class EventReader:
             return Evidence(*place, bytes(record[begin : begin + event.after]))
         return Answer(*place, kind == EventKind.OBEYED, event.after)
 
-    def _rejected(self, record: memoryview) -> CountedReport:
-        event, begin = RejectedEvent.from_buffer(record), ctypes.sizeof(RejectedEvent)
+    def _of_datagram(self, record: memoryview) -> CountedReport:
+        event, begin = DatagramEvent.from_buffer(record), ctypes.sizeof(DatagramEvent)
         place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
-        host, what = inet_ntoa(event.address.to_bytes(4, "big")), self._detail(place, data, event.length)
-        detail = f"from {host}:{event.port}" + (f": {what}" if what else "")
+        host = inet_ntoa(event.address.to_bytes(4, "big"))
+        sender = f"from {host}:{event.port}"
+        if event.kind == EventKind.SUPERSEDED:
+            detail = f"{sender}: {self._superseded(place, data)}"
+            return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))
+        what = self._why_rejected(place, data, event.length)
+        detail = sender + (f": {what}" if what else "")
         mismatch = Mismatch(place, host, what) if event.reason == Reason.SOURCE_MISMATCH else None
         report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
         return CountedReport(event.counter, report)

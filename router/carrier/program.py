@@ -120,6 +120,7 @@ class _Writer:
             received=counters.index("datagrams_received", name),
             received_bytes=counters.index("received_bytes", name),
             padded=counters.index("datagrams_padded", name),
+            superseded=counters.index("superseded_members", name),
             rejected=tuple(rejected),
         )
 

@@ -29,6 +29,14 @@ def why_rejected(program: Program, listener: str, data: bytes, length: int) -> s
     return datagrams.why_rejected(program.envelope, data, length, repairs=repairs)
 
 
+def superseded(program: Program, listener: str, data: bytes) -> str:
+    """Describe the payloads of a datagram that has several: `manual_drive, then drive_motor`."""
+    plan = program.table.listeners.get(listener)
+    if plan is None:
+        return ""
+    return ", then ".join(datagrams.payloads(program.envelope, data, repairs=plan.framing is Framing.ZERO_TRIMMED))
+
+
 def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, place: int) -> str:
     """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
     if topic is not None:

@@ -18,7 +18,7 @@ from router.carrier.events import CountedReport, DeadmanEvents, EventReader
 from router.carrier.names import Names
 from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
-from router.carrier.reasons import where_refused, why_rejected
+from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.carrier.ros_routes import NativeFromRos, native_from_ros
 from router.carrier.state import State
 from router.compiler.program import Program
@@ -65,7 +65,7 @@ class Stage:
         self._library = library
         self._names = Names()
         self._opened = _Opened(library, now)
-        self._reader = EventReader(self._names, self._why_rejected, self._where_refused)
+        self._reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
         self._generation = 0
         # Keep open objects out of garbage collection, which would free them in any order.
         finalize(self, self._opened.close)
@@ -160,6 +160,9 @@ class Stage:
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
         return why_rejected(self._in_use.program, listener, data, length)
+
+    def _superseded(self, listener: str, data: bytes) -> str:
+        return superseded(self._in_use.program, listener, data)
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" for messages held since an earlier program."""

@@ -52,6 +52,12 @@ METRICS = (
     Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
     Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is missing."),
     Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were restored or removed."),
+    Metric(
+        "superseded_members",
+        "counter",
+        ("listener",),
+        "Payloads that another one in the same datagram replaced: of a oneof, the last member counts.",
+    ),
     Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route accepted, by reason."),
     Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),
     Metric("messages_received", "counter", ("route", "source"), "Messages that a route accepted, by source."),
@@ -259,10 +265,11 @@ class Mismatch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A loss. `kind` is `drop` (for one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
+    """A loss. `kind` is `drop` (for one target), `reject` (of a whole datagram), `supersede` (of a payload that a later
+    one in its datagram replaces) or `deadman` (of its own datagram).
 
-    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is the number of such
-    losses since the last report. `mismatch` is set for the reason `source_mismatch`.
+    `place` is the route, or the listener for a reject or supersede, which have an empty `target`. `times` is the number
+    of such losses since the last report. `mismatch` is set for the reason `source_mismatch`.
     """
 
     kind: str

@@ -52,7 +52,14 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
     for listener in table.listeners:
         _open(
             counters,
-            ("datagrams_received", "received_bytes", "kernel_drops", "listener_waiting", "datagrams_padded"),
+            (
+                "datagrams_received",
+                "received_bytes",
+                "kernel_drops",
+                "listener_waiting",
+                "datagrams_padded",
+                "superseded_members",
+            ),
             listener,
         )
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)

@@ -125,6 +125,13 @@ class Kind(enum.Enum):
         "datagrams_rejected",
         0.05,
     )
+    MEMBERS_SUPERSEDED = (
+        Level.WARNING,
+        "{listener} receives datagrams with several payloads, of which only the last one counts",
+        "Send each payload in a datagram of its own; the log names the senders and the payloads.",
+        "superseded_members",
+        0.05,
+    )
     UNHANDLED_CASE = (
         Level.WARNING,
         "{payload_case} is received but has no route",

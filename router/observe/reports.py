@@ -64,6 +64,16 @@ class Reporter:
                 detail=report.detail,
             )
             return
+        if report.kind == "supersede":
+            self._floods.note(
+                (report.place, report.kind),
+                logger.warning,
+                "datagram has several payloads; only the last one counts",
+                times=report.times,
+                listener=report.place,
+                detail=report.detail,
+            )
+            return
         if report.kind == "drop":
             self._lost[report.place, report.target] = boottime_ns(), report
         event = "message dropped" if report.kind == "drop" else "deadman could not send"

@@ -35,6 +35,7 @@ PATHS = {
     "datagrams_received": "listeners {listener} received",
     "received_bytes": "listeners {listener} bytes",
     "kernel_drops": "listeners {listener} kernel_drops",
+    "superseded_members": "listeners {listener} superseded",
     "datagrams_rejected": "listeners {listener} rejected {reason}",
 }
 """The place of each metric in `numbers`: keys, and labels in braces."""
@@ -44,6 +45,7 @@ IF_ANY = {
     "messages_filtered",
     "messages_collected",
     "client_messages_dropped",
+    "superseded_members",
     "datagrams_rejected",
 }
 """Metrics that are omitted while they are 0."""

@@ -17,11 +17,11 @@ from router.recording.reader import Recorded
 from router.rehearsal import cdr
 from router.rehearsal.describing import TableIndex
 from router.rehearsal.fields import leaves
-from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Rehearsal, Rejected, Sent
+from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Rehearsal, Rejected, Sent, Superseded
 
 Delivery = Union[Sent, Published]
 Loss = tuple[str, str, str, str]
-"""What was done (dropped, withheld, rejected), where (a route or a listener), for which target, and why."""
+"""What was done (dropped, withheld, rejected, superseded), where (a route or a listener), for which target, and why."""
 
 
 @dataclass(slots=True)
@@ -173,6 +173,8 @@ def _loss(event: Event) -> Loss | None:
             return "withheld", event.route, event.target, "when"
         case Rejected():
             return "rejected", event.listener, "", event.reason
+        case Superseded():
+            return "superseded", event.listener, "", "by a later payload"
     return None
 
 

@@ -27,6 +27,7 @@ from router.rehearsal.rehearsal import (
     Received,
     Rejected,
     Sent,
+    Superseded,
 )
 from router.types.model import MessageType
 
@@ -166,6 +167,8 @@ class EventDescriber:
                 return f"{at}{event.route} takes a message from {event.source}"
             case Rejected():
                 return f"{at}{event.listener} rejects a datagram as {event.reason}{in_brackets(event.detail)}"
+            case Superseded():
+                return f"{at}{event.listener} uses only the last payload of a datagram{in_brackets(event.detail)}"
             case DeadmanChanged() | Obeyed() | Disobeyed():
                 return at + _of_deadman(event)
         raise AssertionError(event)

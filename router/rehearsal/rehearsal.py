@@ -93,6 +93,14 @@ class Rejected(Event):
 
 
 @dataclass(frozen=True, slots=True)
+class Superseded(Event):
+    """A datagram has several payloads; protobuf keeps only the last one."""
+
+    listener: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class DeadmanChanged(Event):
     """A route's deadman tripped, or was released."""
 
@@ -125,6 +133,7 @@ EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
     "messages_dropped": lambda at, labels, _: Dropped(at, *labels),
     "messages_filtered": lambda at, labels, _: Filtered(at, *labels),
     "messages_collected": lambda at, labels, _: Collected(at, *labels),
+    "superseded_members": lambda at, labels, _: Superseded(at, *labels),
     "datagrams_rejected": lambda at, labels, _: Rejected(at, *labels),
 }
 """For each metric whose count is an event: a function from time, label values, and the last bytes to that event."""
@@ -221,7 +230,7 @@ class Rehearsal:
     def _report(self, detail: str) -> None:
         """Add what is reported about the last count to its event."""
         event = self.events[-1]
-        if isinstance(event, (Dropped, Rejected)):
+        if isinstance(event, (Dropped, Rejected, Superseded)):
             self.events[-1] = replace(event, detail=detail)
 
 

@@ -126,6 +126,8 @@ class TappedDatagram:
         line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
         if self.decoded.zeros:
             line += f" ({self._repair(self.decoded.zeros)})"
+        if self.decoded.superseded:
+            line += f" (superseded: {', '.join(self.decoded.superseded)})"
         return f"{line} [{self.data.hex()}]" if with_hex else line
 
     def _repair(self, zeros: int) -> str:
@@ -142,6 +144,8 @@ class TappedDatagram:
             document["case"] = self.decoded.case.name
             document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
             document["zeros_restored"] = self.decoded.zeros
+            if self.decoded.superseded:
+                document["superseded"] = self.decoded.superseded
         if with_hex or self.decoded is None:
             document["hex"] = self.data.hex()
         return json.dumps(document)

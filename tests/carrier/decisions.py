@@ -71,7 +71,7 @@ class CarrierSide:
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
         schema, envelope = self._schema, self._envelope
         code = self._read(ctypes.byref(schema), self._buffer, len(data), repairs, ctypes.byref(envelope))
-        return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
+        return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired, envelope.superseded)
 
     def whole(self) -> bytes:
         """The envelope read last, restored."""

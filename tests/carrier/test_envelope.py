@@ -96,8 +96,8 @@ def grouped(depth: int) -> bytes:
     return tag(99, GROUP) * depth + tag(99, GROUP_END) * depth
 
 
-def case(number: int, is_repaired: bool = False) -> Decision:
-    return Decision(None, number, is_repaired)
+def case(number: int, is_repaired: bool = False, superseded: int = 0) -> Decision:
+    return Decision(None, number, is_repaired, superseded)
 
 
 MALFORMED = Decision("malformed", 0, False)
@@ -153,7 +153,7 @@ MALFORMED = Decision("malformed", 0, False)
         pytest.param(tag(3, VARINT) + b"\1" + framed(TREE, nested(100)), MALFORMED, id="too deep beside a field"),
         pytest.param(framed(TREE, nested(100)) + b"\0", MALFORMED, id="too deep for a padded one"),
         pytest.param(framed(TREE, nested(99) + grouped(100)), case(TREE), id="both"),
-        pytest.param(framed(TREE, b"") + framed(TEXTS, b""), case(TEXTS), id="the last case counts"),
+        pytest.param(framed(TREE, b"") + framed(TEXTS, b""), case(TEXTS, superseded=1), id="the last case counts"),
         pytest.param(framed(TREE, b"\x0a\x01") + framed(TEXTS, b""), MALFORMED, id="the others have to be sound"),
         pytest.param(framed(TREE, b"\x0a\x00") + framed(TREE, b""), case(TREE), id="a payload in pieces"),
         pytest.param(framed(7, b"") + framed(TREE, b"") + framed(6, b"x"), case(TREE), id="another oneof"),

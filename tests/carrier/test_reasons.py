@@ -231,6 +231,7 @@ DROPPED: Mapping[str, Callable[[Stage], None]] = {
     "superseded": from_basestation(*[enveloped(manual_arm={})] * 2, enveloped(manual_drive={})),
     "missing_field": from_basestation(REQUIRING),
 }
+BRAKE, DRIVE = enveloped(manual_brake={"brake": True}), enveloped(manual_drive={"forward_backward": 5})
 REJECTED: Mapping[str, Callable[[Stage], None]] = {
     "truncated": from_board(bytes(1 << 15)),
     "empty": from_board(b""),
@@ -241,6 +242,14 @@ REJECTED: Mapping[str, Callable[[Stage], None]] = {
     "ignored": from_board(enveloped(pump_info={})),
     "source_mismatch": lambda stage: stage.datagram("exact", STRANGER, GPS, START),
 }
+SUPERSEDED: Mapping[str, tuple[bytes, int, str]] = {
+    "before a routed one": (BRAKE + DRIVE, 1, "manual_brake, then manual_drive"),
+    "in pieces": (DRIVE + DRIVE + BRAKE + BRAKE, 1, "manual_drive, then manual_brake"),
+    "by one that comes again": (DRIVE + BRAKE + DRIVE, 2, "manual_drive, then manual_brake, then manual_drive"),
+    "by one without a route": (DRIVE + BRAKE, 1, "manual_drive, then manual_brake"),
+    "by one that is ignored": (DRIVE + enveloped(pump_info={}), 1, "manual_drive, then pump_info"),
+}
+"""What a datagram has, the number of its superseded payloads, and what is told of them."""
 WITHOUT_A_STAGE = {
     "send_buffer_full": LostEvent(error=errno.EAGAIN),
     "send_error": LostEvent(error=errno.EACCES),
@@ -290,7 +299,8 @@ def test_so_has_every_loss_on_the_way_out(reason: str) -> None:
     event.size, event.kind, event.reason = sizeof(event), EventKind.LOST, LOSSES.index(reason)
     event.route, event.target = names.number("gps_info"), names.number("basestation")
     why = b"" if event.error else b"no memory\0"
-    read = EventReader(names, lambda *_: "", lambda *_: "").read(EventKind.LOST, memoryview(bytearray(event) + why))
+    reader = EventReader(names, lambda *_: "", lambda *_: "", lambda *_: "")
+    read = reader.read(EventKind.LOST, memoryview(bytearray(event) + why))
     assert isinstance(read, CountedReport)
     (line,) = logged([read.report])
     assert (line["route"], line["target"], line["reason"]) == ("gps_info", "basestation", reason)
@@ -307,3 +317,33 @@ def test_every_rejection_has_a_line_with_its_sender(reason: str, tmp_path: Path)
     assert (line["event"], line["reason"]) == ("datagram rejected", reason)
     assert line["listener"] in {"exact", "trimmed"}
     assert str(line["detail"]).startswith("from 192.168.0.")
+
+
+@pytest.mark.parametrize("name", SUPERSEDED)
+def test_payloads_that_a_later_one_replaces_are_counted_and_told_with_their_sender(name: str, tmp_path: Path) -> None:
+    data, count, payloads = SUPERSEDED[name]
+    made = program(tmp_path, LOSING)
+    stage = Stage(library(), START)
+    stage.adopt(made)
+    stage.datagram("exact", BASESTATION, data, START)
+    reports = [record.report for record in stage.records() if isinstance(record, CountedReport)]
+    host, port = BASESTATION
+    (line,) = logged([each for each in reports if each.kind == "supersede"])
+    assert line["event"] == "datagram has several payloads; only the last one counts"
+    assert (line["listener"], line["detail"]) == ("exact", f"from {host}:{port}: {payloads}")
+    assert stage.counters(made.counters.size)[made.counters.index("superseded_members", "exact")] == count
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(DRIVE, id="one payload"),
+        pytest.param(DRIVE + DRIVE, id="one in two pieces"),
+        pytest.param(DRIVE + b"\xea\x77\x00" + DRIVE, id="with an unknown field between them"),
+        pytest.param(DRIVE + b"\xea\x77\x00", id="with an unknown field after it"),
+        pytest.param(bytes.fromhex("0805") + DRIVE, id="after a case of the wrong wire type"),
+    ],
+)
+def test_one_payload_supersedes_none(data: bytes, tmp_path: Path) -> None:
+    reports = told(program(tmp_path, LOSING), do=lambda stage: stage.datagram("exact", BASESTATION, data, START))
+    assert reports == []

@@ -68,6 +68,11 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
         ("messages_waiting imu_info imu_data", 20, None),
         ("messages_dropped imu_info imu_data rate_limited", 9, None),
         ("datagrams_rejected rover malformed", 9, "rover rejects datagrams: malformed, 9 in 2 s"),
+        (
+            "superseded_members rover",
+            9,
+            "rover receives datagrams with several payloads, of which only the last one counts, 9 in 2 s",
+        ),
         ("datagrams_rejected rover ignored", 9, None),
         ("datagrams_rejected rover unhandled", 9, None),  # the next one says it
         ("unhandled arm_diag", 9, "arm_diag is received but has no route, 9 in 2 s"),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
+from itertools import groupby
 
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.types.framing import restored
 from router.types.protobuf import Envelope
+from router.types.wire import LEN
+from tests.oracles.boards import wire_fields
 
 
 @dataclass(frozen=True)
@@ -17,12 +20,14 @@ class Decision:
     """The decision about a datagram before the sender is checked.
 
     If `reason` is None, `number` is the payload case, which may have no route. For `unknown_case` and `malformed`,
-    `number` is the offending field or 0. `is_repaired`: the datagram counts as padded.
+    `number` is the offending field or 0. `is_repaired`: the datagram counts as padded. `superseded`: the number of
+    payloads before the last one, pieces of one counted once.
     """
 
     reason: str | None
     number: int
     is_repaired: bool
+    superseded: int = 0
 
 
 def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, repairs: bool) -> Decision:
@@ -39,7 +44,7 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
         return Decision(None, number, False) if number else Decision("malformed", 0, False)
     is_repaired = len(whole) != len(data)
     if name := parsed.WhichOneof(envelope.oneof):
-        return Decision(None, envelope.cases[name].number, is_repaired)
+        return Decision(None, envelope.cases[name].number, is_repaired, _superseded(envelope, whole))
     fields = UnknownFieldSet(parsed)
     unknown = [fields[index].field_number for index in range(len(fields))]
     if not unknown:
@@ -47,6 +52,12 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     cases = {case.number for case in envelope.cases.values()}
     mistyped = [number for number in unknown if number in cases]
     return Decision("malformed" if mistyped else "unknown_case", [*mistyped, *unknown][0], is_repaired)
+
+
+def _superseded(envelope: Envelope, whole: bytes) -> int:
+    cases = {case.number for case in envelope.cases.values()}
+    payloads = [number for number, wire_type, _ in wire_fields(whole) if wire_type == LEN and number in cases]
+    return len(list(groupby(payloads))) - 1
 
 
 def _only_payload(envelope: Envelope, routed: Container[int], data: bytes) -> int | None:

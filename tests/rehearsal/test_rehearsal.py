@@ -13,7 +13,7 @@ import pytest
 from router.app import Router
 from router.compiler import check_table
 from router.datagrams import Wire, wire_of_protos
-from router.rehearsal.rehearsal import START, Filtered, Received, Rehearsal, Rejected, Sent
+from router.rehearsal.rehearsal import START, Filtered, Received, Rehearsal, Rejected, Sent, Superseded
 from router.values import payload
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import wait_until
@@ -75,7 +75,7 @@ routes:
 
 
 def mixed(wire: Wire, count: int) -> list[bytes]:
-    """Good ones, trimmed and padded ones, and such as are none; the same in every run."""
+    """Good ones, trimmed and padded ones, some with two payloads, and such as are none; the same in every run."""
     chance = random.Random(6)
     made = []
     for _ in range(count):
@@ -83,7 +83,11 @@ def mixed(wire: Wire, count: int) -> list[bytes]:
         words = [f"accel_x={chance.choice([0, 1, 5])}"] if case == "imu_info" else []
         data = wire.encode(wire.case(case), payload(wire.case(case), words))
         data = chance.choice([data, data, data.rstrip(b"\0"), data.ljust(40, b"\0"), data[:-1] + b"\xff", b"\xff\x01"])
-        made.append(data)
+        made.append(
+            wire.encode(wire.case("ph_info"), payload(wire.case("ph_info"), [])) + data
+            if chance.random() < 0.1
+            else data
+        )
     return made
 
 
@@ -122,5 +126,6 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
         assert router.total("datagrams_sent") == kinds[Sent]
         assert router.total("messages_filtered") == kinds[Filtered]
         assert router.total("datagrams_rejected") == kinds[Rejected]
+        assert router.total("superseded_members") == kinds[Superseded] > 0
         assert router.total("messages_dropped") > 0
-        assert len(kinds) >= 5
+        assert len(kinds) >= 6

@@ -32,6 +32,13 @@ def test_repairs_are_told(wire: Wire) -> None:
     assert tapped_datagram(0, "board", b"\x12\0\0\0", wire).line(with_hex=False).endswith("(padded: 2 zeros removed)")
 
 
+def test_payloads_that_the_last_one_replaces_are_told(wire: Wire) -> None:
+    other = wire.encode(wire.case("plain"), payload(wire.case("plain"), []))
+    told = tapped_datagram(0, "board", other + datagram(wire, "i32=5"), wire)
+    assert told.line(with_hex=False).endswith("every_kind i32=5 (superseded: plain)")
+    assert json.loads(told.json(with_hex=False))["superseded"] == ["plain"]
+
+
 def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> None:
     told = tapped_datagram(0, "127.0.0.1:5", b"\xff\xff", wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == (

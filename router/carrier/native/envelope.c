@@ -148,6 +148,7 @@ static int find_case(const struct wire_schema *schema, const uint8_t *data, stru
         if (is_case && wire_type == LEN) {
             pieces = number == envelope->case_number ? pieces + 1 : 1;
             if (pieces == 1) first = begin;
+            if (pieces == 1 && envelope->case_number != 0) envelope->superseded++;
             envelope->case_number = number;
             envelope->start = pieces == 1 ? (uint32_t)(value.at - data) : first;
             envelope->length = (uint32_t)(value.end - data) - envelope->start;

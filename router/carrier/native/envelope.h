@@ -42,6 +42,7 @@ struct envelope {
     uint32_t case_number;
     uint32_t size;          /* with restored trailing zeros, without padding */
     uint32_t start, length; /* of the payload, or from the tag of its first piece to the end of its last one */
+    uint32_t superseded;    /* payloads before it, of other cases: protobuf keeps only the last member of a oneof */
     bool is_single;         /* the payload is in one piece */
     bool is_repaired;       /* `size` differs from that of the datagram; counted as padded, even without a payload */
 };

@@ -10,6 +10,7 @@ enum event_kind {
     EVENT_RELEASED,
     EVENT_DEADMAN_ERROR,
     EVENT_REJECTED,
+    EVENT_SUPERSEDED,
     EVENT_LOST,
     EVENT_OBEYED,
     EVENT_DISOBEYED,
@@ -35,12 +36,12 @@ struct answer_event {
     int64_t after;       /* ns since the deadman tripped; for evidence, the length of the datagram */
 };
 
-struct rejected_event {
-    uint32_t size, kind;      /* EVENT_REJECTED; the datagram follows, cut to MAX_DATAGRAM bytes */
-    uint32_t listener, reason; /* enum reason */
+struct datagram_event {
+    uint32_t size, kind;      /* EVENT_REJECTED or EVENT_SUPERSEDED; the datagram follows, cut to MAX_DATAGRAM bytes */
+    uint32_t listener, reason; /* enum reason, if it was rejected */
     uint32_t address, port;   /* of the sender, host byte order */
     uint32_t length;          /* of the datagram */
-    uint32_t counter;         /* of such rejections */
+    uint32_t counter;         /* of such rejections, or of superseded payloads */
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

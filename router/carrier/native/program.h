@@ -62,8 +62,7 @@ struct listener {
     const struct peer *peers; /* by address; for one address, those with a port first */
     const struct choice *choices; /* `columns` for each row; the last one is for strangers */
     uint32_t peer_count, columns;
-    uint32_t received, received_bytes, padded, rejected[REASONS]; /* counters */
-    uint32_t reserved;
+    uint32_t received, received_bytes, padded, superseded, rejected[REASONS]; /* counters */
 };
 
 struct program {

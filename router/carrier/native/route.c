@@ -8,22 +8,30 @@
 
 /* ---- events ---- */
 
-static void reject(struct routing *routing, const struct received *received, enum reason reason) {
-    const struct listener *listener = received->listener;
-    stage_count(&routing->stage, listener->rejected[reason], 1);
-    if (reason == IGNORED || !may_report(&routing->stage.reporter, received->now)) return;
-    struct rejected_event *event = (struct rejected_event *)routing->record;
+static void report(struct routing *routing, const struct received *received, struct datagram_event about) {
+    if (!may_report(&routing->stage.reporter, received->now)) return;
+    struct datagram_event *event = (struct datagram_event *)routing->record;
     size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
-    *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
-                                     .kind = EVENT_REJECTED,
-                                     .listener = listener->id,
-                                     .reason = reason,
-                                     .address = received->address,
-                                     .port = received->port,
-                                     .length = (uint32_t)received->length,
-                                     .counter = listener->rejected[reason]};
+    *event = about;
+    event->size = padded_to_word(sizeof *event + kept);
+    event->listener = received->listener->id;
+    event->address = received->address;
+    event->port = received->port;
+    event->length = (uint32_t)received->length;
     memcpy(event + 1, routing->datagram, kept);
     ring_put(routing->stage.reporter.events, event, event->size);
+}
+
+static void reject(struct routing *routing, const struct received *received, enum reason reason) {
+    struct datagram_event event = {.kind = EVENT_REJECTED, .reason = reason, .counter = received->listener->rejected[reason]};
+    stage_count(&routing->stage, event.counter, 1);
+    if (reason != IGNORED) report(routing, received, event);
+}
+
+static void report_superseded(struct routing *routing, const struct received *received) {
+    struct datagram_event event = {.kind = EVENT_SUPERSEDED, .counter = received->listener->superseded};
+    stage_count(&routing->stage, event.counter, received->envelope.superseded);
+    report(routing, received, event);
 }
 
 /* ---- targets ---- */
@@ -177,6 +185,7 @@ int route_datagram(struct routing *routing, struct received *received) {
     int reason = envelope_read(routing->program->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
     if (received->envelope.is_repaired) stage_count(&routing->stage, listener->padded, 1);
+    if (received->envelope.superseded) report_superseded(routing, received);
     if (reason == UNKNOWN_CASE) stage_count(&routing->stage, routing->program->unknown_case, 1);
     if (reason == ROUTED) reason = route(routing, find_case(routing->program, received->envelope.case_number), received);
     if (reason != ROUTED) reject(routing, received, (enum reason)reason);
