@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 
+from google.protobuf.descriptor import FieldDescriptor
+
 from router import declared as c
 from router.carrier.arrays import Arrays
 from router.carrier.schema import wire_kind
@@ -15,6 +17,7 @@ _MOST_REQUIRED = 64
 """Required fields of a message that are checked: those that nanopb checks, unless the firmware sets another number."""
 
 _UNBOUNDED = (1 << 32) - 1
+_ZIGZAG = (FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64)
 
 
 class NativeBoards:
@@ -81,6 +84,10 @@ class _Tree:
             flags |= BoardFlag.HAS_FIXED_LENGTH
         if field.has_fixed_count:
             flags |= BoardFlag.HAS_FIXED_COUNT
+        if field.integers is not None:
+            flags |= BoardFlag.HAS_RANGE
+        if field.descriptor.type in _ZIGZAG:
+            flags |= BoardFlag.IS_ZIGZAG
         return c.BoardField(
             number=number,
             kind=_kind(field),
@@ -89,6 +96,8 @@ class _Tree:
             longest=field.longest if field.longest is not None else _UNBOUNDED,
             most=field.most or 0,
             counter=counter,
+            low=field.integers.low if field.integers is not None else 0,
+            high=field.integers.high if field.integers is not None else 0,
             required=required,
             path=self._arrays.text(field.path.encode()),
         )

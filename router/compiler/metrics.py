@@ -165,7 +165,7 @@ REJECT_REASONS: Mapping[str, str] = {
 DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "a mapping failed for these values, for example by division by zero",
     "non_finite": "NaN or infinity where an integer or a time is needed, or for a board",
-    "too_large": "the envelope, a text or a list is larger than the board accepts",
+    "too_large": "the envelope, an integer, a text or a list is larger than the board accepts",
     "stale": "older than `ttl`",
     "rate_limited": "more often than `max_rate`; not logged, because the table asks for it",
     "queue_full": "the queue was full, because the endpoint's `bandwidth` was too small or a thread was behind",

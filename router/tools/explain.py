@@ -213,6 +213,8 @@ def _sizes(field: BoardField) -> Iterator[str]:
         yield _size(field.most, "element", is_fixed=field.has_fixed_count)
     if field.longest is not None:
         yield _size(field.longest, "byte", is_fixed=field.has_fixed_length)
+    if field.integers is not None:
+        yield f"{field.integers.low} to {field.integers.high}"
 
 
 def _bounded(message: BoardMessage) -> Iterator[BoardField]:

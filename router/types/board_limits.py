@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.errors import plural
-from router.types.boards import OptionsOf, why_unbounded
+from router.types.boards import OptionsOf, integers, is_list, is_required, longest, stored_type, why_unbounded
 from router.types.descriptors import message_of
+from router.types.model import Int
 
 MOST_MESSAGES, MOST_LISTS = 65536, 4096
 """Maximum number of messages and of lists, nested ones included, in the envelope of a board."""
 
+_TEXTS = (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES)
 _FLOATS = (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE)
 
 
@@ -27,8 +29,9 @@ class BoardField:
     """The bounds of a field. `path` begins with the payload case: `arm_ctrl.name`.
 
     `longest` is the limit of a string or bytes in bytes, `most` the limit of a list in elements; None means no limit.
-    With `has_fixed_length` or `has_fixed_count` the size is exactly the limit, or zero. `message` has the fields of a
-    message. With `is_required`, the board refuses a message without the field.
+    With `has_fixed_length` or `has_fixed_count` the size is exactly the limit, or zero. `integers` are those that the
+    firmware can store, None if it stores all. With `is_required`, the board refuses a message without the field.
+    `message` has the fields of a message.
     """
 
     path: str
@@ -37,12 +40,19 @@ class BoardField:
     most: int | None = None
     has_fixed_length: bool = False
     has_fixed_count: bool = False
+    integers: Int | None = None
     is_required: bool = False
     message: BoardMessage | None = None
 
     @property
     def is_float(self) -> bool:
         return self.descriptor.type in _FLOATS
+
+    @property
+    def is_checked(self) -> bool:
+        """Whether the field, or one inside it, has limits."""
+        limits = (self.longest, self.most, self.integers)
+        return bool(self.message) or self.is_float or self.is_required or any(each is not None for each in limits)
 
 
 BoardMessage = Mapping[int, BoardField]
@@ -68,6 +78,9 @@ class BoardLimits:
         """Return why a scalar of a payload does not fit its field; empty if it does."""
         if isinstance(value, float) and not self.allows_non_finite and not math.isfinite(value):
             return f"{field.path} is {value}"
+        if isinstance(value, int) and field.integers is not None:
+            low, high = field.integers.low, field.integers.high
+            return "" if low <= value <= high else f"{field.path} is {value}; the board takes {low} to {high}"
         if not isinstance(value, (str, bytes)) or field.longest is None:
             return ""
         size = len(value.encode() if isinstance(value, str) else value)
@@ -85,30 +98,29 @@ def board_fields(
     fields = {}
     for descriptor in message.fields:
         options = options_of(descriptor)
+        if options.is_ignored:
+            continue
         name = f"{path}.{descriptor.name}" if path else descriptor.name
         is_recursive = descriptor.message_type is not None and descriptor.message_type in inside | {message}
         if is_recursive or why_unbounded(descriptor, options):
-            if descriptor.is_required:
+            if is_required(descriptor, options):
                 fields[descriptor.number] = BoardField(name, descriptor, is_required=True)
             continue
         inner: BoardMessage | None = None
-        longest: int | None = None
         if descriptor.message_type is not None:
             inner = board_fields(message_of(descriptor), options_of, name, inside | {message})
-        elif descriptor.type == FieldDescriptor.TYPE_STRING:
-            longest = (options.string_size or 1) - 1  # without its final NUL
-        elif descriptor.type == FieldDescriptor.TYPE_BYTES:
-            longest = options.max_size
+        has_many = is_list(descriptor, options)
         field = BoardField(
             path=name,
             descriptor=descriptor,
-            longest=longest,
-            most=options.max_count if descriptor.is_repeated else None,
-            has_fixed_length=options.fixed_length and longest is not None,
-            has_fixed_count=options.fixed_count,
-            is_required=descriptor.is_required,
+            longest=longest(descriptor, options) if descriptor.type in _TEXTS else None,
+            most=options.max_count if has_many else None,
+            has_fixed_length=options.fixed_length and stored_type(descriptor, options) == FieldDescriptor.TYPE_BYTES,
+            has_fixed_count=options.fixed_count and has_many,
+            integers=integers(descriptor, options),
+            is_required=is_required(descriptor, options),
             message=inner,
         )
-        if inner or longest is not None or field.most is not None or field.is_float or field.is_required:
+        if field.is_checked:
             fields[descriptor.number] = field
     return fields

@@ -1,174 +1,73 @@
 """Sizes that a board can decode: boards decode with nanopb into structures of a fixed size.
 
-nanopb's `.options` files limit strings, bytes and repeated fields. The largest encoding of a message in bytes equals
-nanopb's `*_size` macro; boards reject longer datagrams. Tests compare the sizes with nanopb's generator: an int32 takes
-up to 10 bytes, an enum as many as its largest declared value.
+nanopb's options (`nanopb.py`) limit strings, bytes, integers and repeated fields. The largest encoding of a message in
+bytes equals nanopb's `*_size` macro; boards reject longer datagrams. Tests compare the sizes with nanopb's generator:
+an int32 takes up to 10 bytes, an enum as many as its largest declared value.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
-from google.protobuf.descriptor_pb2 import FileDescriptorProto
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
-from router import inputs
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
+from router.errors import Code, Diagnostic, SourceSpan
 from router.types.descriptors import container, enum_of, message_of
-from router.types.wire import encoding_of, varint
-
-_COMMENT = re.compile(r"//.*|#.*|/\*.*?\*/")
-_OPTION = re.compile(r"(?P<key>\w+)\s*:\s*(?P<value>\"[^\"]*\"|[\w.+-]+)\s*[,;]?\s*")
-_COUNTS = frozenset({"max_size", "max_length", "max_count"})
-_FLAGS = frozenset({"fixed_length", "fixed_count"})
-_WITHOUT_INFLUENCE = frozenset(
-    {
-        "long_names", "packed_struct", "packed_enum", "msgid", "anonymous_oneof", "proto3", "proto3_singular_msgs",
-        "enum_to_string", "enum_validate", "mangle_names", "callback_datatype", "callback_function", "descriptorsize",
-        "default_has", "include", "exclude", "package", "sort_by_tag", "initializer", "enum_intsize",
-        "discard_unused_automatic_types", "discard_deprecated",
-    }
-)  # fmt: skip
-_TYPES = {"FT_DEFAULT": True, "FT_STATIC": True, "FT_INLINE": True, "FT_CALLBACK": False, "FT_POINTER": False}
-
-
-@dataclass(frozen=True, slots=True)
-class BoardOptions:
-    """nanopb's options of one field. Sizes in bytes, a string's with its final NUL.
-
-    `is_static` is False if the board stores the field by pointer or callback, which has no bound.
-    """
-
-    max_size: int | None = None
-    max_length: int | None = None
-    max_count: int | None = None
-    fixed_length: bool = False
-    fixed_count: bool = False
-    is_static: bool = True
-
-    @property
-    def string_size(self) -> int | None:
-        """The size of a string with its NUL: from `max_length`, else `max_size`."""
-        return self.max_length + 1 if self.max_length is not None else self.max_size
-
-
-NO_OPTIONS = BoardOptions()
-
-
-@dataclass(frozen=True, slots=True)
-class OptionsLine:
-    """A line of an `.options` file: `changes` for all full names that `pattern`, with wildcards, matches."""
-
-    span: SourceSpan
-    pattern: str
-    changes: Mapping[str, int | bool]
-
-
-@dataclass(frozen=True, slots=True)
-class OptionsFile:
-    """The lines of one `.options` file, in order."""
-
-    lines: tuple[OptionsLine, ...] = ()
-
-    def of(self, message: str, field: str) -> BoardOptions:
-        """Return the options of a field, by the full name of its message and its own name.
-
-        As in nanopb, options of a message apply to its fields, and later lines override earlier ones.
-        """
-        options = NO_OPTIONS
-        for name in (message, f"{message}.{field}"):
-            for line in self.lines:
-                if fnmatchcase(name, line.pattern):
-                    options = replace(options, **line.changes)  # type: ignore[arg-type]
-        return options
-
-    def unused(self, proto: FileDescriptorProto) -> Iterator[Diagnostic]:
-        """Yield a warning for each line that matches nothing in its `.proto` file, which leaves a field unbounded."""
-        names = set(_names(proto))
-        for line in self.lines:
-            if any(fnmatchcase(name, line.pattern) for name in names):
-                continue
-            full = f"{proto.package}.{line.pattern}"
-            lacks_package = any(fnmatchcase(name, full) for name in names)
-            hint = f"names begin with the package: '{full}'" if lacks_package else did_you_mean(line.pattern, names)
-            yield Diagnostic(line.span, Code.UNUSED_OPTION, f"nothing in {proto.name} is called '{line.pattern}'", hint)
-
-
-def _names(proto: FileDescriptorProto) -> Iterator[str]:
-    """Yield the full names that nanopb accepts options for."""
-    scope = f"{proto.package}." if proto.package else ""
-    yield from (f"{scope}{enum.name}" for enum in proto.enum_type)
-    yield from (f"{scope}{extension.name}" for extension in proto.extension)
-    waiting = [(scope, message) for message in proto.message_type]
-    while waiting:
-        scope, message = waiting.pop()
-        inside = f"{scope}{message.name}."
-        yield inside[:-1]
-        yield from (f"{inside}{field.name}" for field in (*message.field, *message.extension))
-        yield from (f"{inside}{oneof.name}" for oneof in message.oneof_decl)
-        yield from (f"{inside}{enum.name}" for enum in message.enum_type)
-        waiting += [(inside, nested) for nested in message.nested_type]
-
-
-def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
-    """Read an `.options` file. Return it with its findings."""
-    try:
-        text = inputs.read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        return OptionsFile(), [
-            Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"the file cannot be read: {error}")
-        ]
-    lines = []
-    findings = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        bare = _COMMENT.sub("", line).strip()
-        if not bare:
-            continue
-        pattern, _, rest = bare.partition(" ") if " " in bare else bare.partition("\t")
-        changes, complaints = _changes(rest)
-        column = len(line) - len(line.lstrip()) + 1
-        span = SourceSpan(shown_path(path), number, column, column + len(bare))
-        findings += [Diagnostic(span, Code.BAD_PROTO, message, hint) for message, hint in complaints]
-        lines.append(OptionsLine(replace(span, end_column=column + len(pattern)), pattern, changes))
-    return OptionsFile(tuple(lines)), findings
-
-
-def _changes(text: str) -> tuple[Mapping[str, int | bool], Iterable[tuple[str, str]]]:
-    """Return the options that a line sets, and (message, hint) for each problem."""
-    text = text.strip()
-    changes: dict[str, int | bool] = {}
-    if not text:
-        return changes, [("no option after the name", "write for example 'max_size:16'")]
-    at = 0
-    while at < len(text):
-        option = _OPTION.match(text, at)
-        if option is None:
-            return changes, [(f"'{text[at:]}' is not a nanopb option", "write for example 'max_size:16'")]
-        at = option.end()
-        key, value = option["key"], option["value"]
-        if key in _COUNTS and value.isdecimal():
-            changes[key] = int(value)
-        elif key in _FLAGS and value in ("true", "false"):
-            changes[key] = value == "true"
-        elif key == "type" and value in _TYPES:
-            changes["is_static"] = _TYPES[value]
-        elif key in _COUNTS | _FLAGS | {"type"}:
-            return changes, [(f"{key} cannot be '{value}'", "")]
-        elif key not in _WITHOUT_INFLUENCE:
-            hint = did_you_mean(key, _COUNTS | _FLAGS | {"type"})
-            return changes, [(f"the router cannot compute sizes with the nanopb option '{key}'", hint)]
-    return changes, []
-
+from router.types.model import Int
+from router.types.nanopb import BoardOptions
+from router.types.wire import encoding, varint
 
 if TYPE_CHECKING:
     from router.types.protobuf import PayloadCase, ProtoSchema
 
 OptionsOf = Callable[[FieldDescriptor], BoardOptions]
+
+# Fields
+
+
+def stored_type(field: FieldDescriptor, options: BoardOptions) -> int:
+    """Return the type of a field in the firmware."""
+    return options.type if options.type is not None else field.type
+
+
+def is_list(field: FieldDescriptor, options: BoardOptions) -> bool:
+    """Return whether the firmware has a list for a field."""
+    return field.is_repeated if options.label is None else options.label == FieldDescriptorProto.LABEL_REPEATED
+
+
+def is_required(field: FieldDescriptor, options: BoardOptions) -> bool:
+    """Return whether the firmware refuses a message without a field."""
+    return field.is_required if options.label is None else options.label == FieldDescriptorProto.LABEL_REQUIRED
+
+
+def longest(field: FieldDescriptor, options: BoardOptions) -> int | None:
+    """Return the largest size of a string or bytes in bytes, None without a limit."""
+    size = options.max_size
+    if field.type == FieldDescriptor.TYPE_STRING and options.max_length is not None:
+        size = options.max_length + 1
+    if size is not None and stored_type(field, options) == FieldDescriptor.TYPE_STRING:
+        size = max(size, 1) - 1  # without its final NUL
+    return size
+
+
+def integers(field: FieldDescriptor, options: BoardOptions) -> Int | None:
+    """Return the integers that the firmware takes, None if the options do not restrict them."""
+    if (kind := stored_type(field, options)) == FieldDescriptor.TYPE_ENUM:
+        has_negative = any(value.number < 0 for value in enum_of(field).values)
+        return Int(options.enum_bits, has_negative) if 0 < options.enum_bits < _ENUM_BITS else None
+    whole = encoding(kind).type if kind in _SIZED else None
+    return Int(options.int_bits, whole.signed) if isinstance(whole, Int) and 0 < options.int_bits < whole.bits else None
+
+
+_ENUM_BITS = 32
+_SIZED = (
+    FieldDescriptor.TYPE_INT32, FieldDescriptor.TYPE_INT64, FieldDescriptor.TYPE_UINT32, FieldDescriptor.TYPE_UINT64,
+    FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64,
+)  # fmt: skip
+"""The types that `int_size` applies to."""
 
 # Sizes
 
@@ -207,11 +106,13 @@ def framed_size(number: int, payload: int) -> int:
 def unbounded_fields(
     message: Descriptor, options_of: OptionsOf, path: tuple[FieldDescriptor, ...] = ()
 ) -> Iterator[Unbounded]:
-    """Yield every field inside the message, at any depth, that has no largest encoding."""
+    """Yield every field inside the message, at any depth, that has no largest encoding. Ignored ones are omitted."""
     inside = {step.containing_type for step in path}
     for field in message.fields:
-        here = (*path, field)
-        if why := why_unbounded(field, options_of(field)):
+        here, options = (*path, field), options_of(field)
+        if options.is_ignored:
+            continue
+        if why := why_unbounded(field, options):
             yield Unbounded(here, why)
         elif field.message_type is None:
             continue
@@ -225,23 +126,29 @@ def why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
     """Return why a field has no largest encoding, None if it has one. The fields inside it are not considered."""
     if field.type == FieldDescriptor.TYPE_GROUP:
         return "is a group, which nanopb does not support"
-    if field.is_repeated and options.max_count is None:
+    if encoding(stored_type(field, options)).wire_type != encoding(field.type).wire_type:
+        return "has another wire type in the firmware, by type_override"
+    if field.is_repeated and not is_list(field, options):
+        return "is repeated, but has one value in the firmware, by label_override"
+    if is_list(field, options) and options.max_count is None:
         return "is repeated without a max_count"
-    if field.type == FieldDescriptor.TYPE_STRING and options.string_size is None:
-        return "is a string without a max_size"
-    if field.type == FieldDescriptor.TYPE_BYTES and options.max_size is None:
-        return "is bytes without a max_size"
+    if field.type in _TEXTS and longest(field, options) is None:
+        return f"is {_TEXTS[field.type]} without a max_size"
     if not options.is_static:
         return "is stored by pointer or callback"
     return None
+
+
+_TEXTS = {FieldDescriptor.TYPE_STRING: "a string", FieldDescriptor.TYPE_BYTES: "bytes"}
 
 
 def _size_of(fields: Iterable[FieldDescriptor], options_of: OptionsOf) -> int:
     total = 0
     in_oneofs: dict[str, int] = {}
     for field in fields:
-        size = _field_size(field, options_of)
-        if field.containing_oneof is None:
+        options = options_of(field)
+        size = _field_size(field, options, options_of) if not options.is_ignored else 0
+        if field.containing_oneof is None or options.is_apart:
             total += size
         else:
             oneof = field.containing_oneof.name
@@ -249,28 +156,30 @@ def _size_of(fields: Iterable[FieldDescriptor], options_of: OptionsOf) -> int:
     return total + sum(in_oneofs.values())
 
 
-def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
-    options = options_of(field)
+def _field_size(field: FieldDescriptor, options: BoardOptions, options_of: OptionsOf) -> int:
     size = len(varint(field.number << 3)) + _value_size(field, options, options_of)
-    if not field.is_repeated or options.max_count is None:
+    if not is_list(field, options) or options.max_count is None:
         return size
     # Room for the unpacked form, which every decoder must accept; for one element the packed form is longer.
     return size * options.max_count + (1 if options.max_count == 1 else 0)
 
 
 def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: OptionsOf) -> int:
-    if number := encoding_of(field).size:
-        return number
-    if field.type == FieldDescriptor.TYPE_ENUM:
+    kind = stored_type(field, options)
+    if number := encoding(kind).size:
+        return _SMALL.get(options.int_bits, number) if kind in _SHORTENED else number
+    if kind == FieldDescriptor.TYPE_ENUM:
         return max(len(varint(value.number)) for value in enum_of(field).values)
-    if field.type == FieldDescriptor.TYPE_MESSAGE:
+    if kind == FieldDescriptor.TYPE_MESSAGE:
         inner = _size_of(message_of(field).fields, options_of)
         return len(varint(inner)) + inner
-    if field.type == FieldDescriptor.TYPE_STRING:
-        size = options.string_size or 1
-        return len(varint(size)) + size - 1  # without its final NUL
-    size = options.max_size or 0
-    return len(varint(size)) + size
+    size = longest(field, options) or 0
+    return len(varint(size + (kind == FieldDescriptor.TYPE_STRING))) + size
+
+
+_SMALL = {8: 2, 16: 3, 32: 5, 64: 10}
+"""The largest encodings in bytes of integers by the bits of `int_size`, for the types that nanopb shortens."""
+_SHORTENED = tuple(kind for kind in _SIZED if kind not in (FieldDescriptor.TYPE_INT32, FieldDescriptor.TYPE_INT64))
 
 
 def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: SourceSpan) -> list[Diagnostic]:
@@ -279,6 +188,11 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
     `limit` is the largest envelope in bytes that boards accept, `span` the place in the table that sends the case to a
     board.
     """
+    member = schema.descriptor(schema.envelope).fields_by_name[case.name]
+    if schema.board_options(member).is_ignored:
+        message = f"a board ignores {case.name}: nanopb's options leave it out of the firmware"
+        hint = f"see {schema.span(schema.envelope, case.name)}; remove `type:FT_IGNORE`"
+        return [Diagnostic(span, Code.BOARD_PAYLOAD, message, hint)]
     unbounded = unbounded_fields(schema.descriptor(case.type.name), schema.board_options)
     findings = [_unbounded_finding(case, found, schema, span) for found in unbounded]
     if case.max_size is not None and (size := framed_size(case.number, case.max_size)) > limit:
@@ -292,5 +206,7 @@ def _unbounded_finding(case: PayloadCase, found: Unbounded, schema: ProtoSchema,
     field = found.path[-1]
     path = ".".join((case.name, *(step.name for step in found.path)))
     place = schema.span(container(field).full_name, field.name)
-    hint = f"see {place}; limit its size in a nanopb .options file beside the .proto"
+    is_overridden = "_override" in found.why
+    remedy = "remove that option" if is_overridden else "limit its size in a nanopb .options file beside the .proto"
+    hint = f"see {place}; {remedy}"
     return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot decode {path}: it {found.why}", hint)

@@ -22,6 +22,8 @@ with left_out("_hashlib"):  # OpenSSL costs 4 MB and 8 ms; Python's own implemen
 
 PROTO = ".proto"
 OPTIONS = ".options"
+NANOPB = "nanopb.proto"
+"""The file that declares nanopb's options; the router has one for folders without."""
 
 _FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
 _SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", re.MULTILINE | re.DOTALL)
@@ -183,7 +185,7 @@ def scan(content: bytes) -> Scanned:
     blocks: list[str] = []  # for each open brace, the full name of the innermost message
     for statement, opens in _statements(content):
         match statement:
-            case ["package", name]:
+            case ["package", name] if not blocks:  # an option of nanopb has the same name
                 package = name
             case ["import", *_, name]:
                 imports.append(name.strip("\"'"))
@@ -287,7 +289,7 @@ def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> lis
 
 
 def _imports(content: bytes) -> list[str]:
-    return [name for name in scan(content).imports if not name.startswith(_OF_PROTOBUF)]
+    return [name for name in scan(content).imports if name != NANOPB and not name.startswith(_OF_PROTOBUF)]
 
 
 def _folder_above(folder: Folder, file: str) -> Path | None:

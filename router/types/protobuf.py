@@ -19,22 +19,14 @@ from google.protobuf.message_factory import GetMessageClass
 
 from router import inputs
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, plural, shown_path
-from router.types.boards import (
-    NO_OPTIONS,
-    BoardOptions,
-    OptionsFile,
-    framed_size,
-    largest_beside,
-    largest_encoding,
-    read_options,
-    unbounded_fields,
-)
+from router.types.boards import framed_size, largest_beside, largest_encoding, longest, unbounded_fields
 from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
+from router.types.nanopb import NO_OPTIONS, BoardOptions, NanopbOptions, OptionsFile, declares_options, read_options
 from router.types.proto_files import OPTIONS, Folder, envelope_file, proto_of, reached, read_folder
 from router.types.proto_source import Part, ProtoSources, field_comments
-from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
+from router.types.protoc import check_protos, compile_protos, findings_of, shipped
 from router.types.undecidable import undecidable
 from router.types.wire import encoding_of, validates_text
 
@@ -64,11 +56,13 @@ class ProtoSchema:
         self.lock = lock
         self.exclude: Sequence[str] = ()
         self.inputs = inputs.Inputs()
-        self.files = tuple(file.name for file in compiled.file if inputs.is_file(folder.root / file.name))
+        own = [file for file in compiled.file if inputs.is_file(folder.root / file.name)]
+        self.files = tuple(file.name for file in own if not declares_options(file))
         self.sha256 = folder.sha256
         self.sources = _sources(folder, compiled)
         self.warnings = tuple(warnings)
-        self._options = options
+        has_options = bool(options) or any(map(declares_options, compiled.file))
+        self._options = NanopbOptions(options) if has_options else None
         self._pool = DescriptorPool()
         for file in compiled.file:
             self._pool.AddSerializedFile(file.SerializeToString())
@@ -96,11 +90,8 @@ class ProtoSchema:
         return [range(span.start, span.end) for span in message.reserved_range]
 
     def board_options(self, field: FieldDescriptor) -> BoardOptions:
-        """Return the options of a field, from the `.options` file beside its `.proto` file."""
-        if not self._options:
-            return NO_OPTIONS
-        options = self._options.get(container(field).file.name)
-        return options.of(container(field).full_name, field.name) if options is not None else NO_OPTIONS
+        """Return nanopb's options of a field, from its `.proto` file and the `.options` file beside it."""
+        return self._options.of(field) if self._options is not None else NO_OPTIONS
 
     def unbounded(self, message: str) -> str:
         """Describe the first field of a message, by full name, without a largest encoding, and count others; or ""."""
@@ -282,7 +273,7 @@ def _excluded_finding(name: str, envelope: Located[str], folder: Folder) -> Diag
 
 def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     names = [file.name for file in compiled.file]
-    paths = {name: path if inputs.is_file(path := folder.root / name) else WELL_KNOWN / name for name in names}
+    paths = {name: path if inputs.is_file(path := folder.root / name) else shipped(name) for name in names}
     return ProtoSources(compiled.file, paths)
 
 
@@ -324,9 +315,16 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
         raise TableError(refused)
     cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
+    options = {field.name: schema.board_options(field) for field in oneof.fields}
     # An unbounded case is only reported if it is sent to a board.
-    bounded = [framed_size(case.number, case.max_size) for case in cases.values() if case.max_size is not None]
-    max_size = max(bounded, default=0) + largest_beside(oneof, schema.board_options)
+    bounded = [
+        framed_size(case.number, case.max_size)
+        for case in cases.values()
+        if case.max_size is not None and not options[case.name].is_ignored
+    ]
+    has_room_for_all = any(each.is_apart for each in options.values())
+    max_size = sum(bounded) if has_room_for_all else max(bounded, default=0)
+    max_size += largest_beside(oneof, schema.board_options)
     return Envelope(name, oneof.name, schema.message_class(name), cases, max_size)
 
 
@@ -407,7 +405,7 @@ def _element(
     if field.type == FieldDescriptor.TYPE_ENUM:
         return enums[enum_of(field).full_name]
     if field.type == FieldDescriptor.TYPE_STRING:
-        return String(options.string_size - 1 if options.string_size is not None else None)
+        return String(longest(field, options))
     if field.type == FieldDescriptor.TYPE_BYTES:
-        return Bytes(options.max_size)
+        return Bytes(longest(field, options))
     return messages[message_of(field).full_name]

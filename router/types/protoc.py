@@ -18,8 +18,9 @@ import grpc_tools
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import _protoc_compiler
 
+from router.assets import asset
 from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, did_you_mean, nearest, shown_path
-from router.types.proto_files import Folder, declaring, scan
+from router.types.proto_files import NANOPB, Folder, declaring, scan
 from router.types.proto_source import ProtoText
 
 EVERYTHING = "router_every_proto_of_the_folder.proto"
@@ -169,8 +170,13 @@ def _code(complaint: Complaint, text: ProtoText) -> Code:
     return Code.BAD_PROTO
 
 
-WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
+_WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
 """Where grpcio-tools keeps `google/protobuf/*.proto`."""
+
+
+def shipped(name: str) -> Path:
+    """Return the path of a file that is not in the folder of the protos: nanopb's, or one of google/protobuf."""
+    return asset("schemas") / NANOPB if name == NANOPB else _WELL_KNOWN / name
 
 
 def compile_protos(folder: Folder, names: Sequence[str]) -> FileDescriptorSet:
@@ -226,9 +232,11 @@ def _include(scratch: str, folder: Folder, names: Sequence[str]) -> list[str]:
     everything = Path(scratch, "everything")
     everything.mkdir()
     (everything / EVERYTHING).write_text(f'syntax = "proto3";\n{imports}', encoding="ascii")
-    protos = Path(scratch, "protos")  # a name without `:` and `=`, where protoc splits
+    protos, nanopb = Path(scratch, "protos"), Path(scratch, "nanopb")  # names without `:` and `=`, where protoc splits
     protos.symlink_to(folder.root.absolute(), target_is_directory=True)
-    return [str(everything), str(protos), str(WELL_KNOWN)]
+    nanopb.mkdir()
+    (nanopb / NANOPB).symlink_to(shipped(NANOPB))
+    return [str(everything), str(protos), str(nanopb), str(_WELL_KNOWN)]
 
 
 def _complaints(include: Sequence[str]) -> list[Complaint]:

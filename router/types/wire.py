@@ -62,7 +62,12 @@ _ENCODINGS: Mapping[int, Encoding] = {
 
 def encoding_of(field: FieldDescriptor) -> Encoding:
     """Return the encoding of a field, or of a single element of a repeated one."""
-    return _ENCODINGS[field.type]
+    return encoding(field.type)
+
+
+def encoding(kind: int) -> Encoding:
+    """Return the encoding of one of FieldDescriptor.TYPE_*."""
+    return _ENCODINGS[kind]
 
 
 def varint(value: int) -> bytes:

@@ -20,6 +20,9 @@ from tests.acceptance.ros_peer import PATIENCE
 PARTS = Path(__file__).parent / "protos"
 """Protos with bounded strings, bytes and lists, unlike the rover's."""
 
+OPTIONS = Path(__file__).parent / "options"
+"""Protos with nanopb's options in them."""
+
 REQUIRED = Path(__file__).parent / "required"
 """Protos with required fields."""
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.boards.board import REQUIRED, Board, Verdict, compiled
+from tests.boards.board import OPTIONS, REQUIRED, Board, Verdict, compiled
 from tests.carrier.test_boards import COMPLETE, INCOMPLETE, Boards
-from tests.envelopes import I32, VARINT, framed, tag
+from tests.envelopes import I32, VARINT, framed, tag, varint
 from tests.ports import free_port
 
 HOST = "127.0.0.77"
@@ -81,3 +81,78 @@ def test_nanopb_refuses_what_lacks_a_required_field_and_decodes_all_else(library
             assert bool(refused) == bool(found), data.hex()
             counts[refused] += 1
     assert min(counts[""], counts["missing required field"]) > len(datagrams) / 10
+
+
+TEXTS, NUMBERS, IGNORED = 1, 2, 3
+NEEDED = tag(8, I32) + bytes(4)
+
+
+def integer(number: int, value: int) -> bytes:
+    return tag(number, VARINT) + varint(value % (1 << 64))
+
+
+def zigzag(number: int, value: int) -> bytes:
+    return integer(number, 2 * value if value >= 0 else -2 * value - 1)
+
+
+def texts(*fields: bytes) -> bytes:
+    return framed(TEXTS, b"".join(fields))
+
+
+def numbers(*fields: bytes) -> bytes:
+    return framed(NUMBERS, b"".join(fields) + NEEDED)
+
+
+AT_THE_LIMITS = {
+    "a text of the file's size": texts(framed(1, b"12345")),
+    "a text of the field's size": texts(framed(2, b"1234567")),
+    "a text of the line's size": texts(framed(3, b"123")),
+    "bytes of a fixed size": texts(framed(4, b"123")),
+    "a list of the message's count": texts(framed(5, b"12345") * 2),
+    "a list of a fixed count": texts(framed(6, b"\1\2\3")),
+    "the largest byte": numbers(integer(1, 127)),
+    "the smallest byte": numbers(integer(1, -128)),
+    "the largest zigzag": numbers(zigzag(2, 127)),
+    "the smallest zigzag": numbers(zigzag(2, -128)),
+    "the largest octet": numbers(integer(3, 255)),
+    "the largest half": numbers(integer(4, 2**31 - 1)),
+    "the smallest half": numbers(integer(4, -(2**31))),
+    "the largest word": numbers(integer(5, 2**16 - 1)),
+    "packed octets": numbers(framed(6, varint(255) * 4)),
+    "octets one by one": numbers(integer(6, 255) * 4),
+    "an unknown gear that fits": numbers(integer(7, 255)),
+    "a skipped field": numbers(tag(9, I32) + b"\0\0\xc0\x7f"),
+}
+BEYOND = {
+    "a text of the file's size": texts(framed(1, b"123456")),
+    "a text of the field's size": texts(framed(2, b"12345678")),
+    "a text of the line's size": texts(framed(3, b"1234")),
+    "bytes of a fixed size": texts(framed(4, b"12")),
+    "a list of the message's count": texts(framed(5, b"") * 3),
+    "a list of a fixed count": texts(framed(6, b"\1\2")),
+    "the largest byte": numbers(integer(1, 128)),
+    "the smallest byte": numbers(integer(1, -129)),
+    "the largest zigzag": numbers(zigzag(2, 128)),
+    "the smallest zigzag": numbers(zigzag(2, -129)),
+    "the largest octet": numbers(integer(3, 256)),
+    "the largest word": numbers(integer(5, 2**16)),
+    "packed octets": numbers(framed(6, varint(1) + varint(256))),
+    "octets one by one": numbers(integer(6, 1) + integer(6, 256)),
+    "a gear that does not fit": numbers(integer(7, 256)),
+    "a field that only nanopb needs": framed(NUMBERS, b""),
+}
+TRUNCATED = {"the largest half": numbers(integer(4, 2**31)), "the smallest half": numbers(integer(4, -(2**31) - 1))}
+"""An int64 in an int32_t: nanopb truncates these, and so decodes other numbers."""
+
+
+def test_nanopb_decodes_up_to_the_limits_of_its_options_in_protos(library: ctypes.CDLL, tmp_path: Path) -> None:
+    carrier = Boards(library, OPTIONS)
+    with direct(tmp_path, OPTIONS) as board:
+        for name, data in AT_THE_LIMITS.items():
+            assert (carrier.refusal(data), board.verdict(data).refused) == (None, ""), name
+        for name, data in BEYOND.items():
+            assert carrier.refusal(data), name
+            assert board.verdict(data).refused, name
+        for name, data in TRUNCATED.items():
+            assert carrier.refusal(data), name
+        assert board.verdict(framed(IGNORED, NEEDED)).refused == "no payload"

@@ -7,6 +7,8 @@ import struct
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
+from google.protobuf.descriptor import FieldDescriptor
+
 from router.errors import plural
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.wire import GROUP, GROUP_END, I32_SIZE, I64, I64_SIZE, LEN, VARINT, encoding_of, read_varint
@@ -65,6 +67,15 @@ def _of_element(limits: BoardLimits, field: BoardField, element: bytes, counts: 
     elif field.longest is not None:
         if not _fits(len(element), field.longest, field.has_fixed_length):
             yield _too_many(field.path, len(element), "byte", field.longest)
+    elif field.integers is not None:
+        number, _ = read_varint(element, 0)
+        if field.descriptor.type in (FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64):
+            number = number >> 1 if number % 2 == 0 else -(number >> 1) - 1
+        elif field.integers.signed and number >= 1 << 63:
+            number -= 1 << 64
+        if not field.integers.low <= number <= field.integers.high:
+            bounds = f"{field.integers.low} to {field.integers.high}"
+            yield Refusal(TOO_LARGE, f"{field.path} is {number}; the board takes {bounds}")
     elif field.is_float and not limits.allows_non_finite:
         [number] = struct.unpack("<d" if len(element) == I64_SIZE else "<f", element)
         if not math.isfinite(number):
@@ -87,9 +98,18 @@ def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes
     if wire_type != LEN or not field.descriptor.is_repeated:
         return None
     if own == VARINT:
-        return [b""] * sum(byte < 0x80 for byte in value)
+        return _varints(value)
     size = I64_SIZE if own == I64 else I32_SIZE
     return [value[at : at + size] for at in range(0, len(value) - size + 1, size)]
+
+
+def _varints(packed: bytes) -> list[bytes]:
+    found, at = [], 0
+    while at < len(packed):
+        _, end = read_varint(packed, at)
+        found.append(packed[at:end])
+        at = end
+    return found
 
 
 def wire_fields(message: bytes) -> Iterator[tuple[int, int, bytes]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -77,3 +79,12 @@ def rover_schema() -> ProtoSchema:
 @pytest.fixture(scope="session")
 def rover_envelope(rover_schema: ProtoSchema) -> Envelope:
     return find_envelope(rover_schema, ONEOF)
+
+
+def nanopb_headers(root: Path, output: Path) -> str:
+    """The headers that nanopb's generator makes, in a process of its own: nanopb fills the default pool."""
+    output.mkdir(exist_ok=True)
+    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*.proto"))]
+    command = [sys.executable, "-m", "nanopb.generator.nanopb_generator", "-q", "-I", str(root), "-D", str(output)]
+    subprocess.run([*command, *names], cwd=root, check=True, capture_output=True, timeout=60)
+    return "\n".join(path.read_text() for path in sorted(output.rglob("*.pb.h")))

@@ -1,115 +1,29 @@
-"""What boards can hold: `.options` files, and sizes as nanopb computes them."""
+"""What boards can hold: sizes as nanopb computes them."""
 
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
-
 from router.errors import Code, SourceSpan
-from router.types.boards import NO_OPTIONS, BoardOptions, board_findings, largest_encoding, read_options
+from router.types.boards import board_findings, largest_encoding
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.tables import PROTOS
-from tests.types.conftest import ONEOF, Load, Write, settings, with_envelope
-
-
-def test_later_lines_win_and_a_field_wins_over_its_message(tmp_path: Path) -> None:
-    path = tmp_path / "a.options"
-    path.write_text("A.x max_size:1\nA max_size:5 max_count:7\nA.x max_size:2\nA.x max_size:3\n")
-    options, findings = read_options(path)
-    assert findings == []
-    assert options.of("A", "x") == BoardOptions(max_size=3, max_count=7)
-    assert options.of("A", "y") == BoardOptions(max_size=5, max_count=7)
-    assert options.of("B", "x") == NO_OPTIONS
-
-
-@pytest.mark.parametrize(
-    ("line", "finding"),
-    [
-        ("A.x", "no option after the name; write for example 'max_size:16'"),
-        ("A.x 16", "'16' is not a nanopb option; write for example 'max_size:16'"),
-        ("A.x max_size:", "'max_size:' is not a nanopb option; write for example 'max_size:16'"),
-        ("A.x max_size:many", "max_size cannot be 'many'"),
-        ("A.x max_size:-1", "max_size cannot be '-1'"),
-        ("A.x fixed_count:3", "fixed_count cannot be '3'"),
-        ("A.x type:FT_STATC", "type cannot be 'FT_STATC'"),
-        (
-            "A.x max_szie:3",
-            "the router cannot compute sizes with the nanopb option 'max_szie'; did you mean 'max_size'?",
-        ),
-        ("A.x no_unions:true", "the router cannot compute sizes with the nanopb option 'no_unions'"),
-    ],
-)
-def test_line_that_cannot_be_understood_is_a_finding(tmp_path: Path, line: str, finding: str) -> None:
-    path = tmp_path / "a.options"
-    path.write_text(f"# boards\n  {line}  # sizes\n")
-    _, (found,) = read_options(path)
-    assert str(found).startswith(f"{path}:2:3: error[bad-proto]: {finding}")
-
-
-def test_options_of_no_effect_on_sizes_are_accepted(tmp_path: Path) -> None:
-    path = tmp_path / "a.options"
-    path.write_text('* long_names:false packed_struct:true include:"x.h"\n')
-    options, findings = read_options(path)
-    assert findings == []
-    assert options.of("A", "x") == NO_OPTIONS
-
-
-NAMES = """\
-syntax = "proto3";
-package boat;
-enum Mode { OFF = 0; }
-message Hull { message Tank { string label = 1; } oneof fill { Tank water = 1; } enum Kind { WOOD = 0; } }
-"""
-
-
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("*", None),
-        ("boat.Mode", None),
-        ("boat.Hull.fill", None),
-        ("boat.Hull.Kind", None),
-        ("boat.Hull.Tank", None),
-        ("boat.Hull.*.label", None),
-        ("boat.Hull.Tank.lable", "did you mean 'boat.Hull.Tank.label'?"),
-        ("Hull.Tank.label", "names begin with the package: 'boat.Hull.Tank.label'"),
-        ("Hull.*", "names begin with the package: 'boat.Hull.*'"),
-    ],
-)
-def test_line_that_names_nothing_is_a_warning(write: Write, name: str, hint: str | None) -> None:
-    schema = load_protos(*settings(write({"a.proto": NAMES, "a.options": f"{name} max_size:4\n"}), "boat.Hull"))
-    assert [(found.code, found.hint) for found in schema.warnings] == ([(Code.UNUSED_OPTION, hint)] if hint else [])
-
-
-def test_file_that_is_no_text_is_a_finding(tmp_path: Path) -> None:
-    path = tmp_path / "a.options"
-    path.write_bytes(b"\xff\xfe")
-    _, (found,) = read_options(path)
-    assert found.code is Code.BAD_FILE
-
+from tests.types.conftest import ONEOF, Load, Write, nanopb_headers, settings, with_envelope
 
 _SIZE = re.compile(r"^#define (\w+)_size\s+(\d+)$", re.MULTILINE)
 
 
 def nanopb_sizes(root: Path, output: Path) -> dict[str, int]:
-    """Every `*_size` macro with a known value, by message. In a process of its own: nanopb fills the default pool."""
-    output.mkdir(exist_ok=True)
-    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*.proto"))]
-    command = [sys.executable, "-m", "nanopb.generator.nanopb_generator", "-q"]
-    arguments = ["-I", str(root), "-D", str(output), *names]
-    subprocess.run([*command, *arguments], cwd=root, check=True, capture_output=True, timeout=60)
-    headers = "\n".join(path.read_text() for path in output.rglob("*.pb.h"))
-    return {name: int(size) for name, size in _SIZE.findall(headers)}
+    """Every `*_size` macro with a known value, by message."""
+    return {name: int(size) for name, size in _SIZE.findall(nanopb_headers(root, output))}
 
 
 def our_sizes(schema: ProtoSchema) -> dict[str, int]:
     sizes = {
         name.replace(".", "_"): largest_encoding(schema.descriptor(name), schema.board_options)
         for name in schema.messages
+        if schema.sources.file(name) in schema.files
     }
     return {name: size for name, size in sizes.items() if size is not None}
 

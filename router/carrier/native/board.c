@@ -52,6 +52,22 @@ static bool takes_number(struct check *check, const struct board_field *field, c
     return false;
 }
 
+static bool takes_integer(struct check *check, const struct board_field *field, uint64_t value) {
+    int64_t number = field->flags & BOARD_IS_ZIGZAG ? (int64_t)(value >> 1) ^ -(int64_t)(value & 1) : (int64_t)value;
+    if (number >= field->low && number <= field->high) return true;
+    check->refusal->reason = LOSS_TOO_LARGE;
+    const char *format = field->low ? "%s is %lld; the board takes %lld to %lld" : "%s is %llu; the board takes %lld to %lld";
+    snprintf(check->refusal->text, sizeof check->refusal->text, format, field->path, (long long)number, (long long)field->low,
+             (long long)field->high);
+    return false;
+}
+
+static bool takes_varint(struct check *check, const struct board_field *field, struct bytes value) {
+    uint64_t number;
+    if (!(field->flags & BOARD_HAS_RANGE) || !read_varint(&value, LONGEST_VARINT, &number)) return true;
+    return takes_integer(check, field, number);
+}
+
 /* Count elements of a repeated field. */
 static bool takes_more(struct check *check, const struct board_field *field, uint64_t elements) {
     if (!(field->flags & BOARD_IS_REPEATED)) return true;
@@ -97,12 +113,18 @@ static const struct board_field *find_field(const struct board_message *message,
     return NULL;
 }
 
-static bool takes_packed(struct check *check, const struct board_field *field, struct bytes values) {
+static bool takes_packed_varints(struct check *check, const struct board_field *field, struct bytes values) {
+    struct bytes rest = values;
     uint64_t count = 0, value;
-    if (field->kind == WIRE_VARINT) {
-        while (values.at < values.end && read_varint(&values, LONGEST_VARINT, &value)) count++;
-        return takes_more(check, field, count);
-    }
+    while (rest.at < rest.end && read_varint(&rest, LONGEST_VARINT, &value)) count++;
+    if (!takes_more(check, field, count)) return false;
+    for (; count && field->flags & BOARD_HAS_RANGE; count--)
+        if (!read_varint(&values, LONGEST_VARINT, &value) || !takes_integer(check, field, value)) return false;
+    return true;
+}
+
+static bool takes_packed(struct check *check, const struct board_field *field, struct bytes values) {
+    if (field->kind == WIRE_VARINT) return takes_packed_varints(check, field, values);
     size_t size = field->kind == WIRE_I64 ? 8 : 4;
     if (!takes_more(check, field, left(&values) / size)) return false;
     for (; left(&values) >= size; values.at += size)
@@ -154,7 +176,7 @@ static bool takes_field(struct check *check) {
     level->seen |= field->required;
     switch (tag & 7) {
     case LEN: return takes_len(check, field, value);
-    case VARINT: return takes_more(check, field, 1);
+    case VARINT: return takes_more(check, field, 1) && takes_varint(check, field, value);
     default: return takes_more(check, field, 1) && takes_number(check, field, value.at);
     }
 }

@@ -20,7 +20,9 @@ enum board_flag {
     BOARD_IS_FLOAT = 1,
     BOARD_IS_REPEATED = 2,      /* at most `most` elements */
     BOARD_HAS_FIXED_LENGTH = 4, /* `longest` bytes, or none */
-    BOARD_HAS_FIXED_COUNT = 8   /* `most` elements, or none */
+    BOARD_HAS_FIXED_COUNT = 8,  /* `most` elements, or none */
+    BOARD_HAS_RANGE = 16,       /* integers from `low` to `high` */
+    BOARD_IS_ZIGZAG = 32
 };
 
 struct board_field {
@@ -32,6 +34,7 @@ struct board_field {
     uint32_t most;
     uint32_t counter; /* of elements */
     uint32_t reserved;
+    int64_t low, high;
     uint64_t required; /* its bit among the required fields of its message, or 0 */
     const char *path; /* from the payload case on: "arm_ctrl.name" */
 };
