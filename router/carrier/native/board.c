@@ -56,9 +56,9 @@ static bool takes_integer(struct check *check, const struct board_field *field, 
     int64_t number = field->flags & BOARD_IS_ZIGZAG ? (int64_t)(value >> 1) ^ -(int64_t)(value & 1) : (int64_t)value;
     if (number >= field->low && number <= field->high) return true;
     check->refusal->reason = LOSS_TOO_LARGE;
-    const char *format = field->low ? "%s is %lld; the board takes %lld to %lld" : "%s is %llu; the board takes %lld to %lld";
-    snprintf(check->refusal->text, sizeof check->refusal->text, format, field->path, (long long)number, (long long)field->low,
-             (long long)field->high);
+    long long low = field->low, high = field->high;
+    const char *format = low ? "%s is %lld; the board takes %lld to %lld" : "%s is %llu; the board takes %lld to %lld";
+    snprintf(check->refusal->text, sizeof check->refusal->text, format, field->path, (long long)number, low, high);
     return false;
 }
 
@@ -78,7 +78,7 @@ static bool takes_more(struct check *check, const struct board_field *field, uin
     return true;
 }
 
-/* Whether a completely read message has all required fields. Like nanopb, this requires them in each piece of a message. */
+/* Whether a completely read message has all required fields. nanopb expects them in each piece of a message. */
 static bool has_required_fields(struct check *check, const struct level *level) {
     uint64_t missing = level->message->required & ~level->seen;
     if (!missing) return true;

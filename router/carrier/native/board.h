@@ -1,9 +1,9 @@
 /* Checks datagrams for boards, whose firmware decodes with nanopb into structures of a fixed size.
  *
- * The checks cover the sizes of the envelope, of strings and bytes, the number of elements, that numbers are finite, and
- * that no required field is missing. They do not cover other data that nanopb rejects: a field with a wrong wire type, an integer with more bits than its
- * field, a negative number in an enum that declares none, an unknown group. tests/oracles/boards.py is a second
- * implementation. */
+ * The checks cover the sizes of the envelope, of strings and bytes, the number of elements, that numbers are finite,
+ * integers that `int_size` bounds, and that no required field is missing. They do not cover other data that nanopb
+ * rejects: a field with a wrong wire type, an integer with more bits than its type, a negative number in an enum that
+ * declares none, an unknown group. tests/oracles/boards.py is a second implementation. */
 #ifndef BOARD_H
 #define BOARD_H
 

@@ -23,7 +23,8 @@ static void report(struct routing *routing, const struct received *received, str
 }
 
 static void reject(struct routing *routing, const struct received *received, enum reason reason) {
-    struct datagram_event event = {.kind = EVENT_REJECTED, .reason = reason, .counter = received->listener->rejected[reason]};
+    const struct listener *listener = received->listener;
+    struct datagram_event event = {.kind = EVENT_REJECTED, .reason = reason, .counter = listener->rejected[reason]};
     stage_count(&routing->stage, event.counter, 1);
     if (reason != IGNORED) report(routing, received, event);
 }
