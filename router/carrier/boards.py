@@ -12,6 +12,7 @@ from router.carrier.arrays import Arrays
 from router.carrier.schema import wire_kind
 from router.declared import BoardFlag, WireKind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
+from router.types.wire import LEN, encoding_of
 
 _MOST_REQUIRED = 64
 """Required fields of a message that are checked: those that nanopb checks, unless the firmware sets another number."""
@@ -96,11 +97,17 @@ class _Tree:
             longest=field.longest if field.longest is not None else _UNBOUNDED,
             most=field.most or 0,
             counter=counter,
+            wire_types=_wire_types(field),
             low=field.integers.low if field.integers is not None else 0,
             high=field.integers.high if field.integers is not None else 0,
             required=required,
             path=self._arrays.text(field.path.encode()),
         )
+
+
+def _wire_types(field: BoardField) -> int:
+    own = 1 << encoding_of(field.descriptor).wire_type
+    return own | 1 << LEN if field.most is not None else own
 
 
 def _kind(field: BoardField) -> WireKind:

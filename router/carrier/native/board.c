@@ -153,18 +153,6 @@ static bool takes_len(struct check *check, const struct board_field *field, stru
     }
 }
 
-/* Whether a field has the declared wire type. Otherwise protobuf skips it. */
-static bool is_known(const struct board_field *field, uint32_t wire_type) {
-    if (!field) return false;
-    switch (wire_type) {
-    case VARINT: return field->kind == WIRE_VARINT;
-    case I64: return field->kind == WIRE_I64;
-    case I32: return field->kind == WIRE_I32;
-    case LEN: return field->kind == WIRE_MESSAGE || field->kind == WIRE_BYTES || field->flags & BOARD_IS_REPEATED;
-    default: return false;
-    }
-}
-
 static bool takes_field(struct check *check) {
     uint32_t tag;
     struct bytes value;
@@ -172,7 +160,7 @@ static bool takes_field(struct check *check) {
     if (!read_tag(&check->rest, &tag) || !read_value(&check->rest, tag & 7, &value)) return true;
     struct level *level = &check->levels[check->depth];
     const struct board_field *field = find_field(level->message, tag >> 3);
-    if (!is_known(field, tag & 7)) return true;
+    if (!field || !(field->wire_types & 1u << (tag & 7))) return true; /* protobuf skips it */
     level->seen |= field->required;
     switch (tag & 7) {
     case LEN: return takes_len(check, field, value);

@@ -33,10 +33,11 @@ struct board_field {
     uint32_t longest; /* of a string or bytes */
     uint32_t most;
     uint32_t counter; /* of elements */
-    uint32_t reserved;
+    uint32_t wire_types; /* a bit for each declared one: of the type, and of its packed form */
     int64_t low, high;
     uint64_t required; /* its bit among the required fields of its message, or 0 */
     const char *path; /* from the payload case on: "arm_ctrl.name" */
+    uint64_t reserved; /* 64 bytes in total make the search cheaper */
 };
 
 /* A message at one place in the tree of an envelope. Each place has its own, with its own counters. The counters of
