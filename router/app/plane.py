@@ -17,14 +17,14 @@ from time import monotonic, sleep
 from router import declared as c
 from router.app.counts import ThreadCounts
 from router.carrier.boards import NativeBoards
-from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
+from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen, await_receipt
 from router.carrier.deadmen import NativeDeadman, replaced, successors
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import DeadmanEvents, EventReader, EventThread
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.mirror import MirrorRing
-from router.carrier.outlets import Outlets, Publication
+from router.carrier.outlets import AwaitedPublication, Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import superseded, where_refused, why_rejected
@@ -52,7 +52,7 @@ class Opened:
 
     listeners: Mapping[str, Listener]
     senders: Mapping[str, NativeSender]
-    publications: Mapping[str, Publication]
+    publications: Mapping[str, AwaitedPublication]
     subscriptions: Mapping[str, Subscription]
     state: State
 
@@ -103,7 +103,8 @@ class Plane:
         self._generations = count(KEPT_GENERATION + 1)
         self._programs = {KEPT_GENERATION: first} if head_start is not None else {}
         """Programs that explain events, by generation; the newest one is last."""
-        self._is_running, self.has_stopped = head_start is not None, False
+        self._is_running = head_start is not None
+        self.has_stopped = self._has_stopped_ros = False
         size = counts.counters.size
         self._client_deadmen = ClientDeadmen(library, *counts_and_events(library, size), self._names)
         self._publishing = PublishThread(library, forwarding.published, *counts_and_events(library, size), self._names)
@@ -242,8 +243,9 @@ class Plane:
             deadmen = replaced(built.deadmen, earlier.deadmen, routes)
             change = change_to(built.native, built.timers(earlier, of_topics=False), deadmen)
             self._carrier.change(change, built.native)
-        self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)
         self._publishing.advance(generation)
+        # Before the threads that may carry the last messages of deadmen to boards.
+        self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)
         # After deadmen were replaced: feeding an earlier one now feeds its replacement.
         for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
             thread.follow(other)
@@ -305,35 +307,44 @@ class Plane:
     # stopping
 
     def stop(self, listeners: Sequence[Listener]) -> bool:
-        """End all input, handle what is still queued, and end the threads; deadmen keep running.
+        """End all listeners, and handle what has arrived there; messages from ROS are still routed.
 
         Datagrams in an inherited socket stay there for the next process. Return False if a thread is stuck in the
-        middleware: then subscriptions and publishers must stay open.
+        middleware: then publishers must stay open.
         """
         for listener in listeners:
             listener.end_input()
         self._carrier.stop_receiving()
         self._is_running = False
-        threads: list[PublishThread | FromRosThread] = [self._publishing, *self._from_ros]
-        stuck = [thread.name for thread in threads if not thread.stop()]
-        if stuck:
-            logger.error("thread did not stop in time; the router exits without it", threads=stuck)
+        has_ended = _stop([self._publishing])
         self.has_stopped = True
-        return not stuck
+        return has_ended
 
-    def close(self) -> bool:
-        """Send what is held back, then have deadmen send a last time. Nothing is sent afterwards.
+    def end_client_deadmen(self) -> bool:
+        """Have deadmen of clients publish a last time, and wait, but not long, until subscriptions have received that.
 
-        Return False if the thread `client deadmen` is stuck in the middleware: then publishers must stay open.
+        Return False if their thread is stuck in the middleware: then publishers must stay open.
         """
+        has_ended = _stop([self._client_deadmen])
+        if has_ended and self.now is not None:
+            await_receipt(self.now.client_deadmen.values())
+        return has_ended
+
+    def stop_ros(self) -> bool:
+        """Route the messages from ROS that have arrived, and end their threads; deadmen of routes keep running.
+
+        Return False if a thread is stuck in the middleware: then subscriptions must stay open.
+        """
+        has_ended = _stop(self._from_ros)
+        self._has_stopped_ros = True
+        return has_ended
+
+    def close(self) -> None:
+        """Send what is held back, then have deadmen of routes send a last time. Nothing is sent afterwards."""
         self._deadmen.end()
-        has_ended = self._client_deadmen.stop()
-        if not has_ended:
-            logger.error("thread did not stop in time; the router exits without it", threads=["client deadmen"])
-        if self.has_stopped:  # else `stop` is stuck, and its threads use what would be freed
+        if self.has_stopped and self._has_stopped_ros:  # else their threads use what would be freed
             self._events.close()
             self._carrier.close()
-        return has_ended
 
     # explaining events
 
@@ -349,6 +360,14 @@ class Plane:
         """Return the place in the table; "" if an earlier program refused the message."""
         program = self._programs.get(generation)
         return where_refused(program.lowered, route, topic, target, place) if program is not None else ""
+
+
+def _stop(threads: Sequence[PublishThread | FromRosThread | ClientDeadmen]) -> bool:
+    """Stop threads. Log those that are stuck in the middleware; return whether there are none."""
+    stuck = [thread.name for thread in threads if not thread.stop()]
+    if stuck:
+        logger.error("thread did not stop in time; the router exits without it", threads=stuck)
+    return not stuck
 
 
 def _functions_of_rcl(library: ctypes.CDLL) -> tuple[int, int, int]:

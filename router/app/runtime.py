@@ -97,8 +97,13 @@ class Runtime:
         closing.callback(self._close_ros)
 
     def end_with(self, closing: ExitStack) -> None:
-        """Have `closing` stop threads, then gateways, then deadmen, which send once more."""
-        closing.callback(self._close_plane)
+        """Have `closing` end what sends commands, each before what carries them on; deadmen of routes send last.
+
+        The threads for messages from ROS carry the last messages of clients and of their deadmen to boards.
+        """
+        closing.callback(self.plane.close)
+        closing.callback(self._stop_ros)
+        closing.callback(self._end_client_deadmen)
         closing.callback(self._stop_gateways)
         closing.callback(self._stop_plane)
 
@@ -255,8 +260,12 @@ class Runtime:
         if not self.plane.stop(list(self.sockets.listeners.values())) and self._ros is not None:
             self._ros.leave_open()
 
-    def _close_plane(self) -> None:
-        if not self.plane.close() and self._ros is not None:
+    def _end_client_deadmen(self) -> None:
+        if not self.plane.end_client_deadmen() and self._ros is not None:
+            self._ros.leave_open()
+
+    def _stop_ros(self) -> None:
+        if not self.plane.stop_ros() and self._ros is not None:
             self._ros.leave_open()
 
     def _close_listeners(self) -> None:

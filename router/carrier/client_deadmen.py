@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Mapping
-from time import sleep
+from collections.abc import Iterable, Mapping, Sequence
+from time import monotonic, sleep
 
 from router.carrier.deadmen import NativeDeadman, destinations_of, replaced, settings
 from router.carrier.names import Names
-from router.carrier.outlets import Publication
+from router.carrier.outlets import AwaitedPublication
 from router.carrier.ring import Ring
 from router.carrier.state import State
 from router.carrier.threads import NativeThread
@@ -17,15 +17,25 @@ from router.clock import monotonic_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from router.errors import StartError
+from router.log import logger
 
 _POLL_S = 0.002
+
+RECEIPT_S = 0.5
+"""How long, in seconds, a reload or the stop waits until subscriptions have received the last messages of deadmen."""
 
 
 class ClientDeadman(NativeDeadman):
     """The deadman of a topic that clients of a gateway may publish on. Times in ns of the boot clock.
 
-    No call waits for the middleware.
+    `publications` has its topics. No call waits for the middleware.
     """
+
+    def __init__(
+        self, library: ctypes.CDLL, group: int, address: int, topics: Sequence[str], used: Sequence[AwaitedPublication]
+    ) -> None:
+        super().__init__(library, group, address, topics, used)
+        self.publications = dict(zip(topics, used, strict=True))
 
     def feed(self, now: int) -> None:
         """Feed the deadman after a client's message is published; `now` is a time before the publish call."""
@@ -50,6 +60,7 @@ class ClientDeadmen(NativeThread):
     def __init__(self, library: ctypes.CDLL, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names) -> None:
         """Raises MemoryError."""
         super().__init__(library, counts, events)
+        self.name = "client deadmen"
         self._names = names
         self._address = int(library.client_deadmen_open(counts, events.address) or 0)
         if not self._address:
@@ -69,7 +80,7 @@ class ClientDeadmen(NativeThread):
             self._has_started = True
 
     def get_or_open(
-        self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, Publication], state: State
+        self, plan: DeadmanPlan, counters: Counters, publications: Mapping[str, AwaitedPublication], state: State
     ) -> ClientDeadman:
         """Return the deadman of a topic. Programs with the same plan and publisher share it. Raises MemoryError."""
         topics = [topic for topic, _ in plan.datagrams]
@@ -87,13 +98,17 @@ class ClientDeadmen(NativeThread):
     def adopt(self, before: Mapping[str, ClientDeadman], now: Mapping[str, ClientDeadman], generation: int) -> None:
         """Replace the deadmen of one program with those of the next, which has this generation. Both are by name.
 
-        A deadman with changed settings inherits the state of the earlier one.
+        A deadman with changed settings inherits the state of the earlier one. Those without a successor publish a last
+        time if they are armed; wait, but not long, until subscriptions have received that.
         """
-        for name in before.keys() - now.keys():
-            before[name].end()
+        ended = [before[name] for name in before.keys() - now.keys()]
+        for deadman in ended:
+            deadman.end()
         for each, earlier in replaced(now, before, {name: name for name in now}):
             self._library.deadman_replace(self._group, each.address, earlier.address)
         self._library.client_deadmen_advance(self._address, generation)
+        if ended and self.wait_for(generation, RECEIPT_S):
+            await_receipt(ended)
 
     def wait_for(self, generation: int, timeout: float) -> bool:
         """Wait until no publisher of earlier generations is in use. Return False after `timeout` s."""
@@ -116,3 +131,13 @@ class ClientDeadmen(NativeThread):
         Idempotent.
         """
         return bool(self._library.client_deadmen_stop(self._address))
+
+
+def await_receipt(deadmen: Iterable[ClientDeadman]) -> None:
+    """Wait until subscriptions have received what these deadmen have published; log which ones have not in time."""
+    until = monotonic() + RECEIPT_S
+    publications = {topic: each for deadman in deadmen for topic, each in deadman.publications.items()}
+    late = [topic for topic, each in publications.items() if not each.await_receipt(max(until - monotonic(), 0.0))]
+    if late:
+        event = "subscribers may lack the last message of a deadman: they have not acknowledged it in time; continuing"
+        logger.warning(event, topics=late, seconds=RECEIPT_S)

@@ -34,6 +34,12 @@ class Publication(Addressed, Protocol):
     def wanted(self) -> ctypes.Array[Any]: ...
 
 
+class AwaitedPublication(Publication, Protocol):
+    """A publication that can wait until its subscriptions have received everything."""
+
+    def await_receipt(self, timeout: float) -> bool: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Outlets:
     """The open sockets and topics of a program. `state` is that of its targets, passed on by key at a reload.

@@ -39,6 +39,7 @@ CLOSING_S = 1.0
 _publish_serialized = function(
     "rcl_publish_serialized_message", ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(SerializedMessage), ctypes.c_void_p
 )
+_wait_for_all_acked = function("rcl_publisher_wait_for_all_acked", ctypes.c_int, ctypes.c_void_p, ctypes.c_int64)
 _error_string = function("rcutils_get_error_string", ErrorString)
 
 
@@ -89,6 +90,16 @@ class Publication:
                 self.wanted[0] = 1
                 return
             sleep(_POLL_S)
+
+    def await_receipt(self, timeout: float) -> bool:
+        """Wait until all reliable subscriptions have received what was published, at least in their queues.
+
+        Return False after `timeout` s. Fast DDS passes a message to a subscription of this process within the call that
+        publishes it, so best-effort subscriptions of the router also have it.
+        """
+        if has_failed := _wait_for_all_acked(self.address, round(timeout * 1e9)):
+            RCL.rcutils_reset_error()
+        return not has_failed
 
     def stalled(self) -> float:
         """Return how long (s) a call of `publish` has been in the middleware; 0 if no call is running."""

@@ -512,7 +512,7 @@ def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize("place", ["_stop_gateways", "_stop_plane"])
+@pytest.mark.parametrize("place", ["_stop_plane", "_stop_gateways", "_end_client_deadmen", "_stop_ros"])
 def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
     site: Site, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:

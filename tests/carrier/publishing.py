@@ -42,6 +42,10 @@ class Publisher:
         """Make publishing block, take this long, or fail; without arguments, make it succeed at once."""
         self._functions.middleware_impede(self.address, is_stuck, delay_us, refusal.encode())
 
+    def await_receipt(self, timeout: float) -> bool:
+        """Nothing is on its way: subscribers are part of the publisher."""
+        return timeout >= 0
+
     @property
     def is_called(self) -> bool:
         """Whether a thread is inside the middleware."""
