@@ -10,7 +10,7 @@ from itertools import product
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.keys import keys_of
-from router.table.model import InboundDeadman, NodeSettings, Qos, Route, RouteTable, Topic
+from router.table.model import EndpointKind, InboundDeadman, NodeSettings, OnLimit, Qos, Route, RouteTable, Topic
 from router.types.protobuf import PayloadCase
 
 DEFAULT_DEPTH = 10
@@ -154,6 +154,7 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
                 yield from _loops(name, publisher.route, subscriber.route)
         for use in uses:
             yield from _deadman_conflicts(name, use, uses)
+            yield from _limited_stops(table, use, uses)
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
@@ -201,6 +202,24 @@ def _deadman_conflicts(name: str, use: _Use, others: Sequence[_Use]) -> Iterator
             continue
         yield Diagnostic(use.deadman.span, Code.BAD_VALUE, message, hint)
         return
+
+
+def _limited_stops(table: RouteTable, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
+    """Yield a finding if `max_rate` of a route may drop the one message that a gateway's deadman publishes at its end."""
+    if use.deadman is None or use.deadman.because is not None:
+        return
+    for route in [other.route for other in others if other.route is not None and not other.publishes]:
+        for destination in route.destinations:
+            endpoint = table.endpoints.get(destination.endpoint.value)
+            is_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
+            if is_board and destination.max_rate is not None and destination.on_limit is OnLimit.FIRST:
+                message = (
+                    f"when the router stops, '{destination.endpoint.value}' may not get this deadman's message: "
+                    f"`max_rate` of route '{route.name}' drops what follows a command too soon"
+                )
+                hint = "add `on_limit: latest` to that destination, or `because: why` here"
+                yield Diagnostic(use.deadman.span, Code.DOUBTFUL_DEADMAN, message, hint)
+                return
 
 
 def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
