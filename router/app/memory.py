@@ -1,4 +1,4 @@
-"""Drops unused code from the memory of a running router."""
+"""Returns memory to the system: that of large messages once they are freed, and that of code which is not used."""
 
 from __future__ import annotations
 
@@ -12,6 +12,21 @@ _MAPS = Path("/proc/self/maps")
 
 _IDLE = ("_protoc_compiler.", "_foxglove_py.")
 """Prefixes of libraries that are used only at reloads or once a client connects: 14 MB together."""
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
+_LARGE = 1 << 20
+
+
+def return_large_blocks() -> None:
+    """Have glibc return blocks of more than 1 MiB to the system when they are freed.
+
+    By default the first such block that is freed raises that limit to its size, up to 32 MiB. Later blocks then come
+    from heaps that shrink only at their end, so hundreds of megabytes of large messages would stay after their clients.
+    """
+    mallopt = ctypes.CDLL(None).mallopt
+    for parameter in (_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD):
+        mallopt(parameter, _LARGE)
 
 
 class Mapping(NamedTuple):

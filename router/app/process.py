@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
+from router.app.memory import return_large_blocks
 from router.clock import monotonic_ns
 from router.log import logger
 from router.net.udp import unclaimed
@@ -99,4 +100,5 @@ def tune_interpreter() -> None:
     if may_open not in (resource.RLIM_INFINITY, may_request):  # 1024 descriptors are too few for gateway clients
         resource.setrlimit(resource.RLIMIT_NOFILE, (may_request, may_request))
     sys.setswitchinterval(0.0005)  # the longest time that gateways wait for a busy thread
+    return_large_blocks()
     gc.enable()  # it may have been paused until here

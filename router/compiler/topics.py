@@ -205,7 +205,7 @@ def _deadman_conflicts(name: str, use: _Use, others: Sequence[_Use]) -> Iterator
 
 
 def _limited_stops(table: RouteTable, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
-    """Yield a finding if `max_rate` of a route may drop the one message that a gateway's deadman publishes at its end."""
+    """Yield a finding if a route's `max_rate` may drop the one message that a client's deadman publishes at its end."""
     if use.deadman is None or use.deadman.because is not None:
         return
     for route in [other.route for other in others if other.route is not None and not other.publishes]:

@@ -6,7 +6,7 @@ import asyncio
 import socket
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from time import monotonic
 from typing import Any, NamedTuple, Union
@@ -19,6 +19,9 @@ from router.table.addresses import Address
 
 PIECE = 64 * 1024
 """Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""
+
+HEAD = 16
+"""More bytes than a transport puts before a piece: the two are written together."""
 
 UNSENT = 128 * 1024
 """Bytes that the kernel keeps unsent for a client. Newer values can still replace those that wait in the router.
@@ -36,7 +39,7 @@ WATCH_SECONDS = 1.0
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before the loop continues with other work."""
 
-Piece = Union[bytes, memoryview]
+Part = Union[bytes, memoryview]
 
 
 class Limits(NamedTuple):
@@ -54,10 +57,45 @@ class Limits(NamedTuple):
 
 
 class Encoded(NamedTuple):
-    """Frames in their wire form. Other data (pings) may be written between two pieces."""
+    """Frames in their wire form, as pieces of parts. Other data (pings) may be written between two pieces.
 
-    pieces: Sequence[Piece]
+    Large parts are views of the frames, so clients that wait for the same frames share their memory.
+    """
+
+    pieces: Sequence[Sequence[Part]]
     size: int
+
+    @classmethod
+    def of(cls, parts: Iterable[Part]) -> Encoded:
+        """Make pieces of these parts (see `together`)."""
+        pieces = list(together(parts))
+        return cls(pieces, sum(map(size_of, pieces)))
+
+
+def cut(data: bytes) -> list[Part]:
+    """Return views of `data`, each of which leaves room for HEAD bytes in a PIECE."""
+    if len(data) <= PIECE - HEAD:
+        return [data]
+    whole = memoryview(data)
+    return [whole[start : start + PIECE - HEAD] for start in range(0, len(data), PIECE - HEAD)]
+
+
+def together(parts: Iterable[Part]) -> Iterator[list[Part]]:
+    """Yield pieces of at most PIECE - HEAD bytes."""
+    piece: list[Part] = []
+    size = 0
+    for part in parts:
+        if piece and size + len(part) > PIECE - HEAD:
+            yield piece
+            piece, size = [], 0
+        piece.append(part)
+        size += len(part)
+    if piece:
+        yield piece
+
+
+def size_of(piece: Sequence[Part]) -> int:
+    return sum(map(len, piece))
 
 
 class StreamClient:
@@ -81,7 +119,7 @@ class StreamClient:
         self._connection = connection
         self._drain = drain
         self._is_open = is_open
-        self._pieces: deque[Piece] = deque()
+        self._pieces: deque[Sequence[Part]] = deque()
         self._waiting = 0
         self._writing: asyncio.Task[None] | None = None
         _configure(connection)
@@ -108,15 +146,22 @@ class StreamClient:
     def close(self) -> None:
         self._connection.abort()
 
+    def has_left(self, error: BaseException | None) -> None:
+        """Free what was written, whatever still refers to the connection or to the `error` that ended it."""
+        self._pieces.clear()
+        self._waiting = 0
+        if error is not None:
+            error.__traceback__ = None  # its frames refer to the messages that were being written
+
     def _write_now(self) -> None:
         """Write pieces, small ones together, until the kernel takes no more."""
         connection = self._connection
         while self._pieces and not connection.get_write_buffer_size() and not connection.is_closing():
-            batch = [self._pieces.popleft()]
-            size = len(batch[0])
-            while self._pieces and size + len(self._pieces[0]) <= PIECE:
-                size += len(self._pieces[0])
-                batch.append(self._pieces.popleft())
+            batch = [*self._pieces.popleft()]
+            size = size_of(batch)
+            while self._pieces and size + size_of(self._pieces[0]) <= PIECE:
+                size += size_of(self._pieces[0])
+                batch += self._pieces.popleft()
             self._waiting -= size
             connection.write(batch[0] if len(batch) == 1 else b"".join(batch))
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from time import monotonic
 
 from router.gateway.transport.base import PER_TURN, Events, Frame, report_fault
-from router.gateway.transport.stream import ACCEPTED_PER_TURN, PIECE, Encoded, Limits, StreamClient, StreamTransport
+from router.gateway.transport.stream import ACCEPTED_PER_TURN, Encoded, Limits, StreamClient, StreamTransport, cut
 from router.table.addresses import Address
 
 LENGTH = struct.Struct("<I")
@@ -33,13 +33,8 @@ class TcpTransport(StreamTransport):
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
         if self._prefixed:
-            wire = b"".join([part for frame in frames for part in (LENGTH.pack(len(frame.data)), frame.data)])
-        else:
-            wire = b"".join([part for frame in frames for part in (frame.data, b"\n")])
-        if len(wire) <= PIECE:
-            return Encoded([wire], len(wire))
-        whole = memoryview(wire)
-        return Encoded([whole[start : start + PIECE] for start in range(0, len(wire), PIECE)], len(wire))
+            return Encoded.of(part for frame in frames for part in (LENGTH.pack(len(frame.data)), *cut(frame.data)))
+        return Encoded.of(part for frame in frames for part in (*cut(frame.data), b"\n"))
 
     async def _serve(self, listening: socket.socket) -> None:
         limit = self.limits.message - 1  # of a line without its first byte
@@ -71,6 +66,7 @@ class TcpTransport(StreamTransport):
             report_fault("ended a TCP connection", error)
         finally:
             client.close()
+            client.has_left(reader.exception())
             self.leave(client)
 
     async def _read(self, client: StreamClient, reader: asyncio.StreamReader) -> None:

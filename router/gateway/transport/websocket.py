@@ -6,7 +6,8 @@ import asyncio
 import logging
 import re
 import socket
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from functools import partial
 from http import HTTPStatus
 from time import monotonic
@@ -16,7 +17,6 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode, Opcode
-from websockets.frames import Frame as WebsocketFrame
 from websockets.http11 import Request, Response
 from websockets.protocol import State
 
@@ -25,11 +25,14 @@ from router.gateway.transport.base import HIGH_WATER, PER_TURN, Events, Frame, r
 from router.gateway.transport.stream import (
     ACCEPTED_PER_TURN,
     MESSAGE_SECONDS,
-    PIECE,
     Encoded,
     Limits,
+    Part,
     StreamClient,
     StreamTransport,
+    cut,
+    size_of,
+    together,
 )
 from router.log import logger
 from router.table.addresses import Address
@@ -61,12 +64,12 @@ class WebsocketTransport(StreamTransport):
         self._connections: set[Connection] = set()
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
-        messages = [frame.data for frame in frames]
-        if self._text:
-            messages = [b"\n".join(messages)] if messages else []
         opcode = Opcode.TEXT if self._text else Opcode.BINARY
+        messages = [cut(frame.data) for frame in frames]
+        if self._text and messages:
+            messages = [[*messages[0], *(part for message in messages[1:] for part in (b"\n", *message))]]
         pieces = [piece for message in messages for piece in _serialized(opcode, message)]
-        return Encoded(pieces, sum(map(len, pieces)))
+        return Encoded(pieces, sum(map(size_of, pieces)))
 
     async def _serve(self, listening: socket.socket) -> None:
         self._server = await serve(
@@ -155,6 +158,7 @@ class Connection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self._owner.disconnected(self, exc)
+        self.client.has_left(exc)
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
@@ -218,17 +222,15 @@ def _is_cross_origin(headers: Headers) -> bool:
     return any([origin] != hosts or not _LOCAL.fullmatch(origin) for origin in origins)
 
 
-def _serialized(opcode: Opcode, message: bytes) -> list[bytes]:
-    """Return a message as websocket frames; split a large one into several, so that pings can pass between them."""
-    if len(message) <= PIECE:
-        return [WebsocketFrame(opcode, message).serialize(mask=False)]
-    whole = memoryview(message)
-    return [
-        WebsocketFrame(
-            Opcode.CONT if start else opcode, whole[start : start + PIECE], fin=start + PIECE >= len(message)
-        ).serialize(mask=False)
-        for start in range(0, len(message), PIECE)
-    ]
+def _serialized(opcode: Opcode, message: Sequence[Part]) -> Iterator[Sequence[Part]]:
+    """Yield a message as websocket frames; a large one is split into several, so that pings can pass between them."""
+    contents = list(together(message)) or [[]]
+    for number, content in enumerate(contents):
+        size = size_of(content)
+        kind, is_last = (Opcode.CONT if number else opcode), number == len(contents) - 1
+        # RFC 6455, 5.2: FIN and opcode, then the length in 7 bits, or in 16 bits after 126. A server does not mask.
+        first = is_last << 7 | kind
+        yield struct.pack(">BB", first, size) if size < 126 else struct.pack(">BBH", first, 126, size), *content
 
 
 class _DebugLog(logging.Handler):
