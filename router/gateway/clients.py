@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import count
 from typing import Any
@@ -11,6 +12,9 @@ from router.gateway.encoding import Encoding
 from router.gateway.kept import MOST_KEPT_BYTES
 from router.gateway.transport.base import HIGH_WATER, Client, Frame, Transport
 from router.log import FloodLog, logger
+
+MOST_BACKLOG = 256 << 20
+"""Bytes that wait for all clients of a gateway at which no more kept messages are sent."""
 
 
 class ClientQueue:
@@ -28,7 +32,11 @@ class ClientQueue:
         self.dropped = 0
         self.missed_topics: set[str] = set()
         """Topics with a queued frame that a newer one replaced."""
+        self.shown: dict[str, set[int]] = {}
+        """Times of publication (ns) of the kept messages that the client has, of topics that it has in part."""
+        self.has_left = False
         self._on_wire = on_wire
+        self._drained: asyncio.Future[None] | None = None
         self._behind_since: int | None = None
         self._schemas: dict[Hashable, Frame] = {}
         self._values: dict[str, Frame] = {}
@@ -78,6 +86,29 @@ class ClientQueue:
         self._held[topic] = []
         return True
 
+    async def takes_more(self, timeout: float) -> bool:
+        """Wait until frames can be written at once. Return False after `timeout` s, or if the client has left."""
+        until = asyncio.get_running_loop().time() + timeout
+        while not self.keeps_up:
+            if self._drained is None:
+                self._drained = asyncio.get_running_loop().create_future()
+            left = until - asyncio.get_running_loop().time()
+            if not (await asyncio.wait([self._drained], timeout=max(left, 0.0)))[0] or self.has_left:
+                return False
+        return not self.has_left
+
+    def leave(self) -> None:
+        """Free all frames: the client has left."""
+        self.has_left = True
+        for each in (self._schemas, self._values, self._held, self.shown):
+            each.clear()
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._drained is not None:
+            self._drained.set_result(None)
+            self._drained = None
+
     def release(self, topic: str, *, is_complete: bool = False) -> list[Frame]:
         """Return the held values of the topic, in order. `is_complete`: the kept messages include all others so far."""
         if topic in self._held_incomplete:
@@ -87,6 +118,10 @@ class ClientQueue:
         frames = self._held.pop(topic, [])
         self._held_bytes -= sum(len(frame.data) for frame in frames)
         return frames
+
+    def held_before(self, topic: str, sent_ns: int) -> list[Frame]:
+        """Return the held values of the topic that were published before this time; they stay held."""
+        return [frame for frame in self._held.get(topic, ()) if frame.sent_ns < sent_ns]
 
     def hold_back(self, frames: Sequence[Frame]) -> list[Frame]:
         """Return the frames that can be sent now, and hold the others. If these get too large, release all."""
@@ -120,6 +155,7 @@ class ClientQueue:
             self.write(self._take())
         if not self.waiting:
             self._behind_since = None
+            self._wake()
 
     def _take(self) -> list[Frame]:
         """Remove frames from the front of the queue: HIGH_WATER bytes, or one frame that is larger."""
@@ -184,6 +220,11 @@ class Clients:
         elif ready:
             ready[0].write(frames)
 
+    def has_room(self, size: int) -> bool:
+        """Return whether the backlogs of all clients leave room for a kept message of this size."""
+        backlog = sum(each.backlog() for each in self.queues)
+        return backlog == 0 or backlog + size <= MOST_BACKLOG
+
     def record_miss(self, topic: str) -> None:
         """Record that all clients missed a message of the topic."""
         for queue in self.queues.values():
@@ -209,6 +250,7 @@ class Clients:
     def left(self, client: Client) -> None:
         if (queue := self.queues.pop(client, None)) is not None:
             self._counters.left(queue.waiting + queue.held)
+            queue.leave()
             self._counters.clients(len(self.queues))
             self._log_change("client left", queue)
 

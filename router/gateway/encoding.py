@@ -69,6 +69,11 @@ class Sample:
             payload = self._payloads[style, level] = compress(plain, level) if level else plain
         return payload
 
+    def forget(self) -> None:
+        """Forget its JSON, which is made again if it is needed."""
+        self._texts.clear()
+        self._payloads.clear()
+
     def has_payload(self, style: Style, level: int) -> bool:
         """Return whether `payload` and `text` have been made already."""
         return (style, level) in self._payloads

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections import OrderedDict, deque
+from collections.abc import AsyncIterator, Callable, Hashable, Sequence
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
 
+from router.clock import wall_ns
 from router.errors import StartError
-from router.gateway.encoding import ReadyType, Sample
+from router.gateway.encoding import LARGE, ReadyType, Sample
 from router.gateway.publishers import keepers
-from router.gateway.transport.base import PER_TURN
+from router.gateway.transport.base import PER_TURN, Frame
 from router.log import logger
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -20,32 +22,106 @@ MOST_KEPT = 1000
 MOST_KEPT_BYTES = 64 << 20
 """Maximum messages of one topic, and their bytes, that late joiners get: the newest ones."""
 
+FIRST_BYTES = 8 << 20
+"""Bytes that are reserved for the messages of a topic during a fetch, unless they are large or turn out to be more."""
+
+MOST_FETCHED_BYTES = 2 * MOST_KEPT_BYTES
+"""Maximum bytes of fetched messages of all topics, and of the frames made from them."""
+
 POLL_S = 0.02
 QUIET_S = 0.1
-"""Publishers have delivered everything when nothing has arrived for this long."""
-
-AT_MOST_S = 0.5
-"""The longest wait on a topic that is never quiet."""
+"""Publishers have delivered everything when nothing that they kept has arrived for this long."""
 
 PATIENCE_S = 2.0
 """How long to wait for publishers that deliver nothing: they may have published nothing yet."""
+
+REPAIR_S = 4.0
+"""How long to wait in both cases if messages are large: Fast DDS sends a lost fragment again after 3 s."""
+
+LIMIT_S = 20.0
+"""The longest fetch: new messages of a publisher whose clock is behind look like kept ones."""
 
 FRESH_S = 1.0
 """How long fetched messages are reused if none arrives, so that many clients cost few subscriptions."""
 
 
-class Kept(NamedTuple):
-    """Fetched messages, and how many had `arrived` on the topic when the last one was taken."""
+class Kept:
+    """Fetched messages, and how many had `arrived` on the topic when the last one was taken.
 
-    samples: Sequence[Sample] = ()
-    arrived: int = -1
+    `frames` has the latest of their frames, by gateway and message, which the clients of a gateway share. `users` is
+    how many clients are being sent the messages.
+    """
+
+    def __init__(self, samples: Sequence[Sample] = (), arrived: int = -1, reserved: int = 0) -> None:
+        self.samples = samples
+        self.arrived = arrived
+        self.reserved = reserved
+        self.users = 0
+        self._frames: OrderedDict[Hashable, Frame] = OrderedDict()
+        self._size = 0
+
+    def frame(self, key: Hashable) -> Frame | None:
+        return self._frames.get(key)
+
+    def remember(self, key: Hashable, frame: Frame) -> None:
+        """Remember a frame, and forget the oldest ones if there are too many."""
+        if key not in self._frames:
+            self._frames[key] = frame
+            self._size += len(frame.data)
+        while self._size > self.reserved and len(self._frames) > 1:
+            self._size -= len(self._frames.popitem(last=False)[1].data)
+
+
+class FetchBudget:
+    """Limits the bytes of fetched messages, of all topics: fetches wait until there is room.
+
+    `large` lets one fetch of large messages run at a time: several at once overflow the buffers of the middleware,
+    which then sends lost fragments again every 3 s.
+    """
+
+    def __init__(self) -> None:
+        self.reserved = 0
+        self.large = asyncio.Lock()
+        self._owners: list[KeptMessages] = []
+        self._waiting: deque[asyncio.Future[None]] = deque()
+
+    async def reserve(self, size: int) -> None:
+        """Wait until there is room for `size` bytes. Messages that are sent to nobody make room."""
+        while self.reserved + size > MOST_FETCHED_BYTES:
+            if (idle := next((each for each in self._owners if each.is_idle), None)) is not None:
+                idle.forget()
+                continue
+            room = asyncio.get_running_loop().create_future()
+            self._waiting.append(room)
+            await room
+        self.reserved += size
+
+    def release(self, size: int) -> None:
+        self.reserved -= size
+        self.recheck()
+
+    def recheck(self) -> None:
+        """Let all fetches that wait check again."""
+        while self._waiting:
+            if not (room := self._waiting.popleft()).done():
+                room.set_result(None)
+
+    def add(self, owner: KeptMessages) -> None:
+        self._owners.append(owner)
+
+    def remove(self, owner: KeptMessages) -> None:
+        self._owners.remove(owner)
+
+
+class _TooMuchError(Exception):
+    """The messages exceed what is reserved for them."""
 
 
 class KeptMessages:
     """Fetches the messages from the publishers with a short-lived subscription.
 
     They are not cached here: only a publisher knows how many messages it keeps, and they vanish with it. `arrived`
-    returns the number of messages that have arrived on the topic so far.
+    returns the number of messages that have arrived on the topic so far, `latest` the newest of them.
     """
 
     def __init__(
@@ -55,23 +131,51 @@ class KeptMessages:
         topics: RosTopics,
         loop: asyncio.AbstractEventLoop,
         arrived: Callable[[], int],
+        latest: Callable[[], Sample | None],
+        budget: FetchBudget,
     ) -> None:
         self._topic = topic
         self._ready = ready
         self._topics = topics
         self._loop = loop
         self._arrived = arrived
-        self._tap: TopicTap | None = None
+        self._latest = latest
+        self._budget = budget
+        self._is_large = False
         self._asking: asyncio.Task[Kept] | None = None
+        self._waiting = 0
         self._found: Kept | None = None
         self._found_from: frozenset[bytes] = frozenset()
         self._forgetting: asyncio.TimerHandle | None = None
 
-    async def get(self) -> Kept:
-        """Return the messages in the order of publication. Concurrent calls share one subscription.
+    @asynccontextmanager
+    async def fetched(self) -> AsyncIterator[Kept]:
+        """Give the messages in the order of publication. Concurrent calls share one subscription.
 
         The result is empty if the subscription fails, which is logged, or is closed meanwhile.
         """
+        self._waiting += 1
+        try:
+            kept = await self._get()
+            kept.users += 1
+        finally:
+            self._waiting -= 1
+        try:
+            yield kept
+        finally:
+            kept.users -= 1
+            if kept is not self._found:
+                self._free(kept)
+            elif self.is_idle:
+                self._forget_later()
+                self._budget.recheck()
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether there are fetched messages, and nobody is being sent them."""
+        return self._found is not None and not self._found.users and not self._waiting
+
+    async def _get(self) -> Kept:
         if (asking := self._asking) is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
             if self._found and (self._found.arrived, self._found_from) == (self._arrived(), publishers):
@@ -85,55 +189,110 @@ class KeptMessages:
         if self._asking:
             self._asking.cancel()
             self._asking = None
-        if self._tap:
-            self._tap.close()
-            self._tap = None
-        self._forget()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the fetched messages, once they are sent to nobody."""
+        if self._forgetting:
+            self._forgetting.cancel()
+            self._forgetting = None
+        if (found := self._found) is not None:
+            self._found = None
+            self._budget.remove(self)
+            self._free(found)
+
+    def _forget_later(self) -> None:
+        if self._forgetting:
+            self._forgetting.cancel()
+        self._forgetting = self._loop.call_later(FRESH_S, self._forget_if_idle)
+
+    def _forget_if_idle(self) -> None:
+        if self.is_idle:
+            self.forget()
+
+    def _free(self, kept: Kept) -> None:
+        if not kept.users:
+            size, kept.reserved = kept.reserved, 0
+            self._budget.release(size)
 
     async def _ask(self, publishers: frozenset[bytes]) -> Kept:
-        self._forget()
-        found = Kept()
+        self.forget()
+        newest = self._latest()
+        self._is_large |= newest is not None and len(newest.cdr) > LARGE
         try:
-            self._tap = self._topics.tap(
-                self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
-            )
+            found = await self._fetch_all(len(publishers))
         except StartError as error:
             logger.warning(
                 "cannot fetch the messages that publishers keep for late joiners", topic=self._topic, error=str(error)
             )
-        else:
-            found = self._found = await self._collect(self._tap, len(publishers))
-            self._found_from = publishers
-            self._tap.close()
-            self._tap = None
-            self._forgetting = self._loop.call_later(FRESH_S, self._forget)
+            found = Kept()
+        if found.reserved:
+            self._found, self._found_from = found, publishers
+            self._budget.add(self)
+            self._forget_later()
         self._asking = None
         return found
 
-    async def _collect(self, tap: TopicTap, publishers: int) -> Kept:
+    async def _fetch_all(self, publishers: int) -> Kept:
+        """Fetch the messages. Raises StartError."""
+        if not self._is_large:
+            try:
+                return await self._fetch(publishers, FIRST_BYTES)
+            except _TooMuchError:
+                self._is_large = True
+        async with self._budget.large:
+            return await self._fetch(publishers, MOST_KEPT_BYTES)
+
+    async def _fetch(self, publishers: int, reserved: int) -> Kept:
+        """Fetch the messages within `reserved` bytes. Raises _TooMuchError, StartError."""
+        await self._budget.reserve(reserved)
+        kept: Kept | None = None
+        try:
+            tap = self._topics.tap(
+                self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
+            )
+            try:
+                kept = await self._collect(tap, publishers, reserved)
+            finally:
+                tap.close()
+            self._budget.release(reserved - kept.reserved)
+            return kept
+        finally:
+            if kept is None:
+                self._budget.release(reserved)
+
+    async def _collect(self, tap: TopicTap, publishers: int, reserved: int) -> Kept:
+        """Take messages until all that were published before have arrived.
+
+        A publisher delivers its messages in order. If there is only one, the newest message of the topic is the last.
+        Otherwise nobody knows how many there are, and the end is a pause.
+        """
+        newest = self._latest() if publishers == 1 else None
         samples: deque[Sample] = deque()
-        size = 0
+        size, is_complete = 0, False
+        begun_ns = wall_ns()
         begun = last = self._loop.time()
         while True:
             arrived = self._arrived()
             await asyncio.sleep(POLL_S)
             taken = 0
             while taken < MOST_KEPT and (message := tap.take()):
-                taken, last = taken + 1, self._loop.time()
-                samples.append(Sample(self._topic, self._ready, *message))
-                size += len(message[0])
+                taken += 1
+                sample = Sample(self._topic, self._ready, *message)
+                if sample.sent_ns <= begun_ns:
+                    last = self._loop.time()
+                is_complete |= newest is not None and sample.sent_ns >= newest.sent_ns
+                self._is_large |= len(sample.cdr) > LARGE
+                samples.append(sample)
+                size += len(sample.cdr)
+                if size > reserved == FIRST_BYTES:
+                    raise _TooMuchError
                 while len(samples) > MOST_KEPT or (size > MOST_KEPT_BYTES and len(samples) > 1):
                     size -= len(samples.popleft().cdr)
                 if taken % PER_TURN == 0:
                     await asyncio.sleep(0)
             now = self._loop.time()
-            is_quiet = len(samples) >= publishers and now - last > QUIET_S
-            is_late = now - begun > (AT_MOST_S if len(samples) >= publishers else PATIENCE_S)
-            if is_quiet or is_late:
-                return Kept(sorted(samples, key=lambda sample: sample.sent_ns), arrived)
-
-    def _forget(self) -> None:
-        self._found = None
-        if self._forgetting:
-            self._forgetting.cancel()
-            self._forgetting = None
+            pause = QUIET_S if len(samples) >= publishers else PATIENCE_S
+            is_quiet = now - last > (max(pause, REPAIR_S) if self._is_large else pause)
+            if is_complete or is_quiet or now - begun > LIMIT_S:
+                return Kept(sorted(samples, key=lambda sample: sample.sent_ns), arrived, max(size, 1))

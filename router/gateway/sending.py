@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Hashable, Iterable
+from collections.abc import AsyncGenerator, Hashable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import LARGE, Encoding, Sample
 from router.gateway.json_codec import UnreadableError
-from router.gateway.kept import MOST_KEPT
+from router.gateway.kept import MOST_KEPT, Kept
 from router.gateway.publishers import Selection
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import PER_TURN, Frame
@@ -226,7 +226,8 @@ class TopicSender:
             if is_new:
                 self._counters.dropped("mapping_error", sample.topic, error)
             return None
-        served.readable = sample
+        if served.readable is None or served.readable.sent_ns < sample.sent_ns:  # not an older one for a late client
+            served.readable = sample
         if len(data.data) > self._most:
             if is_new:
                 detail = f"{len(data.data)} bytes exceed the limit of {self._most}; {self._remedy}"
@@ -248,31 +249,36 @@ class TopicSender:
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 
-    async def kept(self, served: ServedTopic) -> tuple[list[Frame], bool]:
-        """Return the messages kept for late joiners, oldest first; then the latest value if others may have sent it.
-
-        The second value says whether no other message has arrived since.
-        """
+    async def kept(self, served: ServedTopic, kept: Kept) -> AsyncGenerator[Frame, None]:
+        """Yield the messages kept for late joiners, oldest first; then the latest value if others may have sent it."""
         topic = served.subscription
-        samples, arrived = await topic.kept.get()
+        samples = kept.samples
         if served.selection.is_mixed and (latest := topic.latest()):
             same = [each for each in samples if (each.sent_ns, each.cdr) != (latest.sent_ns, latest.cdr)]
             samples = [*same, latest]
-        frames: list[Frame] = []
         for number, sample in enumerate(samples, 1):
-            if not self._is_quick(sample):
-                await self._prepare(sample)
-            elif number % PER_TURN == 0:
+            if number % PER_TURN == 0:
                 await asyncio.sleep(0)
-            is_new = sample.sent_ns > served.refused_ns
-            if data := self._checked(served, sample, is_new=False):
-                frames.append(data._replace(older=len(samples) - number))
-            elif is_new:
-                self._counters.received(1)
-                self._checked(served, sample, is_new=True)
-                served.counted_early.append(sample.sent_ns)
-            served.refused_ns = max(served.refused_ns, sample.sent_ns)
-        return frames, arrived == topic.arrived
+            if (frame := await self._kept_frame(served, kept, sample)) is not None:
+                yield frame._replace(older=len(samples) - number)
+
+    async def _kept_frame(self, served: ServedTopic, kept: Kept, sample: Sample) -> Frame | None:
+        """Return the frame of a kept message, shared by all clients; None if it cannot be sent, which is counted."""
+        key = self, sample
+        if (frame := kept.frame(key)) is not None:
+            return frame
+        if not self._is_quick(sample):
+            await self._prepare(sample)
+        is_new = sample.sent_ns > served.refused_ns
+        if frame := self._checked(served, sample, is_new=False):
+            kept.remember(key, frame)
+        elif is_new:
+            self._counters.received(1)
+            self._checked(served, sample, is_new=True)
+            served.counted_early.append(sample.sent_ns)
+        served.refused_ns = max(served.refused_ns, sample.sent_ns)
+        sample.forget()
+        return frame
 
     def show(self, served: ServedTopic, frames: list[Frame]) -> None:
         """Append schema and latest value; only the schema if publishers keep messages.

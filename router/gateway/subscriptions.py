@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from router.compiler.lookup import definitions_of
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
-from router.gateway.kept import KeptMessages
+from router.gateway.kept import FetchBudget, KeptMessages
 from router.gateway.publishers import Selection, select
 from router.gateway.transport.base import PER_TURN
 from router.threads import DaemonThread
@@ -36,7 +36,14 @@ class TopicSubscription:
     """
 
     def __init__(
-        self, topic: str, ready: ReadyType, topics: RosTopics, loop: asyncio.AbstractEventLoop, *, is_each: bool
+        self,
+        topic: str,
+        ready: ReadyType,
+        topics: RosTopics,
+        loop: asyncio.AbstractEventLoop,
+        budget: FetchBudget,
+        *,
+        is_each: bool,
     ) -> None:
         self.topic = topic
         self.type_name = ready.message.name
@@ -56,7 +63,7 @@ class TopicSubscription:
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
-        self.kept = KeptMessages(topic, ready, topics, loop, lambda: self.arrived)
+        self.kept = KeptMessages(topic, ready, topics, loop, lambda: self.arrived, self.latest, budget)
         """The messages that publishers keep for late joiners."""
 
     @property
@@ -200,6 +207,7 @@ class Subscriptions:
         self._open: dict[tuple[str, bool], TopicSubscription] = {}  # by topic, and whether to every message
         self._types: dict[str, ReadyType | str] = {}  # or the reason why a type cannot be received
         self._loader = DaemonThread("gateway types")
+        self.fetches = FetchBudget()
 
     def resolved(self, names: Iterable[str]) -> frozenset[str]:
         """Return the absolute names of these topics, as ROS resolves them."""
@@ -239,7 +247,9 @@ class Subscriptions:
                 del self._open[key]
         key = topic, callback is not None
         if (subscription := self._open.get(key)) is None:
-            subscription = TopicSubscription(topic, ready, self._topics, self._loop, is_each=callback is not None)
+            subscription = TopicSubscription(
+                topic, ready, self._topics, self._loop, self.fetches, is_each=callback is not None
+            )
             self._open[key] = subscription
         try:
             subscription.add(wanted, callback)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from functools import partial
 from itertools import chain, count, repeat
 
@@ -15,10 +15,11 @@ from router.gateway.clients import ClientQueue, Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Sample
+from router.gateway.kept import FRESH_S, Kept
 from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import TopicSubscription
-from router.gateway.transport.base import PER_TURN, Frame
+from router.gateway.transport.base import LOW_WATER, PER_TURN, Frame
 from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
 
@@ -32,6 +33,10 @@ SHORTEST_PAUSE_S = 0.1
 
 RESEND_S = 0.5
 """The interval of checks for clients that lack messages which publishers still keep."""
+
+DRAIN_S = FRESH_S
+SHOW_S = 5.0
+"""How long kept messages wait for a client to drain: for one, and for all of a topic."""
 
 SHORTEST_TURN = 10_000_000
 """The minimum time between turns, ns: shorter ones cost more than they gain."""
@@ -226,28 +231,75 @@ class Topics:
 
     async def _show(self, queue: ClientQueue, topic: str, *, holds: bool) -> None:
         queue.missed_topics.discard(topic)
-        frames, is_complete = await self._kept(topic)
+        is_whole, is_complete = await self._write_kept(queue, topic)
+        known = queue.shown.get(topic, set()) if not is_whole else queue.shown.pop(topic, set())
         held = queue.release(topic, is_complete=is_complete) if holds else []
-        if queue.client not in self._clients.queues:
+        if queue.has_left:
             return
-        if frames and not queue.keeps_up:
+        if not is_whole:
             queue.missed_topics.add(topic)
-            frames = []
-        known = {frame.sent_ns for frame in frames}
         missing = [frame for frame in held if frame.sent_ns not in known]
-        self._clients.send_to(queue, sorted([*frames, *missing], key=lambda frame: frame.sent_ns))
+        self._clients.send_to(queue, sorted(missing, key=lambda frame: frame.sent_ns))
 
-    async def _kept(self, topic: str) -> tuple[list[Frame], bool]:
-        """Return the kept messages of a topic if it is still served, and whether no message has arrived since."""
-        while (served := self._served.get(topic)) is not None and served.selection.keepers:
+    async def _write_kept(self, queue: ClientQueue, topic: str) -> tuple[bool, bool]:
+        """Write the kept messages of a topic as the client drains, without those that it has.
+
+        Return whether it has all of them, and whether no other message has arrived since.
+        """
+        is_whole = is_complete = True
+        while (served := self._served.get(topic)) is not None and served.selection.keepers and not queue.has_left:
             try:
-                kept = await self._sender.kept(served)
+                async with served.subscription.kept.fetched() as kept:
+                    is_whole = await self._write_fetched(queue, served, kept)
+                    is_complete = kept.arrived == served.subscription.arrived
             except Exception as error:  # noqa: BLE001 reported; other messages are still sent
                 self._failed(error)
                 break
             if not served.has_ended:
-                return kept
-        return [], False
+                return is_whole, is_complete
+        return True, False
+
+    async def _write_fetched(self, queue: ClientQueue, served: ServedTopic, kept: Kept) -> bool:
+        """Write fetched messages as the client drains. Return False if it does not within SHOW_S, or DRAIN_S for one.
+
+        Then it gets the others later, from publishers that still keep them.
+        """
+        topic = served.subscription.topic
+        known = queue.shown.setdefault(topic, set())
+        skipped = {
+            *known,
+            *(sample.sent_ns for sample in kept.samples),
+        }  # held ones that come, or came, from publishers
+        begun_with = frozenset(known)
+        until = asyncio.get_running_loop().time() + SHOW_S
+        waiting: list[Frame] = []
+        async with aclosing(self._sender.kept(served, kept)) as frames:
+            async for frame in frames:
+                if queue.has_left:
+                    return False
+                if frame.sent_ns in begun_with:
+                    continue
+                if waiting and sum(len(each.data) for each in (*waiting, frame)) > LOW_WATER:
+                    if not await self._write_when_drained(queue, waiting, until):
+                        return False
+                    known.update(each.sent_ns for each in waiting)
+                    waiting = []
+                held = [each for each in queue.held_before(topic, frame.sent_ns) if each.sent_ns not in skipped]
+                skipped.update(each.sent_ns for each in held)
+                waiting += (*held, frame)
+        if waiting and not await self._write_when_drained(queue, waiting, until):
+            return False
+        known.update(each.sent_ns for each in waiting)
+        return True
+
+    async def _write_when_drained(self, queue: ClientQueue, frames: Sequence[Frame], until: float) -> bool:
+        left = until - asyncio.get_running_loop().time()
+        if left < 0 or not await queue.takes_more(min(left, DRAIN_S)):
+            return False
+        if not self._clients.has_room(sum(len(frame.data) for frame in frames)):
+            return False
+        queue.write(frames)
+        return True
 
     def _introduce(self, served: ServedTopic) -> None:
         """Begin to serve a topic while there are clients."""
@@ -291,8 +343,12 @@ class Topics:
         topics = list(self._served.values())
         for served in topics:
             self._sender.show(served, frames)
-        kept = [self._sender.kept(served) for served in topics if served.selection.keepers]
-        return frames + [frame for frames, _ in await asyncio.gather(*kept) for frame in frames]
+        kept = [self._all_kept(served) for served in topics if served.selection.keepers]
+        return [*frames, *chain.from_iterable(await asyncio.gather(*kept))]
+
+    async def _all_kept(self, served: ServedTopic) -> list[Frame]:
+        async with served.subscription.kept.fetched() as kept:
+            return [frame async for frame in self._sender.kept(served, kept)]
 
     def rates(self, seconds: float) -> Iterator[tuple[str, str, float]]:
         """Yield every topic with its type and its rate over the `seconds` since the last call."""

@@ -58,7 +58,8 @@ def latched(graph: LatchedGraph) -> Iterator[TopicSubscription]:
 
 
 async def messages(topic: TopicSubscription) -> list[bytes]:
-    return [sample.cdr for sample in (await topic.kept.get()).samples]
+    async with topic.kept.fetched() as kept:
+        return [sample.cdr for sample in kept.samples]
 
 
 @asynchronous

@@ -205,7 +205,7 @@ async def test_what_publishers_keep_comes_to_a_slow_client_when_it_keeps_up_agai
             await until(lambda: len(behind.texts) == 3)
             later = LateClient(played)
             later.is_slow = True  # before it gets what it came for
-            assert stage.count("client_messages_dropped", "it", "superseded") == 2
+            await until(lambda: stage.count("client_messages_dropped", "it", "superseded") == 2)
             await asyncio.sleep(1.0)
             assert slow.texts == later.texts == []
             for each in (slow, later):

@@ -121,7 +121,7 @@ class StreamClient:
         self._is_open = is_open
         self._pieces: deque[Sequence[Part]] = deque()
         self._waiting = 0
-        self._writing: asyncio.Task[None] | None = None
+        self._writing: asyncio.Handle | asyncio.Task[None] | None = None
         _configure(connection)
 
     def write(self, frames: Sequence[Frame]) -> None:
@@ -133,9 +133,7 @@ class StreamClient:
         self._pieces.extend(encoded.pieces)
         self._waiting += encoded.size
         if self._writing is None:
-            self._write_now()
-            if self.backlog():
-                self._writing = asyncio.get_running_loop().create_task(self._write_later())
+            self._writing = asyncio.get_running_loop().call_soon(self._begin)
 
     def backlog(self) -> int:
         return self._waiting + self._connection.get_write_buffer_size()
@@ -146,24 +144,36 @@ class StreamClient:
     def close(self) -> None:
         self._connection.abort()
 
-    def has_left(self, error: BaseException | None) -> None:
-        """Free what was written, whatever still refers to the connection or to the `error` that ended it."""
+    def has_left(self) -> None:
+        """Free what was not written, whatever still refers to the client."""
         self._pieces.clear()
         self._waiting = 0
-        if error is not None:
-            error.__traceback__ = None  # its frames refer to the messages that were being written
+
+    def _begin(self) -> None:
+        """Write what has been pushed in this turn of the loop.
+
+        Not from `push`: if that fails, the error refers to the frames of all callers, and thus to their messages, until
+        it is garbage-collected.
+        """
+        self._writing = None
+        self._write_now()
+        if self.backlog():
+            self._writing = asyncio.get_running_loop().create_task(self._write_later())
 
     def _write_now(self) -> None:
         """Write pieces, small ones together, until the kernel takes no more."""
         connection = self._connection
         while self._pieces and not connection.get_write_buffer_size() and not connection.is_closing():
-            batch = [*self._pieces.popleft()]
-            size = size_of(batch)
-            while self._pieces and size + size_of(self._pieces[0]) <= PIECE:
-                size += size_of(self._pieces[0])
-                batch += self._pieces.popleft()
-            self._waiting -= size
-            connection.write(batch[0] if len(batch) == 1 else b"".join(batch))
+            connection.write(self._next())
+
+    def _next(self) -> bytes:
+        batch = [*self._pieces.popleft()]
+        size = size_of(batch)
+        while self._pieces and size + size_of(self._pieces[0]) <= PIECE:
+            size += size_of(self._pieces[0])
+            batch += self._pieces.popleft()
+        self._waiting -= size
+        return b"".join(batch)
 
     async def _write_later(self) -> None:
         try:

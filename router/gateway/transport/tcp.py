@@ -66,7 +66,7 @@ class TcpTransport(StreamTransport):
             report_fault("ended a TCP connection", error)
         finally:
             client.close()
-            client.has_left(reader.exception())
+            client.has_left()
             self.leave(client)
 
     async def _read(self, client: StreamClient, reader: asyncio.StreamReader) -> None:

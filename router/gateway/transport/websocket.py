@@ -158,7 +158,7 @@ class Connection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self._owner.disconnected(self, exc)
-        self.client.has_left(exc)
+        self.client.has_left()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
