@@ -121,7 +121,8 @@ class KeptMessages:
     """Fetches the messages from the publishers with a short-lived subscription.
 
     They are not cached here: only a publisher knows how many messages it keeps, and they vanish with it. `arrived`
-    returns the number of messages that have arrived on the topic so far, `latest` the newest of them.
+    returns the number of messages that have arrived on the topic so far, `latest` the newest of them
+    if all publishers keep messages.
     """
 
     def __init__(
@@ -292,7 +293,7 @@ class KeptMessages:
                 if taken % PER_TURN == 0:
                     await asyncio.sleep(0)
             now = self._loop.time()
-            pause = QUIET_S if len(samples) >= publishers else PATIENCE_S
+            pause = QUIET_S if newest is None and len(samples) >= publishers else PATIENCE_S
             is_quiet = now - last > (max(pause, REPAIR_S) if self._is_large else pause)
             if is_complete or is_quiet or now - begun > LIMIT_S:
                 return Kept(sorted(samples, key=lambda sample: sample.sent_ns), arrived, max(size, 1))

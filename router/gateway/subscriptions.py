@@ -63,7 +63,9 @@ class TopicSubscription:
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
-        self.kept = KeptMessages(topic, ready, topics, loop, lambda: self.arrived, self.latest, budget)
+        self.kept = KeptMessages(
+            topic, ready, topics, loop, lambda: self.arrived, lambda: self.latest() if self._keeps else None, budget
+        )
         """The messages that publishers keep for late joiners."""
 
     @property
