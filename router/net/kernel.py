@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Linux constants that the socket module does not name.
 SO_ATTACH_FILTER = 26
+SO_TIMESTAMP = 29
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_MEMINFO = 55
@@ -57,6 +58,24 @@ def send_arrivals(opened: socket.socket) -> None:
             raise
         _warn_once("the kernel does not send arrival times with datagrams: each datagram costs one more system call")
         arrivals(opened)
+
+
+def discard_unstamped(opened: socket.socket) -> None:
+    """Discard what is queued in a socket that does not note arrivals, with a warning: read later, it would look new."""
+    if any(opened.getsockopt(socket.SOL_SOCKET, option) for option in (SO_TIMESTAMPNS, SO_TIMESTAMP)):
+        return
+    count = 0
+    with suppress(BlockingIOError):
+        while True:
+            opened.recv(1, socket.MSG_DONTWAIT)
+            count += 1
+    if count:
+        logger.warning(
+            "datagrams of unknown age waited in an inherited socket and were discarded",
+            address="{}:{}".format(*opened.getsockname()),
+            datagrams=count,
+            remedy="write Timestamping=ns in its socket unit",
+        )
 
 
 def arrivals(opened: socket.socket) -> Callable[[], int]:

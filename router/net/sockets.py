@@ -16,6 +16,7 @@ from router.net.kernel import (
     IP_FREEBIND,
     ask_for_receive_buffer,
     bound_interface,
+    discard_unstamped,
     receive_buffer,
     refuse_input,
     report_sending_errors,
@@ -131,6 +132,8 @@ class ListeningSocket:
         self.address = address
         self.is_waiting = False
         try:
+            if handed_over is not None:
+                discard_unstamped(handed_over)
             send_arrivals(self.socket)
             # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
             # would steal the port unnoticed.

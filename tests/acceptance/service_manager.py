@@ -23,16 +23,21 @@ LAUNCH = 'n=3; for fd in $FDS; do eval "exec $n<&$fd $fd<&-"; n=$((n + 1)); done
 
 
 class ServiceManager:
-    """`told` has all notifications of the routers. The sockets have the options of rover-router.socket."""
+    """`told` has all notifications of the routers. The sockets have the options of rover-router.socket.
+
+    Without `stamps`, the kernel does not note when datagrams arrive, as for a socket unit without Timestamping=.
+    """
 
     module = "router"
 
-    def __init__(self, folder: Path, table: Path, *addresses: tuple[str, int], **environment: str) -> None:
+    def __init__(
+        self, folder: Path, table: Path, *addresses: tuple[str, int], stamps: bool = True, **environment: str
+    ) -> None:
         self._folder = folder
         self._table = table
         self._environment = environment
         self._log = folder / "router.log"
-        self.sockets = [_held(address) for address in addresses]
+        self.sockets = [_held(address, stamps=stamps) for address in addresses]
         sleep(0.2)  # the kernel starts to timestamp datagrams a moment after the first socket requests it
         self.told: list[str] = []
         self.process: subprocess.Popen[bytes] | None = None
@@ -104,9 +109,9 @@ def room_of(opened: socket.socket) -> int:
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
-def _held(address: tuple[str, int]) -> socket.socket:
+def _held(address: tuple[str, int], *, stamps: bool) -> socket.socket:
     held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     make_room(held)
-    held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamps)
     held.bind(address)
     return held

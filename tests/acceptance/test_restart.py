@@ -115,12 +115,14 @@ class Basestation:
 
 
 @contextmanager
-def rover(folder: Path, listeners: int, basestation: int, board: int) -> Iterator[ServiceManager]:
+def rover(
+    folder: Path, listeners: int, basestation: int, board: int, *, stamps: bool = True
+) -> Iterator[ServiceManager]:
     addresses = [(host, free_port(host)) for host in HOSTS[:listeners]]
     names = (f"number_{n}: {{address: '{host}:{port}'}}" for n, (host, port) in enumerate(addresses))
     table = folder / "table.yaml"
     table.write_text(TABLE.format(root=ROOT, listeners=", ".join(names), basestation=basestation, board=board))
-    with closing(ServiceManager(folder, table, *addresses)) as manager:
+    with closing(ServiceManager(folder, table, *addresses, stamps=stamps)) as manager:
         yield manager
 
 
@@ -173,10 +175,12 @@ def test_an_orderly_restart_loses_nothing_and_a_kill_at_most_the_datagram_in_han
 
 
 @contextmanager
-def board_and_operator(folder: Path) -> Iterator[tuple[ServiceManager, socket.socket, socket.socket]]:
+def board_and_operator(
+    folder: Path, *, stamps: bool = True
+) -> Iterator[tuple[ServiceManager, socket.socket, socket.socket]]:
     with udp("127.0.0.222") as board, udp("127.0.0.10") as operator:
         ports = operator.getsockname()[1], board.getsockname()[1]
-        with rover(folder, 1, *ports) as manager:
+        with rover(folder, 1, *ports, stamps=stamps) as manager:
             yield manager, board, operator
 
 
@@ -211,3 +215,22 @@ def test_what_waited_for_the_router_goes_behind_the_brake_or_nowhere_if_it_is_st
         board.setblocking(False)
         with pytest.raises(BlockingIOError):
             board.recv(1000)
+
+
+def test_what_waited_in_a_socket_without_arrival_times_is_discarded(tmp_path: Path) -> None:
+    """Read later, each would look new, so an old command would release the brake."""
+    drive, arm = envelope("manual_drive", forward_backward=50), envelope("manual_arm", speed=1)
+    with board_and_operator(tmp_path, stamps=False) as (manager, board, operator):
+        address = manager.sockets[0].getsockname()
+        for each in [drive, arm] * 20:
+            operator.sendto(each, address)
+        sleep(1.1)
+        manager.start()
+        manager.hear("READY=1")
+        operator.sendto(arm, address)
+        assert [board.recv(1000), board.recv(1000)] == [envelope("manual_brake", brake=True), arm]
+        assert '"datagrams": 40' in manager.text()
+        board.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            board.recv(1000)
+        assert manager.end(signal.SIGTERM) == 0
