@@ -60,6 +60,7 @@ UNITS = {
     "address": "IPv4 address and port",
     "path": "path",
     "duration": "time",
+    "age_limit": "time or {none: why}",
     "period": "time or `each`",
     "size": "size",
     "disk_size": "size",

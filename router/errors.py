@@ -121,6 +121,10 @@ class Code(enum.Enum):
         "doubtful-deadman",
         "A deadman that may not serve its purpose, for example with a timeout of 500 s.",
     )
+    NO_TTL = (
+        "no-ttl",
+        "Nothing drops old commands: one may follow the deadman's payload, or move the rover at the start.",
+    )
     # the mapping
     DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two members of one oneof.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
@@ -154,6 +158,7 @@ _WARNINGS = frozenset(
         Code.NOT_LOCKED,
         Code.NO_DEADMAN,
         Code.DOUBTFUL_DEADMAN,
+        Code.NO_TTL,
         Code.CUT_EXPRESSION,
     }
 )

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from router.compiler.brakes import brake_findings
 from router.compiler.checked import CheckedRoute
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
@@ -111,6 +112,7 @@ def check_table(
         *_board_findings(table, boards),
         *lookup.findings,
         *clash_findings(table),
+        *brake_findings(table, routes),
         *topic_findings(table, [checked.route for checked in routes]),
     ]
     own_topics = [(own, own_type)] if own and own_type else []

@@ -316,6 +316,7 @@ def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
     route = structure(
         Route,
         settings,
+        **_without_ttl(settings),
         name=case.text,
         span=span,
         case=Located(case.text, case.span),
@@ -329,6 +330,12 @@ def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
     if reason := optional_text(mapping(entry.value), "none"):
         return replace(route, no_deadman=reason.value)
     return replace(route, deadman=_deadman(entry, tuple(each.endpoint for each in route.destinations)))
+
+
+def _without_ttl(settings: MappingNode) -> Mapping[str, str | None]:
+    """Return the values of a model for `ttl: {none: why}`; none if `ttl` is a duration or missing."""
+    ttl = settings.get("ttl")
+    return {"ttl": None, "no_ttl": located(ttl.get("none")).value} if isinstance(ttl, MappingNode) else {}
 
 
 def _members(node: Node | None) -> Sequence[Node]:
@@ -537,7 +544,9 @@ def _inbound(node: Node, span: SourceSpan) -> Inbound:
     settings = mapping(node)
     entry = settings.entries.get("deadman")
     deadman = _inbound_deadman(entry) if entry else None
-    return structure(Inbound, settings, span=span, topic=_topic(node, span), deadman=deadman)
+    return structure(
+        Inbound, settings, **_without_ttl(settings), span=span, topic=_topic(node, span), deadman=deadman
+    )
 
 
 def _inbound_deadman(entry: Entry) -> InboundDeadman:

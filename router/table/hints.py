@@ -181,7 +181,8 @@ def for_value(error: SchemaError) -> str:
         pattern = error.limit
         is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited")
         if is_unset:
-            return f"leave '{error.path[-1]}' out"
+            takes_reason = error.path[-1] == "ttl" and error.path[0] != "defaults"
+            return "write `ttl: {none: why}`" if takes_reason else f"leave '{error.path[-1]}' out"
         return as_variable(value) or _locator(value, error) or _meant_quantity(value, pattern)
     if error.keyword == "maximum" and matches(EACH, str(error.schema.get("pattern", ""))):
         return _MOST_OFTEN[1]

@@ -366,7 +366,8 @@ class Route:
     log: the payload case, or, for one of several routes of a case, a name such as `imu_info_from_ros`. `ignore` is the
     reason for ignoring the case. Messages come from `sources`, which are names of endpoints or only `any`, or from
     `source_topics`. `topics` (published) and `collect` are for the former, `fields` and `for_each` for the latter.
-    `ttl` is in ns. `no_deadman` is the reason why a route with commands has no deadman.
+    `ttl` is in ns. `no_ttl` is the reason why messages of any age may leave, `no_deadman` why a route with commands has
+    no deadman.
     """
 
     name: str
@@ -379,6 +380,7 @@ class Route:
     fields: FieldMap | None = None
     ignore: str | None = None
     ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
+    no_ttl: Annotated[str | None, Words("no ttl: {}")] = None
     deadman: Deadman | None = None
     no_deadman: str | None = None
     for_each: Expression | None = None
@@ -489,11 +491,12 @@ class InboundDeadman(DeadmanKeys):
 
 @dataclass(frozen=True, slots=True)
 class Inbound:
-    """A topic that a gateway's clients may publish on. `ttl` is in ns."""
+    """A topic that a gateway's clients may publish on. `ttl` and `no_ttl` are as in a route."""
 
     topic: Topic
     span: SourceSpan
     ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
+    no_ttl: Annotated[str | None, Words("no ttl: {}")] = None
     deadman: InboundDeadman | None = None
 
 

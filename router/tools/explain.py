@@ -131,6 +131,8 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             yield f"    disarmed by commands of {', '.join(deadman.disarmed_by)}"
     if route.no_deadman is not None:
         yield f"  no deadman: {route.no_deadman}"
+    if no_ttl := phrases(route).get("no_ttl"):
+        yield f"  {no_ttl}"
 
 
 def _source(name: str, table: RouteTable) -> str:

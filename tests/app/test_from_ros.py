@@ -9,6 +9,7 @@ import struct
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from time import sleep
 
 import pytest
 from structlog.testing import capture_logs
@@ -236,3 +237,25 @@ def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
             == 1
         )
         assert [each.raw.take() for each in ros._subscriptions.values()] == [None]  # it is open
+
+
+LATCHED = f"""\
+  drive_motor:
+    source: {{topic: drive_motor, type: {TYPE}, qos: {{durability: transient_local}}}}
+    fields: auto
+    destinations: [basestation]
+    ttl: TTL
+    deadman: {{none: for this test}}
+"""
+
+
+@pytest.mark.parametrize(("ttl", "sent"), [("1s", 0), ("{none: it is a setting}", 1)])
+def test_a_latched_command_from_before_the_start_is_sent_only_without_ttl(site: Site, ttl: str, sent: int) -> None:
+    with closing(Publisher("drive_motor", TYPE, "--transient-local", "--depth", "1")) as publisher:
+        publisher.publish([command(7)])
+        publisher.await_receipt()
+        sleep(1.2)
+        with site.router(LATCHED.replace("TTL", ttl)) as router:
+            wait_until(lambda: router.totals()["messages_received"] == 1)
+        totals = router.totals()
+    assert (totals["datagrams_sent"], totals["messages_dropped"]) == (sent, 1 - sent)

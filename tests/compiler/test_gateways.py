@@ -37,7 +37,7 @@ PUBLISHES = (
 SUBSCRIBES = """routes: {ph_info: {source: {topic: %s, type: std_msgs/msg/Float32},
   fields: {ph_value: data}, destinations: [base]}}"""
 
-BRAKES = SUBSCRIBES.replace("source:", "deadman: {timeout: 1s, send: {ph_info: {}}, to: [base]}, source:")
+BRAKES = SUBSCRIBES.replace("[base]", "[board], ttl: 1s, deadman: {timeout: 1s, send: {ph_info: {}}}")
 
 
 def checked(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> Checked:
@@ -137,15 +137,18 @@ def test_gateways_do_not_send_to_each_other(check_text: CheckText) -> None:
         (f"{{{TWIST}}}, {{{TWIST}}}", [Code.BAD_VALUE]),
         (f"{{{TWIST}}}, {{topic: cmd_vel, type: geometry_msgs/msg/Twist}}", [Code.BAD_VALUE]),
         (f"{{{TWIST}, qos: {{history: keep_all}}}}", [Code.QOS_CONFLICT]),
-        (f"{{{TWIST}, max_rate: 2, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.BAD_VALUE]),
-        (f"{{{TWIST}, max_rate: 2.1, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
-        (f"{{{TWIST}, deadman: {{timeout: 500ms, send: {{}}, repeat: 9ms}}}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}, max_rate: 2, ttl: 200ms, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}, max_rate: 2.1, ttl: 200ms, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
+        (f"{{{TWIST}, ttl: 200ms, deadman: {{timeout: 500ms, send: {{}}, repeat: 9ms}}}}", [Code.BAD_VALUE]),
         (f"{{{TWIST}, ttl: 5s, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.DOUBTFUL_DEADMAN]),
-        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.w: 0}}}}}}", [Code.UNKNOWN_FIELD]),
-        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: y}}}}}}", [Code.UNKNOWN_FIELD]),
-        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: received_at}}}}}}", [Code.UNKNOWN_FIELD]),
-        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: '1 / 0'}}}}}}", [Code.OUT_OF_RANGE]),
-        ("{topic: /a, type: std_msgs/msg/UInt8, deadman: {timeout: 1s, send: {data: 256}}}", [Code.OUT_OF_RANGE]),
+        (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.w: 0}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: y}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: received_at}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: '1 / 0'}}}}}}", [Code.OUT_OF_RANGE]),
+        (
+            "{topic: /a, type: std_msgs/msg/UInt8, ttl: 1s, deadman: {timeout: 1s, send: {data: 256}}}",
+            [Code.OUT_OF_RANGE],
+        ),
     ],
 )
 def test_what_is_let_in_is_checked(check_text: CheckText, inbound: str, found: list[Code]) -> None:
@@ -185,7 +188,7 @@ def test_gateways_that_let_in_one_topic_agree_on_its_type(
     assert codes(check_text, f"{a}, {b}") == found
 
 
-DEADMAN = "deadman: {timeout: 500ms, send: {}}"
+DEADMAN = "ttl: 200ms, deadman: {timeout: 500ms, send: {}}"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +201,7 @@ DEADMAN = "deadman: {timeout: 500ms, send: {}}"
         (PUBLISHES % "/a", DEADMAN, None, 1),
         (SUBSCRIBES % "/a", DEADMAN, None, 0),
         (BRAKES % "/a", DEADMAN, None, 1),
-        (BRAKES % "/a", "", None, 0),
+        (BRAKES % "/a", "ttl: 200ms", None, 0),
         (BRAKES % "/b", DEADMAN, None, 0),
     ],
 )
@@ -320,7 +323,7 @@ def test_what_clients_publish_with_a_time_limit_or_a_deadman_are_commands(
 
 def test_a_deadman_of_clients_may_publish_nan(check_text: CheckText) -> None:
     deadman = "{timeout: 1s, send: {linear.x: nan}}"
-    assert codes(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, deadman: {deadman}}}]}}") == []
+    assert codes(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, ttl: 1s, deadman: {deadman}}}]}}") == []
 
 
 NO_GOSSIP = "config: {scouting: {gossip: {enabled: false}}}"

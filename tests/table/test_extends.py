@@ -107,6 +107,17 @@ def test_a_reason_takes_the_place_of_a_deadman(base: Path) -> None:
     assert not any(route.deadman for route in table.routes)
 
 
+def test_a_reason_and_a_ttl_replace_each_other(base: Path) -> None:
+    (base / "any.yaml").write_text("extends: base.yaml\nroutes:\n  manual_drive: {ttl: {none: it is a test}}\n")
+    [at_any_age] = [route for route in good(base, "extends: any.yaml\n").routes if route.deadman]
+    assert (at_any_age.ttl, at_any_age.no_ttl) == (None, "it is a test")
+    [limited] = [
+        route for route in good(base, "extends: any.yaml\nroutes: {manual_drive: {ttl: 1s}}\n").routes if route.deadman
+    ]
+    assert limited.ttl
+    assert (limited.ttl.value, limited.no_ttl) == (1_000_000_000, None)
+
+
 def test_chains_are_followed_from_file_to_file(base: Path) -> None:
     (base / "deep").mkdir()
     (base / "deep" / "middle.yaml").write_text("extends: ../base.yaml\nnode: {name: middle}\n")

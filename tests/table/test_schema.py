@@ -71,12 +71,12 @@ MODELS: list[tuple[str, type, set[str]]] = [
     ("destination", Destination, set()),
     ("topic", Topic, set()),
     ("qos", Qos, set()),
-    ("route", Route, {"case", "no_deadman", "source_topics"}),
+    ("route", Route, {"case", "no_deadman", "no_ttl", "source_topics"}),
     ("deadman", Deadman, set()),
     ("collect", Collect, set()),
     ("gateway", Gateway, {"address", "zenoh"}),
     ("zenoh", ZenohSettings, set()),
-    ("inbound", Inbound, {"topic"}),
+    ("inbound", Inbound, {"topic", "no_ttl"}),
     ("inbound_deadman", InboundDeadman, set()),
 ]
 """Definitions, the classes that declare their keys, and which of the fields are no keys of their own."""

@@ -60,6 +60,10 @@ DEFAULTS = "{queue_depth: 7, ttl: 2s, deadman: {timeout: 1s, repeat: 50ms}}"
         ("{source: arm, topic: a}", "{source: arm, ttl: 2s, topic: {topic: a, queue_depth: 7}}"),
         ("{source: arm, ttl: 1s, topic: a}", "{source: arm, ttl: 1s, topic: {topic: a, queue_depth: 7}}"),
         (
+            "{source: arm, ttl: {none: why}, topic: a}",
+            "{source: arm, ttl: {none: why}, topic: {topic: a, queue_depth: 7}}",
+        ),
+        (
             "{source: arm, topic: {topic: a, queue_depth: 3}}",
             "{source: arm, ttl: 2s, topic: {topic: a, queue_depth: 3}}",
         ),
