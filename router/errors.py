@@ -114,6 +114,10 @@ class Code(enum.Enum):
         "board-payload",
         "A payload that a board's firmware cannot decode: no fixed size, too large, or not finite.",
     )
+    EMPTY_FIELD = (
+        "empty-field",
+        "A field of the envelope, beside the payload, that nothing fills where the router makes envelopes for boards.",
+    )
     NO_TARGET = ("no-target", "A route without destinations or topics.")
     SOURCE_CLASH = ("source-clash", "Two routes of one payload case have the same source.")
     NO_DEADMAN = ("no-deadman", "Nothing stops the board when its commands stop arriving.")
@@ -159,6 +163,7 @@ _WARNINGS = frozenset(
         Code.NO_DEADMAN,
         Code.DOUBTFUL_DEADMAN,
         Code.NO_TTL,
+        Code.EMPTY_FIELD,
         Code.CUT_EXPRESSION,
     }
 )

@@ -110,6 +110,7 @@ def check_table(
         *(lock.findings(table.envelope.lock) if lock and table.envelope else ()),
         *network_findings(table),
         *_board_findings(table, boards),
+        *_envelope_findings(table, schema, envelope, routes),
         *lookup.findings,
         *clash_findings(table),
         *brake_findings(table, routes),
@@ -145,6 +146,35 @@ def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Ite
             what = f"the envelope for '{name}' has {messages:,} nested messages and {lists:,} repeated fields"
             hint = f"the limits are {MOST_MESSAGES:,} and {MOST_LISTS:,}: make it another kind of endpoint"
             yield Diagnostic(table.endpoints[name].span, Code.TOO_LARGE, what, hint)
+
+
+def _envelope_findings(
+    table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Iterable[CheckedRoute]
+) -> Iterator[Diagnostic]:
+    """Yield findings for fields beside the payload, which are empty in envelopes that the router makes.
+
+    It makes them from messages from ROS and for deadmen; forwarded ones keep their fields.
+    """
+    names = [name for checked in routes for name in _made_for(checked) if name in table.endpoints]
+    if table.envelope is None or not names:
+        return
+    span = table.envelope.message.span
+    beside = [member for member in schema.messages[envelope.name].fields if member.oneof != envelope.oneof]
+    for name in (member.name for member in beside if member.is_required):
+        message = f"nothing fills '{name}', which {envelope.name} requires, in envelopes for '{names[0]}'"
+        yield Diagnostic(span, Code.MISSING_KEY, message, f"see {schema.span(envelope.name, name)}; make it optional")
+    board = next((name for name in names if table.endpoints[name].kind is EndpointKind.BOARD), None)
+    empty = [member.name for member in beside if not member.is_required]
+    if board is not None and empty and table.envelope.because is None:
+        message = f"nothing fills {', '.join(empty)} of {envelope.name} in envelopes for '{board}' from ROS or deadmen"
+        hint = "a board that checks them obeys only forwarded envelopes; if none does, add `because: why` to 'envelope'"
+        yield Diagnostic(span, Code.EMPTY_FIELD, message, hint)
+
+
+def _made_for(checked: CheckedRoute) -> Iterator[str]:
+    """Yield the endpoints to which a route sends envelopes that the router makes."""
+    yield from (target.label for subscription in checked.subscriptions for target in subscription.targets)
+    yield from (name for name, _ in (checked.deadman.datagrams if checked.deadman else ()))
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:

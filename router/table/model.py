@@ -81,7 +81,7 @@ class EnvelopeSettings:
     """The envelope: `message` and `oneof`, declared in `protos`, an absolute path (by default the router's own protos).
 
     `lock` is the absolute path of the lock file, None if it is beside the protos. `exclude` are files and folders
-    relative to `protos`.
+    relative to `protos`. `because` is the reason why other fields of the message may be empty.
     """
 
     protos: Located[Path]
@@ -89,6 +89,7 @@ class EnvelopeSettings:
     oneof: Located[str]
     lock: Located[Path] | None = None
     exclude: tuple[Located[str], ...] = ()
+    because: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

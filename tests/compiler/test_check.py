@@ -16,6 +16,8 @@ import pytest
 from router.carrier.image import image_of
 from router.carrier.library import library
 from router.compiler import check, check_table
+from router.errors import Code
+from tests.bad_tables.corpus import HERE
 from tests.tables import ROUTES
 
 
@@ -50,6 +52,42 @@ def test_every_process_makes_the_same_program(name: str) -> None:
     ]  # fmt: skip
     assert len(made[0]) > 10_000
     assert made[0] == made[1]
+
+
+BESIDE = """
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload{because}}}
+listen: {{rover: {{address: 127.0.0.1:5000}}}}
+endpoints:
+  board: {{address: 127.0.0.2:8, kind: board}}
+  base: {{address: 127.0.0.3:9000, kind: basestation}}
+routes:
+  halt: {{source: base, destinations: board, deadman: {{none: it stops the board}}}}
+  drive: {drive}
+"""
+SPEED = "source: {topic: speed, type: std_msgs/msg/Float32}, fields: {speed: data}"
+TO_BASE = "ttl: 1s, deadman: {timeout: 1s, send: {drive: {}}, because: it is a test}"
+
+
+@pytest.mark.parametrize(
+    ("drive", "because", "empty", "lacks"),
+    [
+        ("{source: base, destinations: board, deadman: {none: it is a test}}", "", False, False),  # forwarded
+        ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {drive: {}}}}", "", True, True),
+        (f"{{{SPEED}, destinations: board, deadman: {{none: it is a test}}}}", "", True, True),
+        (f"{{{SPEED}, destinations: board, deadman: {{none: it is a test}}}}", ", because: a test", False, True),
+        (f"{{{SPEED}, destinations: base}}", "", False, True),
+        (f"{{source: board, destinations: base, {TO_BASE}}}", "", False, True),
+    ],
+)
+def test_fields_beside_the_payload_are_empty_in_what_the_router_makes(
+    tmp_path: Path, drive: str, because: str, empty: bool, lacks: bool
+) -> None:
+    """That is a warning for boards, and an error if the field is required: nobody can decode the envelope."""
+    table = tmp_path / "table.yaml"
+    for protos, code, is_found in (("beside", Code.EMPTY_FIELD, empty), ("must", Code.MISSING_KEY, lacks)):
+        table.write_text(BESIDE.format(protos=HERE / "protos" / protos, because=because, drive=drive))
+        assert [each.code for each in check_table(table, {}).diagnostics] == [code] * is_found
 
 
 def plain(value: Any) -> Any:
