@@ -16,7 +16,8 @@ SLOW = {
 }  # fmt: skip
 """Modules of the standard library that other modules import anyway."""
 
-GROUND = {"router", "router.clock", "router.declared", "router.log"}
+LOG = {"router", "router.clock", "router.log", "router.shortage"}
+GROUND = {"router.declared", *LOG}
 NET = {"router.net", "router.net.kernel", "router.net.sockets"}
 
 
@@ -33,8 +34,8 @@ def imported(script: str) -> set[str]:
     ("script", "ours"),
     [
         ("import router", {"router"}),
-        ("from router.log import logger, FloodLog; FloodLog()", {"router", "router.clock", "router.log"}),
-        ("import router.net.sockets", {"router", "router.clock", "router.log", *NET}),
+        ("from router.log import logger, FloodLog; FloodLog()", LOG),
+        ("import router.net.sockets", {*LOG, *NET}),
         (
             "from router.carrier import library, ring, threads, carrier, sender; library.library()",
             {
