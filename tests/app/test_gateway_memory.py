@@ -25,8 +25,8 @@ from tests.ros.peers import Publisher
 
 ROUTES = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 MIB = 1 << 20
-TOPICS, SIZE, CLIENTS = 4, 3 * MIB, 10
-CONTENTS = [f"{number:02}" + "x" * SIZE for number in range(TOPICS)]
+KEPT, SIZE, CLIENTS = 4, 3 * MIB, 10
+CONTENTS = [f"{number:02}" + "x" * SIZE for number in range(KEPT)]
 
 
 def gateways(kind: str, port: int) -> str:
@@ -55,9 +55,10 @@ def large_frames() -> int:
 def test_clients_that_read_nothing_cost_little_and_nothing_once_they_have_left(site: Site, kind: str) -> None:
     port = free_port(kind=socket.SOCK_STREAM)
     with ExitStack() as opened:
-        for number, text in enumerate(CONTENTS):
-            peer = opened.enter_context(closing(Publisher(f"map{number}", STRING, "--transient-local", "--depth", "1")))
-            peer.publish([cdr(text)])
+        for number in range(2):
+            options = "--transient-local", "--depth", str(KEPT)
+            peer = opened.enter_context(closing(Publisher(f"map{number}", STRING, *options)))
+            peer.publish(map(cdr, CONTENTS))
         router = opened.enter_context(site.router(ROUTES + gateways(kind, port)))
         thread = router._runtime.gateways
         assert thread is not None
@@ -70,7 +71,7 @@ def test_clients_that_read_nothing_cost_little_and_nothing_once_they_have_left(s
                 wait_until(lambda: sum(backlogs(router)) > CLIENTS * MIB)  # each gets one
                 sleep(1.5)  # what they do not take is discarded now
                 assert max(backlogs(router)) <= SIZE + HIGH_WATER
-                assert fetches.reserved <= TOPICS * (SIZE + MIB)
+                assert fetches.reserved <= 2 * KEPT * (SIZE + MIB)
                 gc.disable()
             wait_until(lambda: router.total("gateway_clients") == 0)
             wait_until(lambda: fetches.reserved == 0)
@@ -87,14 +88,14 @@ def backlogs(router: Router) -> list[float]:
 @pytest.mark.parametrize("kind", ["tcp", "websocket"])
 def test_a_late_client_gets_all_large_messages_while_others_read_nothing(site: Site, kind: str) -> None:
     port = free_port(kind=socket.SOCK_STREAM)
-    with closing(Publisher("map", STRING, "--transient-local", "--depth", str(TOPICS))) as peer, ExitStack() as joined:
+    with closing(Publisher("map", STRING, "--transient-local", "--depth", str(KEPT))) as peer, ExitStack() as joined:
         peer.publish(map(cdr, CONTENTS))
         with site.router(ROUTES + gateways(kind, port)):
             for _ in range(CLIENTS):
                 joined.enter_context(idle_client(kind, port))
             late = joined.enter_context(idle_client(kind, port))
             late.settimeout(30)
-            missing, tail = {b'"data":"%02d' % number for number in range(TOPICS)}, b""
+            missing, tail = {b'"data":"%02d' % number for number in range(KEPT)}, b""
             while missing:
                 data = tail + late.recv(MIB)
                 missing -= {each for each in missing if each in data}
