@@ -59,6 +59,10 @@ class ClientQueue:
         """Whether the kept messages of any topic are on their way."""
         return bool(self._held)
 
+    def is_held(self, topic: str) -> bool:
+        """Whether the kept messages of this topic are on their way."""
+        return topic in self._held
+
     def record_miss(self, topic: str) -> None:
         """Record that the client missed a message of the topic, unless kept messages on their way include it."""
         (self._held_incomplete if topic in self._held else self.missed_topics).add(topic)

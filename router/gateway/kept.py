@@ -147,7 +147,8 @@ class KeptMessages:
         self._waiting = 0
         self._found: Kept | None = None
         self._found_from: frozenset[bytes] = frozenset()
-        self._forgetting: asyncio.TimerHandle | None = None
+        self._is_old = False
+        self._aging: asyncio.TimerHandle | None = None
 
     @asynccontextmanager
     async def fetched(self) -> AsyncIterator[Kept]:
@@ -167,9 +168,9 @@ class KeptMessages:
             kept.users -= 1
             if kept is not self._found:
                 self._free(kept)
-            elif self.is_idle:
-                self._forget_later()
-                self._budget.recheck()
+            else:
+                self._forget_if_old()
+                self._budget.recheck()  # it may be idle now
 
     @property
     def is_idle(self) -> bool:
@@ -179,8 +180,9 @@ class KeptMessages:
     async def _get(self) -> Kept:
         if (asking := self._asking) is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
-            if self._found and (self._found.arrived, self._found_from) == (self._arrived(), publishers):
-                return self._found
+            found = self._found
+            if found and not self._is_old and (found.arrived, self._found_from) == (self._arrived(), publishers):
+                return found
             asking = self._asking = self._loop.create_task(self._ask(publishers))
         await asyncio.wait([asking])  # it continues for others if this call is cancelled
         return Kept() if asking.cancelled() else asking.result()
@@ -194,22 +196,21 @@ class KeptMessages:
 
     def forget(self) -> None:
         """Forget the fetched messages, once they are sent to nobody."""
-        if self._forgetting:
-            self._forgetting.cancel()
-            self._forgetting = None
+        if self._aging:
+            self._aging.cancel()
+            self._aging = None
         if (found := self._found) is not None:
             self._found = None
             self._budget.remove(self)
             self._free(found)
 
-    def _forget_later(self) -> None:
-        if self._forgetting:
-            self._forgetting.cancel()
-        self._forgetting = self._loop.call_later(FRESH_S, self._forget_if_idle)
-
-    def _forget_if_idle(self) -> None:
-        if self.is_idle:
+    def _forget_if_old(self) -> None:
+        if self.is_idle and self._is_old:
             self.forget()
+
+    def _age(self) -> None:
+        self._is_old = True
+        self._forget_if_old()
 
     def _free(self, kept: Kept) -> None:
         if not kept.users:
@@ -230,7 +231,8 @@ class KeptMessages:
         if found.reserved:
             self._found, self._found_from = found, publishers
             self._budget.add(self)
-            self._forget_later()
+            self._is_old = False
+            self._aging = self._loop.call_later(FRESH_S, self._age)
         self._asking = None
         return found
 

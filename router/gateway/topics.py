@@ -317,7 +317,7 @@ class Topics:
             if served and served.selection.keepers and not served.is_quiet():
                 continue
             for queue in behind:
-                if topic in queue.missed_topics:
+                if topic in queue.missed_topics and not queue.is_held(topic):
                     queue.missed_topics.discard(topic)
                     self._show_kept(queue, [served] if served else [])
 
