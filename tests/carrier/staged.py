@@ -30,6 +30,6 @@ class Staged:
         for record in self.stage.records():
             if isinstance(record, Output):
                 self.outputs.append(record)
-            elif isinstance(record, CountedReport):
+            elif isinstance(record, CountedReport) and record.report.kind == "drop":
                 self.losses.append((record.report.place, record.report.target))
         return [data for name, data in self.outputs if name == target]

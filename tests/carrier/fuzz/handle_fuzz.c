@@ -6,7 +6,7 @@
 #include "carrier.c"
 #include "schemas.h"
 
-enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 3 + REASONS };
+enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 4 + REASONS };
 /* Counters of the one route behind those of listeners. */
 enum { ROUTE = LISTENERS * OF_LISTENER, ACCEPTED = ROUTE, SENT, SENT_BYTES, STALE, LIMITED, FULL, FAILED, WAITING,
        QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, PACED, HELD, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
@@ -74,8 +74,8 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
         uint32_t first = index * OF_LISTENER;
         listeners[index] = (struct listener){.fd = -1, .repairs = index, .peers = peers, .choices = choices, .peer_count = 3,
                                              .columns = COLUMNS, .received = first, .received_bytes = first + 1,
-                                             .padded = first + 2};
-        for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 3 + reason;
+                                             .padded = first + 2, .superseded = first + 3};
+        for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 4 + reason;
     }
     struct ring *events = ring_open(1 << 15);
     carrier = carrier_open(timers_open(counters, events), counters, events, ring_open(1 << 15));

@@ -16,7 +16,7 @@
 
 enum { ROUNDS = 12, PROGRAMS = 24, TOPICS = 2, QUEUE = 1 << 12, ALIVE = 0x600d, NUMBER = 2, SLOTS = 3 };
 /* Counters of each topic behind those of the listener and of the route. */
-enum { RECEIVED, BYTES, PADDED, REJECTED, UNKNOWN = REJECTED + REASONS, ACCEPTED, LAST, DURATION, TOPIC = DURATION + 14 };
+enum { RECEIVED, BYTES, PADDED, SUPERSEDED, REJECTED, UNKNOWN = REJECTED + REASONS, ACCEPTED, LAST, DURATION, TOPIC = DURATION + 14 };
 enum { WAITING, QUEUE_FULL, FILTERED, PUBLICATIONS, STALE, LIMITED, MAPPING, NON_FINITE, REFUSED, OF_TOPIC };
 enum { COUNTERS = TOPIC + TOPICS * OF_TOPIC };
 
@@ -123,7 +123,7 @@ static struct made *make(const struct round *stage, uint32_t generation) {
     made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
     made->choice = (struct choice){0, ACCEPTED};
     made->listener = (struct listener){.fd = stage->socket, .choices = &made->choice, .columns = 1, .received = RECEIVED,
-                                       .received_bytes = BYTES, .padded = PADDED};
+                                       .received_bytes = BYTES, .padded = PADDED, .superseded = SUPERSEDED};
     for (int reason = 0; reason < REASONS; reason++) made->listener.rejected[reason] = (uint32_t)(REJECTED + reason);
     made->program = (struct program){.generation = generation, .listener_count = 1, .case_count = 1,
                                      .unknown_case = UNKNOWN, .schema = &schema, .listeners = &made->listener,

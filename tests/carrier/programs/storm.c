@@ -17,8 +17,8 @@ enum {
     HISTOGRAM = 14, MOST_LEFT = 4,
 };
 /* Counters. Those of listeners, routes and destinations are each a block. */
-enum { OF_LISTENER = 3 + REASONS, OF_DESTINATION = 6, OF_ROUTE = 5 + HISTOGRAM + DESTINATIONS * OF_DESTINATION };
-enum { RECEIVED, BYTES, PADDED, REJECTED };
+enum { OF_LISTENER = 4 + REASONS, OF_DESTINATION = 6, OF_ROUTE = 5 + HISTOGRAM + DESTINATIONS * OF_DESTINATION };
+enum { RECEIVED, BYTES, PADDED, SUPERSEDED, REJECTED };
 enum { SENT, SENT_BYTES, STALE, LIMITED, FULL, ERROR };
 enum { KNOWN, STRANGERS, WAITING, QUEUE_FULL, FILTERED, LAST };
 enum {
@@ -115,7 +115,8 @@ static struct listener make_listener(const struct made *made, int index) {
                                 .choices = made->choices, .peer_count = 1, .columns = 2,
                                 .received = listener_counter(index, RECEIVED),
                                 .received_bytes = listener_counter(index, BYTES),
-                                .padded = listener_counter(index, PADDED)};
+                                .padded = listener_counter(index, PADDED),
+                                .superseded = listener_counter(index, SUPERSEDED)};
     for (int reason = 0; reason < REASONS; reason++)
         listener.rejected[reason] = listener_counter(index, REJECTED + reason);
     return listener;
