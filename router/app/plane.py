@@ -23,7 +23,7 @@ from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import DeadmanEvents, EventReader, EventThread
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
-from router.carrier.mirror import MirrorRing
+from router.carrier.mirror import ActionRing, MirrorRing
 from router.carrier.outlets import AwaitedPublication, Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
@@ -117,6 +117,7 @@ class Plane:
         for thread in threads:
             counts.add_thread(thread)
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
+        self._acted = ActionRing(forwarding.acted, self._names)
         reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
         self._events = EventThread(threads, reader, reporter.report, of_deadmen, self._pulse)
 
@@ -285,19 +286,24 @@ class Plane:
             if deadman not in kept:
                 deadman.end()
 
-    # received datagrams, for the mirror
+    # received datagrams and actions, for the mirror
 
     def observe(self, *, is_observed: bool) -> None:
-        """Start or stop mirroring received datagrams for `take`."""
-        self._forwarding.mirror(self.counts.counters.index("mirror_dropped") if is_observed else None)
+        """Start or stop mirroring received datagrams for `take`, and actions for `take_actions`."""
+        lost = self.counts.counters.index("mirror_dropped") if is_observed else None
+        self._forwarding.mirror(lost, self._client_deadmen.group)
 
     def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
         """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. Not thread-safe."""
         return self._mirrored.take()
 
+    def take_actions(self) -> list[tuple[int, str, str, str, str, str, str, bytes]]:
+        """Return the actions since the last call, as fields of `recording.mirror.Action`. Not thread-safe."""
+        return self._acted.take()
+
     @property
     def lost(self) -> int:
-        """Datagrams that the full mirror dropped."""
+        """Datagrams and actions that the full mirror dropped."""
         return self.counts.total("mirror_dropped")
 
     def feed_watchdog(self, notify: int, interval: int) -> None:

@@ -94,11 +94,11 @@ class Router:
             services = opening.enter_context(StopStack(opening))  # closed after deadmen have sent a last time
             self._runtime.end_with(opening)
             self._runtime.plane.start_reporting()
+            if self._first.table.record is not None:  # for the recorder, which opens later, but records from here on
+                self._runtime.plane.observe(is_observed=True)
             with background_threads():
                 change = self._runtime.prepare(self._first)
                 opening.callback(change.undo.close)
-            if self._first.table.record is not None:  # for the recorder, which opens later, but records from here on
-                self._runtime.plane.observe(is_observed=True)
             self._runtime.start(change)
             with background_threads():
                 self._open_services(change, services)

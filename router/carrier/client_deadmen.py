@@ -65,7 +65,8 @@ class ClientDeadmen(NativeThread):
         self._address = int(library.client_deadmen_open(counts, events.address) or 0)
         if not self._address:
             raise MemoryError("the deadmen of gateways cannot be opened")
-        self._group: int = library.client_deadmen_group(self._address)
+        self.group: int = library.client_deadmen_group(self._address)
+        """The address of their `struct timers`."""
         self._has_started = False
 
     def start(self, functions: tuple[int, int, int]) -> None:
@@ -88,9 +89,9 @@ class ClientDeadmen(NativeThread):
         return state.get_or_open(
             ("client deadman", plan.route),
             (plan, *used),
-            lambda address: ClientDeadman(self._library, self._group, address, topics, used),
+            lambda address: ClientDeadman(self._library, self.group, address, topics, used),
             "deadman_open",
-            self._group,
+            self.group,
             *settings(plan, counters, self._names),
             *destinations_of(plan, counters, self._names, used, "publisher"),
         )
@@ -105,7 +106,7 @@ class ClientDeadmen(NativeThread):
         for deadman in ended:
             deadman.end()
         for each, earlier in replaced(now, before, {name: name for name in now}):
-            self._library.deadman_replace(self._group, each.address, earlier.address)
+            self._library.deadman_replace(self.group, each.address, earlier.address)
         self._library.client_deadmen_advance(self._address, generation)
         if ended and self.wait_for(generation, RECEIPT_S):
             await_receipt(ended)

@@ -9,6 +9,7 @@ from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
 from router.carrier.names import Names
 from router.carrier.ring import Ring
+from router.carrier.state import open_native
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -20,15 +21,15 @@ MOST_COUNTERS = 1 << 18
 KEPT_GENERATION = 1
 """The generation of a kept program; compiled programs have higher ones."""
 
-_PUBLISHED, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
-"""Bytes of the queues: messages for topics, received datagrams for observers, and events of a thread."""
+_PUBLISHED, _MIRRORED, _ACTIONS, _EVENTS = 1 << 20, 1 << 22, 1 << 18, 1 << 18
+"""Bytes of the queues: messages for topics, received datagrams and actions for observers, and events of a thread."""
 
 
 class Forwarding:
     """The threads `receive` and `timers`, which run once `carrier` is started.
 
-    `published` gets the messages for topics, `mirrored` the received datagrams while they are observed. `names` are the
-    names known already, `counters` is the number of counters of the first program.
+    `published` gets the messages for topics; while there are observers, `mirrored` gets the received datagrams, and
+    `acted` the actions. `names` are the names known already, `counters` is the number of counters of the first program.
     """
 
     def __init__(self, library: ctypes.CDLL, counters: int, names: Iterable[str] = ()) -> None:
@@ -36,11 +37,19 @@ class Forwarding:
         self.library = library
         self.names = Names(names)
         self.published, self.mirrored = Ring(library, _PUBLISHED), Ring(library, _MIRRORED)
+        self.acted = Ring(library, _ACTIONS)
+        self._actions = open_native(library, "actions_open", self.acted.address)
         self.deadmen = Deadmen(library, *counts_and_events(library, counters), self.names)
         self.carrier = Carrier(library, self.deadmen.address, *counts_and_events(library, counters), self.published)
 
-    def mirror(self, lost: int | None) -> None:
-        """Mirror received datagrams from now on; `lost` counts those that the full ring drops. None stops that."""
+    def mirror(self, lost: int | None, *others: int) -> None:
+        """Mirror received datagrams and actions from now on; `lost` counts those that full rings drop. None stops that.
+
+        `others` are the addresses of further groups of timers whose actions are wanted.
+        """
+        self.library.actions_count_lost(self._actions, lost or 0)
+        for group in (self.deadmen.address, *others):
+            self.library.timers_observe(group, None if lost is None else self._actions)
         self.carrier.mirror(None if lost is None else self.mirrored, lost or 0)
 
 

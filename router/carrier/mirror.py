@@ -1,18 +1,19 @@
-"""Mirrored datagrams of the carrier, in the form that observers get."""
+"""Mirrored datagrams and actions of the carrier, in the form that observers get."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 from functools import cache
 from socket import inet_ntoa
 
 from router.carrier.names import Names
-from router.carrier.reasons import REJECTIONS
+from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.ring import Ring
 from router.datagrams import Peer
-from router.declared import ROUTED, MirrorRecord
+from router.declared import NO_NAME, ROUTED, Action, ActionRecord, MirrorRecord
 
-_HEAD = ctypes.sizeof(MirrorRecord)
+_HEAD, _ACTION_HEAD = ctypes.sizeof(MirrorRecord), ctypes.sizeof(ActionRecord)
 
 
 class MirrorRing:
@@ -35,6 +36,40 @@ class MirrorRing:
                 taken.append((it.at, self._name(it.listener), (_host(it.address), it.port), sender, why, data))
                 position += it.size
         return taken
+
+
+class ActionRing:
+    """Reads `ring`, to which all threads note their actions while there are observers."""
+
+    def __init__(self, ring: Ring, names: Names) -> None:
+        self.ring = ring
+        self._name = names.name
+
+    def take(self) -> list[tuple[int, str, str, str, str, str, str, bytes]]:
+        """Return the actions since the last call, with the fields of `recording.mirror.Action`. Not thread-safe."""
+        taken: list[tuple[int, str, str, str, str, str, str, bytes]] = []
+        while records := self.ring.take():
+            position = 0
+            while position < len(records):
+                it = ActionRecord.from_buffer(records, position)
+                rest = bytes(records[position + _ACTION_HEAD : position + _ACTION_HEAD + it.length])
+                reason, detail, data = self._outcome(it, rest)
+                target, topic = self._name_or_none(it.target), self._name_or_none(it.topic)
+                what = Action(it.action).name.lower()
+                taken.append((it.at, what, self._name(it.route), target, topic, reason, detail, data))
+                position += it.size
+        return taken
+
+    def _name_or_none(self, number: int) -> str:
+        return self._name(number) if number != NO_NAME else ""
+
+    def _outcome(self, it: ActionRecord, rest: bytes) -> tuple[str, str, bytes]:
+        """Return why the datagram was not sent, with details, and the datagram."""
+        error = os.strerror(it.error) if it.error else ""
+        if it.action != Action.LOST:
+            return "send_error" if error else "", error, rest
+        detail = why_refused(it.refusal, rest) if it.refusal.kind else rest.decode(errors="replace")
+        return LOSSES[it.reason], detail or error, b""
 
 
 @cache

@@ -135,7 +135,7 @@ METRICS = (
         ("route", "reason"),
         "Messages not delivered to single clients, by reason.",
     ),
-    Metric("mirror_dropped", "counter", (), "Routed datagrams that recordings and taps missed."),
+    Metric("mirror_dropped", "counter", (), "Datagrams and actions that recordings and taps missed."),
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
     Metric("recorded_bytes", "counter", (), "Bytes of the datagrams written to a recording."),
     Metric("record_dropped", "counter", ("reason",), "Datagrams missing from a recording, by reason."),

@@ -61,9 +61,9 @@ class HeadStart:
             self._change = c.Change(program=self._image.at(c.Program, parts["program"]))
             self._change.timers = self._timers(parts, of_topics=False)
             undo.callback(self.forwarding.deadmen.end)
+            self.forwarding.mirror(parts["mirror_lost"])
             self._start_deadmen(parts)
             self._fill_listeners(parts)
-            self.forwarding.mirror(parts["mirror_lost"])
             self.forwarding.carrier.start(self._change, self._image)
             undo.pop_all()
 

@@ -1,13 +1,15 @@
-"""A tap on a running router: a stream of received datagrams and the decisions about them, over HTTP.
+"""A tap on a running router: a stream of received datagrams, the decisions about them, and actions, over HTTP.
 
 The stream is MAGIC, then records, each preceded by its length: `<uint32 length> <uint8 kind> ...`, little-endian.
 
     SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <listener> <endpoint> <reason> <datagram>
     LOST   <uint64 count>    the number of datagrams not sent, because the reader of the stream is too slow
     ALIVE                    once a second if there is nothing else to send
+    ACTED  <uint64 wall clock, ns> <what> <route> <target> <topic> <reason> <detail> <datagram>
 
-Listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16). A datagram longer
-than the router accepts is cut to one byte more than that.
+Listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16), as are those of
+ACTED, which are the fields of an Action. A datagram longer than the router accepts is cut to one byte more than that.
+Only a tap without a filter has actions.
 """
 
 from __future__ import annotations
@@ -22,12 +24,12 @@ from typing import NamedTuple
 
 from router.compiler.program import Program
 from router.errors import RouterError, TransportError, did_you_mean
-from router.recording.mirror import Mirror, Mirrored, MirroredDatagram, first_field
+from router.recording.mirror import Acted, Action, Mirror, Mirrored, MirroredDatagram, first_field
 
 MAGIC = b"router tap 2\n"
 CONTENT_TYPE = "application/x-router-tap"
 
-SEEN, LOST, ALIVE = 1, 2, 3
+SEEN, LOST, ALIVE, ACTED = 1, 2, 3, 4
 
 MAX_WAITING = 4 << 20
 """Maximum bytes in the queue of a slow reader."""
@@ -118,7 +120,7 @@ class Tap:
         self._lost_before = mirror.lost
         self._changed = threading.Condition()
         self._is_closed = False
-        self._detach = mirror.attach(self._take)
+        self._detach = mirror.attach(self._take, self._take_actions if is_wanted is None else None)
 
     def stream(self) -> Iterator[bytes]:
         """Yield pieces as soon as there are any, at least one per second. Ends after `close`."""
@@ -140,11 +142,17 @@ class Tap:
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Queue the wanted datagrams. Called by the mirror's thread."""
         chosen = batch if self._is_wanted is None else list(filter(self._is_wanted, batch))
-        piece = encode(chosen)
+        self._queue(encode(chosen), len(chosen))
+
+    def _take_actions(self, actions: Sequence[Acted]) -> None:
+        """Queue the actions. Called by the mirror's thread."""
+        self._queue(encode_actions(actions), len(actions))
+
+    def _queue(self, piece: bytes, count: int) -> None:
         unseen, self._lost_before = self._mirror.lost - self._lost_before, self._mirror.lost
         with self._changed:
             if self._waiting + len(piece) > MAX_WAITING:
-                self._lost += len(chosen)
+                self._lost += count
             elif piece:
                 self._pieces.append(piece)
                 self._waiting += len(piece)
@@ -162,6 +170,15 @@ def encode(batch: Iterable[Mirrored]) -> bytes:
     return b"".join(pieces)
 
 
+def encode_actions(actions: Iterable[Acted]) -> bytes:
+    """Return an ACTED record for each action."""
+    pieces: list[bytes] = []
+    for at, *texts, data in actions:
+        head = _texts(*texts)
+        pieces += (_SEEN.pack(9 + len(head) + len(data), ACTED, at), head, data)
+    return b"".join(pieces)
+
+
 def encode_lost(count: int) -> bytes:
     return _LOST.pack(9, LOST, count)
 
@@ -172,10 +189,11 @@ def encode_alive() -> bytes:
 
 @lru_cache(1024)
 def _head(listener: str, peer: tuple[str, int], *texts: str) -> bytes:
-    pieces = [_PEER.pack(socket.inet_aton(peer[0]), peer[1])]
-    for text in map(str.encode, (listener, *texts)):
-        pieces += (_TEXT.pack(len(text)), text)
-    return b"".join(pieces)
+    return _PEER.pack(socket.inet_aton(peer[0]), peer[1]) + _texts(listener, *texts)
+
+
+def _texts(*texts: str) -> bytes:
+    return b"".join(_TEXT.pack(len(text)) + text for text in map(str.encode, texts))
 
 
 class Lost(NamedTuple):
@@ -191,7 +209,7 @@ class StreamReader:
         self._waiting = bytearray()
         self._has_begun = False
 
-    def take(self, piece: bytes) -> Iterator[MirroredDatagram | Lost]:
+    def take(self, piece: bytes) -> Iterator[MirroredDatagram | Action | Lost]:
         """Yield the records that this piece completes. Raises TransportError if this is not a tap stream."""
         waiting = self._waiting
         waiting += piece
@@ -215,17 +233,25 @@ class StreamReader:
         del waiting[:start]
 
 
-def _record(record: bytes) -> Iterator[MirroredDatagram | Lost]:
+def _record(record: bytes) -> Iterator[MirroredDatagram | Action | Lost]:
     """Yield the content of a record. Unknown kinds are skipped: a newer router may have more."""
     if record[0] == LOST:
         yield Lost(int.from_bytes(record[1:9], "little"))
     elif record[0] == SEEN:
         at = int.from_bytes(record[1:9], "little")
         host, port = _PEER.unpack_from(record, 9)
-        start, texts = 9 + _PEER.size, list[str]()
-        for _ in range(3):
-            (length,) = _TEXT.unpack_from(record, start)
-            start += _TEXT.size + length
-            texts.append(record[start - length : start].decode())
-        listener, endpoint, reason = texts
-        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), endpoint, reason, record[start:])
+        (listener, endpoint, reason), data = _read_texts(record, 9 + _PEER.size, 3)
+        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), endpoint, reason, data)
+    elif record[0] == ACTED:
+        (what, route, target, topic, reason, detail), data = _read_texts(record, 9, 6)
+        yield Action(int.from_bytes(record[1:9], "little"), what, route, target, topic, reason, detail, data)
+
+
+def _read_texts(record: bytes, start: int, count: int) -> tuple[list[str], bytes]:
+    """Return texts preceded by their lengths, and what follows them."""
+    texts: list[str] = []
+    for _ in range(count):
+        (length,) = _TEXT.unpack_from(record, start)
+        start += _TEXT.size + length
+        texts.append(record[start - length : start].decode())
+    return texts, record[start:]

@@ -1,7 +1,8 @@
 """Schemas and channels of recordings. The files of one router use the same numbers for them.
 
 A channel has the datagrams of one payload case from one sender to one listener with one decision of routing. These are
-its metadata; together with a message's data they give the whole datagram (see `Holds`).
+its metadata; together with a message's data they give the whole datagram (see `Holds`). Other channels have what the
+router sent, and its other actions.
 """
 
 from __future__ import annotations
@@ -24,6 +25,12 @@ DATAGRAMS = "raw/datagrams"
 REJECTED = "rejected/{reason}/{topic}"
 """The topic of rejected datagrams, so that viewers do not mix them with accepted ones."""
 
+SENT = "sent/{topic}"
+"""The topic of payloads that the router sent."""
+
+EVENTS = "router/events"
+"""The topic of actions that sent nothing."""
+
 MOST_CHANNELS = 4096
 """Beyond that, for example if a client often changes its port, datagrams are recorded raw."""
 
@@ -38,6 +45,10 @@ class Holds(enum.Enum):
     """All other datagrams, byte for byte."""
     VIEW = "view"
     """Payloads of datagrams that are also recorded raw: for viewers, not for replay."""
+    SENT = "sent"
+    """Payloads that the router sent; not for replay."""
+    EVENT = "event"
+    """Actions without a payload, as `Event`; not for replay."""
 
 
 class Channels:
@@ -64,6 +75,14 @@ class Channels:
     def datagrams(self, reason: str) -> int:
         topic, metadata = _decided(DATAGRAMS, {"holds": Holds.DATAGRAM.value}, reason)
         return self._channel(topic, DATAGRAM, metadata)
+
+    def sent(self, case: PayloadCase, what: str, route: str, target: str, ros_topic: str) -> int:
+        """Return the channel of payloads that were sent. The arguments are those of an Action."""
+        metadata = {**_metadata(case, Holds.SENT), "what": what, "route": route, "endpoint": target, "ros": ros_topic}
+        return self._channel(SENT.format(topic=case.name), _payload(case), metadata)
+
+    def events(self) -> int:
+        return self._channel(EVENTS, EVENT, {"holds": Holds.EVENT.value})
 
     def _channel(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> int:
         key = self._key(topic, message, metadata)
@@ -113,17 +132,25 @@ def _collect(file: FileDescriptor, into: dict[str, bytes]) -> None:
     into.setdefault(file.name, file.serialized_pb)
 
 
-def _datagram() -> Descriptor:
-    file = FileDescriptorProto(name="rover_router/datagram.proto", package="rover_router", syntax="proto3")
-    message = file.message_type.add(name="Datagram")
-    text, data = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTES
-    for number, (name, kind) in enumerate([("listener", text), ("peer", text), ("data", data), ("endpoint", text)], 1):
-        message.field.add(name=name, number=number, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
+def _own_message(name: str, **fields: FieldDescriptorProto.Type.ValueType) -> Descriptor:
+    """Return a message of ours, with its fields in order."""
+    file = FileDescriptorProto(name=f"rover_router/{name.lower()}.proto", package="rover_router", syntax="proto3")
+    message = file.message_type.add(name=name)
+    for number, (field, kind) in enumerate(fields.items(), 1):
+        message.field.add(name=field, number=number, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
     pool = DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
-    return pool.FindMessageTypeByName("rover_router.Datagram")
+    return pool.FindMessageTypeByName(f"rover_router.{name}")
 
 
-DATAGRAM = _datagram()
+_TEXT, _BYTES = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTES
+
+DATAGRAM = _own_message("Datagram", listener=_TEXT, peer=_TEXT, data=_BYTES, endpoint=_TEXT)
 Datagram = GetMessageClass(DATAGRAM)
 """`peer` is HOST:PORT, `data` the bytes as received, `endpoint` the sender's name in the table."""
+
+EVENT = _own_message(
+    "Event", what=_TEXT, route=_TEXT, endpoint=_TEXT, ros=_TEXT, reason=_TEXT, detail=_TEXT, data=_BYTES
+)
+Event = GetMessageClass(EVENT)
+"""The fields of an Action: `endpoint` is its target, `ros` its topic. `data` is a datagram that was not sent."""

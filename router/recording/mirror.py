@@ -1,6 +1,6 @@
-"""The mirror: received datagrams and what routing decided about them, for recordings, taps and pages.
+"""The mirror: received datagrams, what routing decided about them, and actions, for recordings, taps and pages.
 
-While no consumer is attached, the receive thread does nothing for it.
+While no consumer is attached, the native threads do nothing for it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,32 @@ class MirroredDatagram(NamedTuple):
 Mirrored = tuple[int, str, Peer, str, str, bytes]
 """The fields of a MirroredDatagram as a plain tuple, which takes a third of the time to build."""
 
+
+class Action(NamedTuple):
+    """What the router did by itself. `at`: when it did that (wall clock, ns).
+
+    `what` is one of ACTIONS: a command was `sent`; a deadman has `braked`, `tripped` or was `released`; a message for
+    an endpoint was `lost`. `target` is the endpoint, `topic` the ROS topic of the message or "". `reason` and `detail`
+    say why something was not sent. `data` is the datagram, empty for a lost message.
+    """
+
+    at: int
+    what: str
+    route: str
+    target: str = ""
+    topic: str = ""
+    reason: str = ""
+    detail: str = ""
+    data: bytes = b""
+
+
+SENT, BRAKED, LOST, TRIPPED, RELEASED = ACTIONS = ("sent", "braked", "lost", "tripped", "released")
+
+Acted = tuple[int, str, str, str, str, str, str, bytes]
+"""The fields of an Action as a plain tuple."""
+
 Consumer = Callable[[Sequence[Mirrored]], None]
+ActionConsumer = Callable[[Sequence[Acted]], None]
 
 
 class Source(Protocol):
@@ -56,13 +81,16 @@ class Source(Protocol):
     def take(self) -> Sequence[Mirrored]:
         """Return the datagrams since the last call."""
 
+    def take_actions(self) -> Sequence[Acted]:
+        """Return the actions since the last call."""
+
     @property
     def lost(self) -> int:
-        """Datagrams that were routed, but not mirrored."""
+        """Datagrams and actions that were not mirrored."""
 
 
 class Mirror:
-    """One thread calls the consumers, at most PERIOD after a datagram; they must return quickly.
+    """One thread calls the consumers, at most PERIOD after a datagram or an action; they must return quickly.
 
     Exceptions of consumers go to `failed`.
     """
@@ -70,14 +98,14 @@ class Mirror:
     def __init__(self, source: Source, failed: Callable[[Exception], None]) -> None:
         self._source = source
         self._failed = failed
-        self._consumers: tuple[Consumer, ...] = ()
+        self._consumers: tuple[tuple[Consumer, ActionConsumer | None], ...] = ()
         self._attaching = threading.Lock()
         self._stopping = threading.Event()
         self._thread: Thread | None = None
 
     @property
     def lost(self) -> int:
-        """Datagrams that were routed, but not mirrored."""
+        """Datagrams and actions that were not mirrored."""
         return self._source.lost
 
     @property
@@ -85,8 +113,8 @@ class Mirror:
         """Whether a consumer is attached."""
         return bool(self._consumers)
 
-    def attach(self, consumer: Consumer) -> Callable[[], None]:
-        """Call `consumer` with all datagrams from now on. Returns a function that detaches it.
+    def attach(self, consumer: Consumer, acted: ActionConsumer | None = None) -> Callable[[], None]:
+        """Call `consumer` with all datagrams from now on, and `acted` with all actions. Returns a function to detach.
 
         A consumer must not detach itself. A call in progress when it is detached still finishes.
         """
@@ -96,20 +124,22 @@ class Mirror:
                 thread = Thread(self._run, "mirror", (stopping,))
                 thread.start()
                 self._stopping, self._thread = stopping, thread
-            self._consumers = (*self._consumers, consumer)
+            attached = consumer, acted
+            self._consumers = (*self._consumers, attached)
             if len(self._consumers) == 1:
                 self._source.observe(is_observed=True)
 
         def detach() -> None:
             with self._attaching:
-                if not any(each is consumer for each in self._consumers):
+                if not any(each is attached for each in self._consumers):
                     return
                 if len(self._consumers) == 1:
                     self._end()
-                self._consumers = tuple(each for each in self._consumers if each is not consumer)
+                self._consumers = tuple(each for each in self._consumers if each is not attached)
                 if not self._consumers:
                     self._source.observe(is_observed=False)
                     self._source.take()
+                    self._source.take_actions()
 
         return detach
 
@@ -131,12 +161,13 @@ class Mirror:
 
     def _deliver(self) -> None:
         """Call the consumers. Runs in the thread, and after its end in the one that joined it; never concurrently."""
-        batch = self._source.take()
-        if not batch:
-            return
-        for consumer in self._consumers:
+        actions, batch = self._source.take_actions(), self._source.take()
+        for consumer, acted in self._consumers:
             try:
-                consumer(batch)
+                if batch:
+                    consumer(batch)
+                if actions and acted is not None:
+                    acted(actions)
             except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
                 self._failed(error)
 
@@ -173,6 +204,17 @@ class Classifier:
             return None
         case, payload = decoded
         return case, payload.SerializeToString()
+
+    def sent_payload(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
+        """Return payload case and payload of a datagram that the router has sent, perhaps without trailing zeros."""
+        if (found := self._single_field(data)) is not None:
+            return found
+        try:
+            envelope = self.envelope.message_class.FromString(restored(data))
+        except ProtobufError:
+            return None
+        case = envelope.WhichOneof(self.envelope.oneof) if self.envelope.cases else None
+        return (self.envelope.cases[case], getattr(envelope, case).SerializeToString()) if case else None
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two

@@ -1,4 +1,4 @@
-"""Reads a recording: the datagrams, byte for byte, in the order in which the router received them.
+"""Reads a recording: the datagrams, byte for byte, in the order in which the router received them, and its actions.
 
 If the writer was killed, it reads all complete chunks of the file.
 """
@@ -15,12 +15,14 @@ from typing import Any, BinaryIO, NamedTuple
 import zstandard
 from google.protobuf.message import DecodeError as ProtobufError
 from mcap.exceptions import McapError
-from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata
+from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from router.datagrams import Peer
 from router.errors import UsageError
-from router.recording.channels import Datagram, Holds
+from router.recording.channels import Datagram, Event, Holds
+from router.recording.mirror import Action
+from router.recording.schemas import RecordedCase
 from router.recording.writer import LIBRARY, METADATA
 from router.types.wire import LEN, varint
 
@@ -44,6 +46,26 @@ class Recorded(NamedTuple):
     data: bytes
 
 
+class RecordedAction(NamedTuple):
+    """What the router did by itself. `steady` is as for a datagram.
+
+    The datagram of the action is encoded as protobuf encodes it, and has the trailing zeros that were not sent.
+    """
+
+    steady: int
+    action: Action
+
+    @property
+    def at(self) -> int:
+        return self.action.at
+
+
+_Decoded = tuple[str, Peer, str, str, bytes]
+"""The fields of Recorded from `listener` on."""
+_Decoder = Callable[[int, bytes], "_Decoded | Action | None"]
+"""Decodes a message that was logged at a time. Returns None if it is also elsewhere in the recording."""
+
+
 class Recording:
     """A recording. `about` is its metadata. Raises UsageError if the file is not a recording of a router."""
 
@@ -52,7 +74,7 @@ class Recording:
         self.about: dict[str, str] = {}
         self.is_whole = self.ends_early = False
         """Set when all is read: the writer finished the file; or it was killed, or the file is damaged."""
-        self._decoders: dict[int, Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]] = {}
+        self._decoders: dict[int, _Decoder] = {}
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
@@ -75,16 +97,43 @@ class Recording:
 
     def datagrams(self) -> Iterator[Recorded]:
         """Yield each datagram once, until the end of the file or damage."""
+        return (each for each in self.everything() if isinstance(each, Recorded))
+
+    def everything(self) -> Iterator[Recorded | RecordedAction]:
+        """Yield each datagram and each action once, until the end of the file or damage.
+
+        Actions are about 0.1 s out of order.
+        """
         try:
             for record in self._records:
-                if isinstance(record, Message):
-                    if (found := self._decoders[record.channel_id](record.data)) is not None:
-                        yield Recorded(record.log_time, record.publish_time, *found)
-                else:
+                if not isinstance(record, Message):
                     self._take(record)
+                elif (found := self._decoders[record.channel_id](record.log_time, record.data)) is None:
+                    continue
+                elif isinstance(found, Action):
+                    yield RecordedAction(record.publish_time, found)
+                else:
+                    yield Recorded(record.log_time, record.publish_time, *found)
         except _DAMAGED:
             pass
         self.ends_early = not self.is_whole
+
+    def cases(self) -> list[RecordedCase]:
+        """Return the payload cases of all channels. Chunks are skipped. Call this before reading messages."""
+        with self.path.open("rb") as file:
+            schemas: dict[int, Schema] = {}
+            found: dict[tuple[str, int], RecordedCase] = {}
+            try:
+                for record in StreamReader(file, emit_chunks=True, record_size_limit=self.size).records:
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel) and "number" in record.metadata:
+                        case, schema = record.topic.rpartition("/")[2], schemas[record.schema_id]
+                        number = int(record.metadata["number"])
+                        found.setdefault((case, number), RecordedCase(case, number, schema.name, schema.data))
+            except _DAMAGED:
+                pass
+        return [*found.values()]
 
     def _take(self, record: McapRecord) -> None:
         if isinstance(record, Channel):
@@ -103,24 +152,40 @@ class Recording:
             raise UsageError(f"{self.path} is not a recording of a router")
 
 
-def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]:
-    """Return a function that decodes the messages of the channel with this metadata.
-
-    It returns the fields of Recorded from `listener` on, or None if the datagram is elsewhere in the recording.
-    """
+def _decoder(metadata: dict[str, str]) -> _Decoder:
+    """Return a function that decodes the messages of the channel with this metadata."""
     holds, reason = metadata.get("holds"), metadata.get("reason", "")
     if holds == Holds.DATAGRAM.value:
         return partial(_raw, reason)
+    if holds == Holds.EVENT.value:
+        return _event
+    if holds == Holds.SENT.value:
+        rebuilt = _rebuild(metadata["number"])
+        what, route, target, topic = (metadata[key] for key in ("what", "route", "endpoint", "ros"))
+        return lambda at, payload: Action(at, what, route, target, topic, data=rebuilt(payload))
     if holds != Holds.PAYLOAD.value:
-        return lambda _: None  # the datagram is elsewhere in the recording
-    tag, peer = varint(int(metadata["number"]) << 3 | LEN), _peer(metadata["peer"])
+        return lambda *_: None  # the datagram is elsewhere in the recording
+    rebuilt, peer = _rebuild(metadata["number"]), _peer(metadata["peer"])
     listener, endpoint = metadata["listener"], metadata["endpoint"]
-    return lambda payload: (listener, peer, endpoint, reason, b"".join((tag, varint(len(payload)), payload)))
+    return lambda _, payload: (listener, peer, endpoint, reason, rebuilt(payload))
 
 
-def _raw(reason: str, message: bytes) -> tuple[str, Peer, str, str, bytes]:
+def _rebuild(number: str) -> Callable[[bytes], bytes]:
+    """Return a function that puts a payload with this field number into an envelope."""
+    tag = varint(int(number) << 3 | LEN)
+    return lambda payload: b"".join((tag, varint(len(payload)), payload))
+
+
+def _raw(reason: str, _: int, message: bytes) -> _Decoded:
     datagram: Any = Datagram.FromString(message)
     return datagram.listener, _peer(datagram.peer), datagram.endpoint, reason, datagram.data
+
+
+def _event(at: int, message: bytes) -> Action:
+    event: Any = Event.FromString(message)
+    return Action(
+        at, event.what, event.route, event.endpoint, event.ros, event.reason, event.detail, event.data
+    )
 
 
 def _peer(text: str) -> Peer:

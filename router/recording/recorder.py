@@ -1,4 +1,4 @@
-"""The recorder: writes mirrored datagrams to disk, and keeps the newest chunks in memory to save on request.
+"""The recorder: writes mirrored datagrams and actions to disk, and keeps the newest chunks in memory to save on request.
 
 The mirror's thread encodes each datagram once, into chunks for both; the thread `recorder` writes them.
 """
@@ -13,14 +13,16 @@ from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler.program import Program
 from router.errors import RouterError
 from router.log import fault, logger
+from router.recording.about import about
 from router.recording.channels import Channels
 from router.recording.encoder import LONGEST_CHUNK, Chunk, Encoder
-from router.recording.mirror import Classifier, Mirror, Mirrored
+from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.recording.writer import ContinuousWriter, RecordingDirectory
 from router.table.model import RecordSettings
 from router.threads import Thread, WakeEvent
@@ -109,7 +111,7 @@ class Recorder:
         self._wake_up = WakeEvent()
         self._thread = Thread(self._run, "recorder")  # a disk may hang
         self._thread.start()
-        self._detach = mirror.attach(self._take)
+        self._detach = mirror.attach(self._take, self._take_actions)
 
     def save(self, reason: str) -> Path:
         """Write the datagrams in memory to a new file, and return its path. Thread-safe. Raises RecordError."""
@@ -179,12 +181,19 @@ class Recorder:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Encode a batch. Called by the mirror's thread."""
+        self._encode(self._encoder.add, batch)
+
+    def _take_actions(self, actions: Sequence[Acted]) -> None:
+        """Encode actions. Called by the mirror's thread."""
+        self._encode(self._encoder.add_actions, actions)
+
+    def _encode(self, add: Callable[[Sequence[Any], Classifier, int, int], None], batch: Sequence[Any]) -> None:
         program = self._running_program()
         if program is not self._program:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
         with self._encoding:
             try:
-                self._encoder.add(batch, self._classifier, wall_ns(), boottime_ns())
+                add(batch, self._classifier, wall_ns(), boottime_ns())
                 if self._encoder.size > LONGEST_CHUNK:
                     self._finish_chunk()
             except Exception as error:  # noqa: BLE001 a fault of the router; keep recording
@@ -319,4 +328,4 @@ class Recorder:
     def _about(self, reason: str) -> dict[str, str]:
         """Return the metadata of a file."""
         program = self._running_program()
-        return {"reason": reason, "table": program.table.path.name, "protos_sha256": program.protos_sha256}
+        return {**about(program.table, reason), "protos_sha256": program.protos_sha256}

@@ -11,9 +11,10 @@ from time import monotonic_ns, time_ns
 
 from router.errors import TransportError, UsageError, did_you_mean
 from router.observe.tap import Lost
+from router.recording.about import about
 from router.recording.channels import Channels
 from router.recording.encoder import Encoder
-from router.recording.mirror import Classifier, MirroredDatagram
+from router.recording.mirror import Action, Classifier, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import PERIOD
 from router.recording.writer import RecordingFile
@@ -36,7 +37,7 @@ class TapRecording:
         self._classifier = Classifier(envelope, table)
         self._written_at = monotonic_ns()
         try:
-            self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
+            self._file = RecordingFile(path, channels, about(table, "router record"))
         except FileExistsError:
             raise UsageError(f"{path} already exists", "choose another name") from None
         except OSError as error:
@@ -50,16 +51,20 @@ class TapRecording:
         """Bytes of the file so far."""
         return self._file.size
 
-    def take(self, batch: Iterable[MirroredDatagram | Lost]) -> None:
+    def take(self, batch: Iterable[MirroredDatagram | Action | Lost]) -> None:
         """Add a batch. Call this every second, also with an empty batch, so that earlier ones are written."""
         datagrams: list[MirroredDatagram] = []
+        actions: list[Action] = []
         for each in batch:
             if isinstance(each, Lost):
                 self.missed += each.number
+            elif isinstance(each, Action):
+                actions.append(each)
             else:
                 datagrams.append(each)
         self.datagrams += len(datagrams)
         self._encoder.add(datagrams, self._classifier, time_ns(), monotonic_ns())
+        self._encoder.add_actions(actions, self._classifier, time_ns(), monotonic_ns())
         if monotonic_ns() - self._written_at >= PERIOD:
             self._write()
 

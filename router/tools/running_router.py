@@ -18,7 +18,7 @@ from router.observe.problems import Kind, Problem
 if TYPE_CHECKING:
     from router.observe.snapshot import Snapshot
     from router.observe.tap import Lost
-    from router.recording.mirror import MirroredDatagram
+    from router.recording.mirror import Action, MirroredDatagram
     from router.table.addresses import Address
     from router.table.model import RouteTable
 
@@ -111,12 +111,12 @@ def down(url: str, error: TransportError) -> Problem:
 @contextmanager
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = (), only: str | None = None
-) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
+) -> Iterator[Iterator[list[MirroredDatagram | Action | Lost]]]:
     """Open a tap of the datagrams that a running router receives.
 
     Only those with these payload cases, from these endpoints (empty: all) and with this decision (`only`: one of
     DECISIONS; None: both). They arrive in batches; while nothing is received, an empty batch arrives each second.
-    Datagrams without a known payload case are always included. Raises UsageError if the router rejects the request,
+    Datagrams without a known payload case are always included, actions only if no filter is given. Raises UsageError if the router rejects the request,
     TransportError if none answers, or later if the router stops.
     """
     parameters = [("case", case) for case in cases] + [("from", source) for source in sources]
@@ -128,7 +128,7 @@ def tap(
         yield _stream(response, url)
 
 
-def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[MirroredDatagram | Lost]]:
+def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[MirroredDatagram | Action | Lost]]:
     from router.observe.tap import StreamReader
 
     reader = StreamReader()

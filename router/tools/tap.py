@@ -24,7 +24,7 @@ from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
-from router.recording.mirror import MirroredDatagram
+from router.recording.mirror import Action, MirroredDatagram
 from router.table.model import Expression
 from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
@@ -120,7 +120,7 @@ class TappedDatagram:
 
     def line(self, with_hex: bool) -> str:
         """Return one line: `12:00:00.123 sensor_board imu_info accel_x=1.5`."""
-        start = f"{_clock(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
+        start = f"{clock_text(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
         line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
@@ -162,7 +162,7 @@ class TappedMessage:
 
     def line(self, with_hex: bool) -> str:
         """Return one line: `12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
-        line = f"{_clock(self.at)} {self.type_name} {one_line(words(ros_tree(self.message)))}"
+        line = f"{clock_text(self.at)} {self.type_name} {one_line(words(ros_tree(self.message)))}"
         return f"{line} [{self.cdr.hex()}]" if with_hex else line
 
     def json(self, with_hex: bool) -> str:
@@ -176,11 +176,12 @@ class TappedMessage:
         return json.dumps(document | {"hex": self.cdr.hex()} if with_hex else document)
 
 
-def _clock(at: dt.datetime) -> str:
+def clock_text(at: dt.datetime) -> str:
+    """Return a time of day with milliseconds."""
     return f"{at:%H:%M:%S.%f}"[:-3]
 
 
-def _local_time(at: int) -> dt.datetime:
+def local_time(at: int) -> dt.datetime:
     """Return the local time of `at`, ns since 1970."""
     return dt.datetime.fromtimestamp(at / 1e9).astimezone()
 
@@ -202,13 +203,14 @@ class RunningTap:
         self._cases = cases
         self._condition = condition
 
-    def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[TappedDatagram]]:
+    def take(self, batches: Iterable[list[MirroredDatagram | Action | Lost]]) -> Iterator[list[TappedDatagram]]:
         """Yield the part of each batch that is to be shown, which may be empty."""
         for batch in batches:
             shown = []
             for each in batch:
                 if isinstance(each, Lost):
                     self.missed += each.number
+                if not isinstance(each, MirroredDatagram):
                     continue
                 peer = each.endpoint or f"{each.peer[0]}:{each.peer[1]}"
                 tapped = tapped_datagram(each.at, peer, each.data, self._wire, each.reason)
@@ -229,7 +231,7 @@ def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
     """Yield messages without end; after PATIENCE without one, an empty list."""
     while True:
         yield [
-            TappedMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
+            TappedMessage(local_time(arrived), listener.type_name, cdr, listener.message(cdr))
             for cdr, arrived in listener.take(PATIENCE)
         ]
 
@@ -251,6 +253,6 @@ def listen(
 def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> TappedDatagram:
     """Return a datagram that was received at `at`, ns since 1970."""
     try:
-        return TappedDatagram(_local_time(at), peer, data, wire.decode(data), rejected=rejected)
+        return TappedDatagram(local_time(at), peer, data, wire.decode(data), rejected=rejected)
     except DecodeError as error:
-        return TappedDatagram(_local_time(at), peer, data, None, str(error), rejected)
+        return TappedDatagram(local_time(at), peer, data, None, str(error), rejected)

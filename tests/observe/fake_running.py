@@ -23,7 +23,7 @@ from router.observe.metrics import CountersCollector
 from router.observe.obedience import Reply
 from router.observe.running import ReloadResult
 from router.observe.watch import LAST_SEEN, Health, Watch
-from router.recording.mirror import Classifier, Mirror, Mirrored
+from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.table.addresses import Address
 from tests.tables import ROUTES
 
@@ -55,6 +55,7 @@ class FakeRunning:
         self.mirror = Mirror(self, self.failures.append)
         self.lost = 0
         self.waiting: deque[Mirrored] = deque()
+        self.acted: deque[Acted] = deque()
         self.counts = program.counters.fresh_counts()
         self._turns = 0
 
@@ -63,6 +64,9 @@ class FakeRunning:
 
     def take(self) -> list[Mirrored]:
         return [self.waiting.popleft() for _ in range(len(self.waiting))]
+
+    def take_actions(self) -> list[Acted]:
+        return [self.acted.popleft() for _ in range(len(self.acted))]
 
     def count(self, metric: str, *labels: str, to: float) -> None:
         """Times are in ns, as in the counters."""

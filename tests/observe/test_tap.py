@@ -25,7 +25,7 @@ from router.observe.tap import (
     encode_lost,
     wanted,
 )
-from router.recording.mirror import MirroredDatagram
+from router.recording.mirror import Action, MirroredDatagram
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
 
@@ -49,9 +49,9 @@ def running() -> Iterator[FakeRunning]:
     assert opened.failures == []
 
 
-def read(stream: Iterator[bytes], count: int) -> list[MirroredDatagram | Lost]:
+def read(stream: Iterator[bytes], count: int) -> list[MirroredDatagram | Action | Lost]:
     """So many from the stream, or more if they came together."""
-    reader, found = StreamReader(), list[MirroredDatagram | Lost]()
+    reader, found = StreamReader(), list[MirroredDatagram | Action | Lost]()
     while len(found) < count:
         found += reader.take(next(stream))
     return found
@@ -69,6 +69,21 @@ def test_all_that_is_received_is_shown_as_it_came_with_what_was_decided(running:
         ("rover", BOARD, "sensor_board", "empty", b""),
         ("rover", STRANGER, "", "source_mismatch", IMU),
     ]
+
+
+def test_a_tap_without_a_filter_shows_actions(running: FakeRunning) -> None:
+    actions = [
+        Action(7, "sent", "drive", "driving_board", "cmd", data=IMU),
+        Action(8, "lost", "drive", "driving_board", "", "stale", "sent 2 s ago"),
+        Action(9, "tripped", "drive"),
+    ]
+    with closing(Tap(running.mirror, None)) as tap:
+        running.acted += actions
+        assert read(tap.stream(), 3) == actions
+    with closing(Tap(running.mirror, wanted(PROGRAM, [], ["sensor_board"]))) as tap:
+        running.acted += actions
+        running.receive(IMU, BOARD)
+        assert [type(each) for each in read(tap.stream(), 1)] == [MirroredDatagram]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from router.datagrams import Peer, Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
 from router.recording.encoder import Chunk, Encoder
-from router.recording.mirror import Classifier, Mirror, MirroredDatagram
+from router.recording.mirror import Action, Classifier, Mirror, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import Recorder
 from router.recording.writer import RecordingFile
@@ -74,7 +74,7 @@ def endpoints() -> dict[str, Endpoint]:
 def table(**changed: Any) -> RouteTable:
     """The part of a table that a recording contains."""
     listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
-    told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, **changed}
+    told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, "routes": (), **changed}
     return cast("RouteTable", SimpleNamespace(**told))
 
 
@@ -141,10 +141,13 @@ class FakeMirror:
 
     def __init__(self) -> None:
         self.show: Callable[[Sequence[MirroredDatagram]], None] = print
+        self.act: Callable[[Sequence[Action]], None] = print
         self.program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
 
-    def attach(self, consumer: Callable[[Sequence[MirroredDatagram]], None]) -> Callable[[], None]:
-        self.show = consumer
+    def attach(
+        self, consumer: Callable[[Sequence[MirroredDatagram]], None], acted: Callable[[Sequence[Action]], None]
+    ) -> Callable[[], None]:
+        self.show, self.act = consumer, acted
         return lambda: None
 
 

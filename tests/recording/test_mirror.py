@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from router.recording.mirror import Consumer, Mirror, Mirrored, MirroredDatagram
+from router.recording.mirror import Acted, Consumer, Mirror, Mirrored, MirroredDatagram
 
 PEER = ("127.0.0.2", 8)
 
@@ -21,6 +21,7 @@ class Source:
         self.mirror = Mirror(self, self.failures.append)
         self.lost = 7
         self.observed: list[bool] = []
+        self.actions: deque[Acted] = deque()
         self._kept: deque[Mirrored] = deque()
 
     def receive(self, data: bytes) -> None:
@@ -29,6 +30,9 @@ class Source:
 
     def take(self) -> list[Mirrored]:
         return [self._kept.popleft() for _ in range(len(self._kept))]
+
+    def take_actions(self) -> list[Acted]:
+        return [self.actions.popleft() for _ in range(len(self.actions))]
 
     def observe(self, *, is_observed: bool) -> None:
         self.observed.append(is_observed)

@@ -87,7 +87,7 @@ def test_all_that_was_seen_is_in_the_file_when_it_is_closed(tmp_path: Path) -> N
     recording = Recording(path)
     assert [again(each) for each in recording.datagrams()] == [each for batch in batches for each in batch]
     assert recording.is_whole
-    assert recording.about == {"reason": "continuous", "table": "rover.yaml", "protos_sha256": "0" * 64}
+    assert recording.about == {"reason": "continuous", "table": "rover.yaml", "protos_sha256": "0" * 64, "routes": "{}"}
     assert counted(made) == {
         "recorded_datagrams": 4,
         "recorded_bytes": sum(len(each.data) for batch in batches for each in batch),

@@ -73,6 +73,20 @@ static void report_error(struct timers *timers, const struct deadman *deadman, c
     report_with(timers, (struct deadman_event){0, EVENT_DEADMAN_ERROR, deadman->id, to->id, error, to->send_errors}, why);
 }
 
+static void note(struct timers *timers, enum action action, const struct deadman *deadman) {
+    struct actions *observed = atomic_load_explicit(&timers->actions, memory_order_acquire);
+    struct action_record record = {.action = action, .route = deadman->id, .target = NO_NAME, .topic = NO_NAME};
+    if (observed) actions_note(observed, timers->stage->counters, record, NULL, 0);
+}
+
+static void note_brake(struct timers *timers, const struct deadman *deadman, const struct deadman_destination *to,
+                       const struct deadman_datagram *datagram, int error) {
+    struct actions *observed = atomic_load_explicit(&timers->actions, memory_order_acquire);
+    struct action_record record = {.action = ACTION_BRAKED, .route = deadman->id, .target = to->id, .topic = NO_NAME,
+                                   .error = error};
+    if (observed) actions_note(observed, timers->stage->counters, record, datagram->data, datagram->size);
+}
+
 /* Send the datagrams for a destination. Return 0, BRAKE_LATER, or the last error. */
 static int send_to(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to) {
     int failed = 0;
@@ -80,6 +94,7 @@ static int send_to(struct timers *timers, struct deadman *deadman, const struct 
         int error = timers->stage->brake(timers->stage, to, &to->datagrams[index]);
         if (error) failed = error;
         if (error == BRAKE_LATER) continue;
+        note_brake(timers, deadman, to, &to->datagrams[index], error);
         stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
         if (error) report_error(timers, deadman, to, error, "");
     }
@@ -169,6 +184,7 @@ static void release(struct timers *timers, struct deadman *deadman) {
     await_answers(timers, deadman, deadman->own, 0);
     counter_set(timers->stage->counters, deadman->active, 0);
     report(timers, EVENT_RELEASED, deadman);
+    note(timers, ACTION_RELEASED, deadman);
 }
 
 static void end_start(struct timers *timers, struct deadman *deadman, uint64_t destinations) {
@@ -325,6 +341,7 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     await_answers(timers, deadman, deadman->armed, now);
     counter_set(timers->stage->counters, deadman->active, 1);
     stage_count(timers->stage, deadman->trips, 1);
+    note(timers, ACTION_TRIPPED, deadman);
     send_all(timers, deadman, deadman->armed);
     report(timers, EVENT_TRIPPED, deadman);
 }

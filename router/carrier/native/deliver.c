@@ -25,6 +25,12 @@ enum { LONGEST_REFUSED = 48 /* reported bytes of a text */ };
 
 static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
 
+static void note_lost(struct actions *actions, const struct stage *stage, const struct lost_event *lost, const char *text) {
+    struct action_record action = {.action = ACTION_LOST, .route = lost->route, .target = lost->target, .topic = lost->topic,
+                                   .reason = lost->reason, .error = lost->error, .refusal = lost->refusal};
+    actions_note(actions, stage->counters, action, text, strlen(text));
+}
+
 void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost, const char *text) {
     lost.route = to->route;
@@ -33,6 +39,8 @@ void lose_message(struct stage *stage, const struct targets *to, const struct ta
     lost.counter = target->dropped[lost.reason];
     stage_count(stage, lost.counter, 1);
     report_loss(&stage->reporter, now, lost, text);
+    struct actions *observed = target->topic ? NULL : stage_actions(stage);
+    if (observed) note_lost(observed, stage, &lost, text);
 }
 
 void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
@@ -177,6 +185,14 @@ static bool publish_it(struct stage *stage, const struct targets *to, const stru
     }
 }
 
+/* Note a command that was sent. A datagram that feeds no deadman is in the mirror as it was received. */
+static void note_sent(struct actions *actions, const struct stage *stage, const struct targets *to,
+                      const struct target *target, const uint8_t *data, size_t size) {
+    if (to->topic == NO_NAME && !target->feed_count) return;
+    struct action_record action = {.action = ACTION_SENT, .route = to->route, .target = target->id, .topic = to->topic};
+    actions_note(actions, stage->counters, action, data, size);
+}
+
 /* Like `deliver_now`; part of `deliver`, where each instruction counts. */
 static inline bool leave(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
                          size_t size, int64_t expires, int64_t now) {
@@ -187,6 +203,8 @@ static inline bool leave(struct stage *stage, const struct targets *to, const st
     } else {
         stage_count(stage, target->delivered, 1);
         stage_count(stage, target->delivered_bytes, (int64_t)size);
+        struct actions *observed = stage_actions(stage);
+        if (observed) note_sent(observed, stage, to, target, data, size);
     }
     return true;
 }

@@ -137,6 +137,11 @@ static inline void stage_count(struct stage *stage, uint32_t index, int64_t amou
     if (stage->counted) stage->counted(stage, index, amount);
 }
 
+/* Where to note actions of the stage's thread; NULL while nobody observes. The stage must have a group of timers. */
+static inline struct actions *stage_actions(const struct stage *stage) {
+    return atomic_load_explicit(&stage->timers->actions, memory_order_acquire);
+}
+
 /* Begin with a datagram: set the slots of its time and its sender, and the others to their defaults. `sources` are names of
  * senders, by column. */
 void begin_datagram(struct machine *machine, const struct layout *layout, const struct value *sources,

@@ -6,10 +6,9 @@
 
 #include "deliver.h"
 
-/* Open a lock with priority inheritance: its holder runs with the priority of the waiting threads, and unlocking passes the
- * lock to the first of them, so a thread that sends continuously cannot delay brakes by taking it again and again. It costs
- * nothing if no thread waits. Return 0 or an errno. */
-static int open_lock(pthread_mutex_t *lock) {
+/* The holder runs with the priority of the waiting threads, and unlocking passes the lock to the first of them, so a thread
+ * that sends continuously cannot delay brakes by taking it again and again. It costs nothing if no thread waits. */
+int lock_open(pthread_mutex_t *lock) {
     pthread_mutexattr_t attributes;
     int error = pthread_mutexattr_init(&attributes);
     if (error) return error;
@@ -23,7 +22,7 @@ struct timers *timers_open_on(struct stage *stage, bool has_timer) {
     struct timers *timers = calloc(1, sizeof *timers);
     if (!timers) return NULL;
     timers->timer = has_timer ? timerfd_create(CLOCK_BOOTTIME, TFD_CLOEXEC | TFD_NONBLOCK) : -1;
-    if ((has_timer && timers->timer < 0) || open_lock(&timers->lock)) {
+    if ((has_timer && timers->timer < 0) || lock_open(&timers->lock)) {
         if (timers->timer >= 0) close(timers->timer);
         free(timers);
         return NULL;
@@ -62,6 +61,10 @@ void timers_close(struct timers *timers) {
         free(timers->stage);
     }
     free(timers);
+}
+
+void timers_observe(struct timers *timers, struct actions *actions) {
+    atomic_store_explicit(&timers->actions, actions, memory_order_release);
 }
 
 /* ---- with the lock held ---- */

@@ -11,6 +11,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "actions.h"
 #include "counters.h"
 #include "ring.h"
 
@@ -53,6 +54,7 @@ struct timers {
     /* Nothing is due before this time (boot clock, ns); NEVER if nothing is due at all. May be read without the lock. It moves
      * back only when timers are served, so the cost of a command that extends a deadline is independent of other timers. */
     _Atomic int64_t wakes_at;
+    _Atomic(struct actions *) actions; /* of all threads that use the group, while they are observed; else NULL */
     struct timer *first, *last; /* newest first: deferrals are served before the pacer that gets their messages */
 };
 
@@ -64,6 +66,12 @@ struct timers *timers_open(counter *counters, struct ring *events);
  * descriptors run out. */
 struct timers *timers_open_on(struct stage *stage, bool has_timer);
 void timers_close(struct timers *timers); /* when no thread uses it and it has no timer left */
+
+/* Note the actions of the threads that use the group from now on; NULL stops that. Takes no lock. */
+void timers_observe(struct timers *timers, struct actions *actions);
+
+/* Open a lock with priority inheritance. Return 0 or an errno. */
+int lock_open(pthread_mutex_t *lock);
 
 /* Serve the timers that are due, and determine when the next one is. `now` is on the boot clock. */
 void timers_serve(struct timers *timers, int64_t now);
