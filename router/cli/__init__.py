@@ -72,6 +72,7 @@ GROUPS = {
     },
     "Record": {
         "record": "record what the running router receives",
+        "show": "print a recording, or explain the stops in it",
         "replay": "send a recording again, or run it through two tables",
     },
     "Try": {

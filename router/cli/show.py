@@ -1,0 +1,152 @@
+"""`router show FILE`: print a recording, or with `--why` explain each stop in it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import say, seconds
+from router.errors import UsageError
+
+if TYPE_CHECKING:
+    from router.datagrams import Wire
+    from router.recording.reader import Recording
+    from router.tools.show import Entry
+
+_DESCRIPTION = """Print a recording: what the router received, rejected and dropped, what it sent by itself, and when
+deadmen tripped. With --why, print for each deadman that tripped when that was, why, and what last fed it. Neither the
+table nor a running router is needed. Times are local, with milliseconds; times in file names are UTC."""
+_EXAMPLES = (
+    "router show it.mcap --why",
+    "router show it.mcap --around 14:03",
+    "router show it.mcap --case drive_motor --where 'left > 0' --json",
+)
+_MARGIN = 30.0
+_BATCH = 500
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "show", _DESCRIPTION, *_EXAMPLES)
+    parser.add_argument("file", type=Path, metavar="FILE", help="recording of a router")
+    parser.add_argument("--why", action="store_true", help="explain each stop instead")
+    about = "only payloads of this case, received or sent; may be repeated"
+    parser.add_argument("--case", dest="cases", action="append", default=[], metavar="CASE", help=about)
+    about = "only payloads for which this expression is true: 'satellites < 4'"
+    parser.add_argument("--where", metavar="EXPR", help=about)
+    about = "only around this time: local, such as 14:03 or 14:03:07, or with date, such as 2026-04-12T14:03"
+    parser.add_argument("--around", metavar="TIME", help=about)
+    about = "how long before and after the time of --around (default: 30s)"
+    parser.add_argument("--margin", type=seconds, metavar="DURATION", help=about)
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+
+
+def run(args: argparse.Namespace) -> int:
+    from router.datagrams import Wire
+    from router.recording.reader import Recording
+    from router.recording.schemas import recorded_envelope
+    from router.tools.show import in_order
+
+    if args.why and (args.cases or args.where):
+        raise UsageError("--why explains whole stops", "leave out --case and --where")
+    if args.margin is not None and args.around is None:
+        raise UsageError("--margin is for --around", "give both")
+    with closing(Recording(args.file)) as recording:
+        wire = Wire(recorded_envelope(recording.cases()))
+        entries = in_order(recording.everything())
+        first = next(entries, None)
+        if first is None:
+            say(f"{args.file} has no datagrams")
+            return OK
+        _say_what(recording, first)
+        (_explain if args.why else _print)(args, recording, wire, chain([first], entries), first)
+        if recording.ends_early:
+            say(f"{args.file} was not finished: everything after its last complete chunk is missing")
+    return OK
+
+
+def _say_what(recording: Recording, first: Entry) -> None:
+    from router.recording.about import tripped_in
+    from router.tools.tap import clock_text, local_time
+
+    begin = local_time(first.at)
+    tripped = ", ".join(tripped_in(recording.about))
+    why = f"saved because of {tripped}, " if tripped else ""
+    offset = f"{begin:%z}"
+    say(
+        f"{recording.path}: {why}table {recording.about.get('table', 'unknown')}; "
+        f"begins {begin:%Y-%m-%d} {clock_text(begin)}, local time (UTC{offset[:3]}:{offset[3:]})"
+    )
+
+
+def _window(args: argparse.Namespace, first: Entry) -> tuple[int, int] | None:
+    from router.tools.show import window
+
+    if args.around is None:
+        return None
+    return window(args.around, _MARGIN if args.margin is None else args.margin, first.at)
+
+
+def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
+    from router.tools.tap import clock_text, local_time
+
+    begin, end, last_shown = (clock_text(local_time(each)) for each in (*span, last))
+    say(f"{what} between {begin} and {end}; the recording ends at {last_shown}")
+
+
+def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: Iterator[Entry], first: Entry) -> None:
+    from router.tools.show import Filter, shown
+    from router.tools.tap import Condition
+
+    cases = [wire.case(name) for name in args.cases] or list(wire.envelope.cases.values())
+    if args.where and not cases:
+        raise UsageError(f"{recording.path} has no payloads, so --where has none to look at")
+    condition = Condition(args.where, wire.envelope, cases) if args.where else None
+    chosen, span = Filter(args.cases, condition), _window(args, first)
+    last, count = first.at, 0
+
+    def lines() -> Iterator[str]:
+        nonlocal last
+        for entry in entries:
+            last = entry.at
+            if span is None or span[0] <= entry.at <= span[1]:
+                as_shown = shown(entry, wire)
+                if chosen.takes(entry, as_shown):
+                    yield as_shown.json(False) if args.json else as_shown.line(False)
+
+    made = lines()
+    while batch := [*islice(made, _BATCH)]:
+        count += len(batch)
+        print("\n".join(batch), flush=True)
+    if span is not None and not count:
+        _say_nothing(span, "nothing to show", last)
+    if condition is not None and condition.failure:
+        say(f"payloads for which --where has no value are not shown: {condition.failure}")
+
+
+def _explain(
+    args: argparse.Namespace, recording: Recording, wire: Wire, entries: Iterator[Entry], first: Entry
+) -> None:
+    from router.recording.about import routes_of
+    from router.tools.stops import Stops
+
+    stops, last, span = Stops(routes_of(recording.about), wire), first.at, _window(args, first)
+    for entry in entries:
+        stops.take(entry)
+        last = entry.at
+    found = [stop for stop in stops.found if span is None or span[0] <= stop.at <= span[1]]
+    for number, stop in enumerate(found):
+        if args.json:
+            print(stop.json())
+        else:
+            print("\n".join(([""] if number else []) + stop.lines()))
+    if not found and span is not None:
+        _say_nothing(span, "no deadman tripped", last)
+    elif not found and not stops.has_actions:
+        say("this recording has no actions of the router: an earlier version made it, or nothing was sent")
+    elif not found:
+        say("no deadman tripped in this recording")

@@ -1,0 +1,1 @@
+"""Why a robot stopped is found in the recording alone."""
