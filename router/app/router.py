@@ -308,7 +308,8 @@ class Services:
         def recorded(metric: str) -> SeriesFunction:
             return lambda: self._recorder.samples()[metric] if self._recorder else ()
 
-        own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
+        metrics = "recorded_datagrams", "recorded_bytes", "record_dropped", "recordings_unsaved", "recordings_lost"
+        own = {metric: recorded(metric) for metric in metrics}
         return {**own, "endpoint_stale_after_seconds": self._stale_after}
 
     def _stale_after(self) -> Iterator[tuple[tuple[str, str], float]]:

@@ -147,6 +147,8 @@ METRICS = (
         "number",
         ("route", "topic", "policy"),
         "Peers that currently cannot connect because of their QoS.",
+    Metric("recordings_unsaved", "number", ("reason",), "Recordings of stops in memory that the disk does not accept."),
+    Metric("recordings_lost", "counter", (), "Recordings of stops that were never written."),
     ),
 )
 
@@ -239,6 +241,14 @@ STARTS: Mapping[str, str] = {
 """Ways in which a router can start, with their meaning."""
 
 CLIENTS = "clients"
+UNSAVED_REASONS: Mapping[str, str] = {
+    "disk_full": "the disk or the user's quota is full",
+    "read_only": "the disk is mounted read-only",
+    "no_permission": "the router's user may not write there",
+    "disk_error": "another error of the disk, which the log names",
+}
+"""Reasons why the recording of a stop is not on the disk yet, with their meaning."""
+
 """The `target` and `source` label of a gateway's clients."""
 
 QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")

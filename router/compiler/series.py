@@ -18,6 +18,7 @@ from router.compiler.metrics import (
     TOPIC_STATES,
     UNKNOWN_CASE,
     Counters,
+    UNSAVED_REASONS,
 )
 from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, source_label
 from router.table.model import ROS, RouteTable
@@ -72,10 +73,11 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
     _open(counters, ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"))
     _open_each(counters, "config_reloads", last=RELOAD_RESULTS)
     if table.record is not None:
-        _open(counters, ("recorded_datagrams", "recorded_bytes"))
+        _open(counters, ("recorded_datagrams", "recorded_bytes", "recordings_lost"))
         _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
 
 
+        _open_each(counters, "recordings_unsaved", last=UNSAVED_REASONS)
 def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
     """Open the series of a route, or of one source topic of a route from ROS."""
     route = plan.route

@@ -48,6 +48,10 @@ REMEDIES: Mapping[str, str] = {
     "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
 }
 """Remedies by the reason of a loss."""
+    "disk_full": "Free space on the disk of `record.directory` (`df -h`) before you stop the router: it retries every 10 s.",
+    "read_only": "Remount the disk of `record.directory` writable (`dmesg` says why it is not); the router retries.",
+    "no_permission": "Make `record.directory` writable for the user of the router, which retries every 10 s.",
+    "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
@@ -56,6 +60,7 @@ _MORE: Mapping[Kind, str] = {
 }
 """The text that gives the value, for kinds where it matters."""
 
+    Kind.RECORDING_UNSAVED: ", {:.0f} of them",
 _GAUGES = (Kind.LISTENER_WAITING, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
@@ -71,6 +76,9 @@ _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
 
 _NAMED = 3
 """Maximum routes that a text names."""
+
+_ALSO_LOST = "mirror_dropped", "recordings_lost"
+"""Further metrics of RECORDING_INCOMPLETE."""
 
 _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
@@ -280,7 +288,7 @@ class Look:
     def _lost(self, kind: Kind) -> Iterator[Problem]:
         """Yield unintended losses of the last seconds, summed over the labels that the words do not contain."""
         sums: dict[Labels, Counter[str]] = defaultdict(Counter)
-        for metric in (kind.metric, *(["mirror_dropped"] if kind is Kind.RECORDING_INCOMPLETE else [])):
+        for metric in (kind.metric, *(_ALSO_LOST if kind is Kind.RECORDING_INCOMPLETE else ())):
             for values, count in self.grown(metric):
                 labels = dict(zip(SERIES[metric], values, strict=True))
                 if labels.get("reason") not in _NO_LOSS and (kind not in DROPS or kind is self._drop(labels)):

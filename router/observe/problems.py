@@ -150,11 +150,17 @@ class Kind(enum.Enum):
         "Check that the hub runs and that `connect` is reachable; the log has the error.",
         "gateway_connections",
     )
+    RECORDING_UNSAVED = (
+        Level.WARNING,
+        "the recording of a stop is only in memory: {reason}",
+        "",
+        "recordings_unsaved",
+    )
     RECORDING_INCOMPLETE = (
         Level.WARNING,
         "recordings or taps are missing datagrams",
         "Run `df` and `router doctor`: the disk is full or too slow, or the computer is too busy.",
-        "record_dropped",  # and mirror_dropped
+        "record_dropped",  # and mirror_dropped, recordings_lost
     )
     ENDPOINT_NEVER_HEARD = (
         Level.INFO,

@@ -23,6 +23,7 @@ METRICS = {kind.metric for kind in Kind} | {
     "messages_received",
     "mirror_dropped",
     *DELIVERED,
+    "recordings_lost",
 }
 """The metrics read each second. Histograms, which have most of the series, are not among them."""
 

@@ -5,6 +5,9 @@ The mirror's thread encodes each datagram once, into chunks for both; the thread
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,9 +22,10 @@ from router.clock import boottime_ns, wall_ns
 from router.compiler.program import Program
 from router.errors import RouterError
 from router.log import fault, logger
-from router.recording.about import about
+from router.recording.about import about, reason_of
 from router.recording.channels import Channels
 from router.recording.encoder import LONGEST_CHUNK, Chunk, Encoder
+from router.recording.incidents import Incident, Incidents
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.recording.writer import ContinuousWriter, RecordingDirectory
 from router.table.model import RecordSettings
@@ -33,13 +37,18 @@ PERIOD = 500_000_000
 MOST_QUEUED = 64 << 20
 """Maximum bytes of chunks in the queue to the disk."""
 
+AFTERMATH = 2_000_000_000
+"""ns from a stop until its recording is saved, which then has the brakes, their effect, and further deadmen."""
+
+LONGEST_AFTERMATH = 10_000_000_000
+"""Likewise, if boards have not answered."""
+
 STOP_SECONDS = 2.5
 """How long shutting down waits for the disk. A service manager kills the router after 10 s, and more must be closed."""
 
 _PATIENCE = 30.0
 """Timeout of `save`, s."""
 
-_NO_NOTES: Mapping[str, str] = {}
 
 
 class RecordError(RouterError):
@@ -69,10 +78,15 @@ class Ring:
 
 @dataclass(slots=True)
 class _Trip:
-    """A deadman that has tripped: the route, the boards that have not answered yet, and the answers."""
+    """A deadman that has tripped: the route, the boards that have not answered yet, and the answers.
+
+    `at` is on the wall clock, `tripped_at` on the boot clock, ns.
+    """
 
     route: str
     awaited: set[str]
+    at: int
+    tripped_at: int
     answers: list[str] = field(default_factory=list)
 
 
@@ -99,11 +113,12 @@ class Recorder:
             else None
         )
         self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
+        self._incidents = Incidents(self._write_incident, lambda: self._ring.chunks() if self._ring else ())
         self._overflow = self._lost_by_faults = 0
         self._is_writing = True
         self._due = boottime_ns() + PERIOD
-        self._trips: deque[_Trip] = deque()  # to save
-        self._unanswered: dict[str, _Trip] = {}  # by route
+        self._trips: list[_Trip] = []
+        self._tripping = threading.Lock()  # for the trips
         self._trips_saved_at: int | None = None
         self._requests: deque[tuple[str, Future[Path]]] = deque()
         self._requesting = threading.Lock()
@@ -129,37 +144,38 @@ class Recorder:
             raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
 
     def deadman_tripped(self, route: str, awaited: Iterable[str] = ()) -> None:
-        """Request to save the datagrams in memory, once the `awaited` boards have answered. Returns at once."""
+        """Request to save the datagrams in memory after AFTERMATH and the answers of `awaited` boards. Returns at once."""
         if self._ring is not None:
-            self._unanswered[route] = trip = _Trip(route, set(awaited))
-            if not trip.awaited:
-                self.deadman_released(route)
+            with self._tripping:
+                self._trips.append(_Trip(route, set(awaited), wall_ns(), boottime_ns()))
+            self._wake()
 
     def board_answered(self, route: str, board: str, answer: str) -> None:
         """Note whether a board obeys the deadman of a route, for the metadata of the file that is saved then."""
-        trip = self._unanswered.get(route)
-        if trip is None or board not in trip.awaited:
-            return
-        trip.awaited.remove(board)
-        trip.answers.append(f"{route}: {board} {answer}")
-        if not trip.awaited:
-            self.deadman_released(route)
+        with self._tripping:
+            for trip in self._trips:
+                if trip.route == route and board in trip.awaited:
+                    trip.awaited.remove(board)
+                    trip.answers.append(f"{route}: {board} {answer}")
 
     def deadman_released(self, route: str) -> None:
-        """Save what was requested when the deadman tripped, without waiting for more answers."""
-        trip = self._unanswered.pop(route, None)
-        if trip is not None:
-            self._trips.append(trip)
+        """Wait for no more answers to a deadman."""
+        with self._tripping:
+            for trip in self._trips:
+                if trip.route == route:
+                    trip.awaited.clear()
             self._wake()
 
     def samples(self) -> Mapping[str, Sequence[tuple[tuple[str, ...], float]]]:
         """Return the metrics of the recorder: for each its label values and values."""
         continuous = self._continuous
-        write_errors = self._lost_by_faults + (continuous.lost if continuous else 0)
+        write_errors = self._lost_by_faults + self._incidents.dropped + (continuous.lost if continuous else 0)
         return {
             "recorded_datagrams": [((), continuous.datagrams if continuous else 0)],
             "recorded_bytes": [((), continuous.bytes if continuous else 0)],
             "record_dropped": [(("overflow",), self._overflow), (("write_error",), write_errors)],
+            "recordings_unsaved": [((reason,), number) for reason, number in self._incidents.unsaved.items()],
+            "recordings_lost": [((), self._incidents.lost)],
         }
 
     def close(self) -> None:
@@ -223,15 +239,17 @@ class Recorder:
             self._wake_up.wait(self._due - boottime_ns())
             self._write()
             self._save_requested()
-            if self._trips and self._may_save_trips():
-                self._save_trips()
+            if self._trips and self._are_trips_due():
+                self._take_trips()
+            self._incidents.save(boottime_ns())
         self._write()
         if self._continuous is not None:
             self._continuous.close()
         self._save_requested()
-        self._trips.extend(self._unanswered.values())
         if self._trips:
-            self._save_trips()
+            self._take_trips()
+        self._incidents.save(boottime_ns(), at_once=True)
+        self._incidents.give_up()
 
     def _write(self) -> None:
         """Finish a chunk, and write all queued ones."""
@@ -276,25 +294,43 @@ class Recorder:
             except RecordError as error:
                 done.set_exception(error)
 
-    def _may_save_trips(self) -> bool:
+    def _are_trips_due(self) -> bool:
         """Return True at most once per `last`: then nothing is missed, and frequent trips do not fill the disk."""
         assert self._settings.last is not None  # noqa: S101 - `deadman_tripped` checks
         now = boottime_ns()
-        if self._trips_saved_at is not None and now - self._trips_saved_at < self._settings.last:
+        with self._tripping:
+            waited = now - self._trips[0].tripped_at
+            is_awaiting = waited < LONGEST_AFTERMATH and any(trip.awaited for trip in self._trips)
+        is_recent = self._trips_saved_at is not None and now - self._trips_saved_at < self._settings.last
+        if is_recent or is_awaiting or waited < AFTERMATH:
             return False
         self._trips_saved_at = now
         return True
 
-    def _save_trips(self) -> None:
-        trips = [self._trips.popleft() for _ in range(len(self._trips))]
-        answers = "; ".join(answer for trip in trips for answer in trip.answers)
-        with suppress(RecordError):  # it has been logged
-            self._save(f"deadman-{min(trip.route for trip in trips)}", {"obeyed": answers} if answers else {})
-
-    def _save(self, reason: str, notes: Mapping[str, str] = _NO_NOTES) -> Path:
-        """Write the ring to a file with these notes in its metadata. Raises RecordError, which has been logged."""
+    def _take_trips(self) -> None:
+        """Keep what is in memory until it is saved."""
+        assert self._ring is not None  # noqa: S101 - `deadman_tripped` checks
+        with self._tripping:
+            trips, self._trips = self._trips, []
+        self._write()
         try:
-            path = self._write_ring(reason, notes)
+            routes = [*dict.fromkeys(trip.route for trip in trips)]
+            answers = "; ".join(answer for trip in trips for answer in trip.answers)
+            metadata = {**self._about(reason_of(routes), routes), **({"obeyed": answers} if answers else {})}
+            self._incidents.add(Incident(routes, trips[0].at, metadata, self._ring.chunks()))
+        except Exception as error:  # noqa: BLE001 as in `_take`
+            fault(error, "prevented saving", "the recorder").log()
+
+    def _write_incident(self, incident: Incident) -> None:
+        path = self._write_chunks(incident.reason, incident.chunks, incident.about, incident.at)
+        logger.info("saved the last datagrams", reason=incident.reason, file=str(path))
+
+    def _save(self, reason: str) -> Path:
+        """Write the ring to a file, and return its path. Raises RecordError, which has been logged."""
+        assert self._ring is not None  # noqa: S101 - `save` checks
+        self._write()
+        try:
+            path = self._write_chunks(reason, self._ring.chunks(), self._about(reason), wall_ns())
         except OSError as error:
             logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
@@ -305,27 +341,26 @@ class Recorder:
         logger.info("saved the last datagrams", reason=reason, file=str(path))
         return path
 
-    def _write_ring(self, reason: str, notes: Mapping[str, str]) -> Path:
-        """Write the ring to a file. Meanwhile, continuous recording continues."""
-        assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` check
-        self._write()
-        chunks = self._ring.chunks()
+    def _write_chunks(self, reason: str, chunks: Sequence[Chunk], about: Mapping[str, str], at: int) -> Path:
+        """Write chunks to a file, all or none. Meanwhile, continuous recording continues. Raises OSError."""
         coming = sum(chunk.size_in_file for chunk in chunks)
         writing = self._continuous.path if self._continuous is not None else None
         self._directory.make_room(coming + (self._settings.max_size if writing is not None else 0), writing)
-        file = self._directory.new(reason, self._channels, {**self._about(reason), **notes})
+        if shutil.disk_usage(self._directory.path).free < coming:  # others need the rest
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory.path))
+        file = self._directory.new(reason, self._channels, about, at)
         try:
             for chunk in chunks:
                 file.write(chunk)
                 if boottime_ns() >= self._due and not self._closing:
                     self._write()
+            file.close()
         except Exception:
-            file.abandon()
+            file.discard()
             raise
-        file.close()
         return file.path
 
-    def _about(self, reason: str) -> dict[str, str]:
+    def _about(self, reason: str, tripped: Sequence[str] = ()) -> dict[str, str]:
         """Return the metadata of a file."""
         program = self._running_program()
-        return {**about(program.table, reason), "protos_sha256": program.protos_sha256}
+        return {**about(program.table, reason, tripped), "protos_sha256": program.protos_sha256}

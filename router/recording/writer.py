@@ -115,7 +115,7 @@ class RecordingFile:
             self._append(self._end())
             self.sync()
         finally:
-            os.close(self._descriptor)
+            self._close()
 
     def abandon(self) -> None:
         """Close a file after a write error; remove it if it has no chunk."""
@@ -124,6 +124,17 @@ class RecordingFile:
                 self.path.unlink()
         with suppress(OSError):
             self.close()
+
+    def discard(self) -> None:
+        """Remove a file after an error."""
+        with suppress(OSError):
+            self.path.unlink()
+        if self._descriptor >= 0:
+            self._close()
+
+    def _close(self) -> None:
+        descriptor, self._descriptor = self._descriptor, -1
+        os.close(descriptor)
 
     def _end(self) -> bytes:
         """Return data end, summary and footer."""
@@ -209,10 +220,10 @@ class RecordingDirectory:
         self._stem = stem
         self._retention = settings.retention
 
-    def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
-        """Create a file with the next number. Raises OSError."""
+    def new(self, reason: str, channels: Channels, about: Mapping[str, str], at: int) -> RecordingFile:
+        """Create a file with the next number and the time `at` (wall clock, ns). Raises OSError."""
         number = 1 + max((number for number, _ in _numbered(self.path, self._stem)), default=0)
-        time = datetime.fromtimestamp(wall_ns() / 1e9, timezone.utc).strftime(_TIME)
+        time = datetime.fromtimestamp(at / 1e9, timezone.utc).strftime(_TIME)
         words = [self._stem, f"{number:06}", time]
         if reason:
             words.append(re.sub(r"[^a-z0-9_.-]+", "-", reason.lower()))
@@ -326,7 +337,7 @@ class ContinuousWriter:
             self.close()
         if self._file is None:
             self._directory.make_room(self._max_size)
-            self._file = self._directory.new("", self._channels, self._about())
+            self._file = self._directory.new("", self._channels, self._about(), wall_ns())
             self._opened = now
         return self._file
 

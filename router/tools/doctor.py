@@ -50,8 +50,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     yield from ports(program, running=running is not None)
     yield from ros_ports(program, variables)
     yield from receive_buffers(program)
-    if running is None:
-        yield from recordings(program)
+    yield from recordings(program, running=running is not None)
     yield from shared_memory(variables)
     yield from open_domain(program, variables)
     yield from clock()
@@ -69,7 +68,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     program = checked.program
     if program is not None:
         needed += [carrier(), ros(program), ports(program, running=False, with_listeners=False)]
-        needed += [recordings(program), ros_ports(program, variables)]
+        needed += [recordings(program, running=False), ros_ports(program, variables)]
     yield from (result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM)
     if program is not None:
         yield from (result for result in listeners(program) if result.grade is not Grade.FINE)

@@ -91,8 +91,15 @@ def receive_buffers(program: Program) -> Iterator[CheckResult]:
     )
 
 
-def recordings(program: Program) -> Iterator[CheckResult]:
-    """Check that the directory is writable and has room for what the table keeps."""
+LEAST_FREE = 64 << 20
+"""Bytes: more than the recording of a stop takes at 5,000 datagrams per second."""
+
+
+def recordings(program: Program, *, running: bool) -> Iterator[CheckResult]:
+    """Check that the directory is writable and has room for what the table keeps.
+
+    A `running` router may have another user, and reports itself what it cannot write.
+    """
     settings = program.table.record
     if settings is None:
         return
@@ -107,10 +114,19 @@ def recordings(program: Program) -> Iterator[CheckResult]:
         remedy = "move that file away, or give `record` another directory"
         yield problem("recordings", f"{there} is a file, not a folder", remedy)
         return
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        remedy = "`dmesg` says why; `mount -o remount,rw` undoes it; or give `record` another directory"
+        grade = problem if running else warning  # it prevents no start
+        yield grade("recordings", f"the disk with {there} is mounted read-only", remedy)
+        return
     if not os.access(there, os.R_OK | os.W_OK | os.X_OK):
+        what = f"{_user(os.geteuid())} may not write to {there}"
+        if running:
+            yield fine("recordings", f"{what}; the running router reports what it cannot write")
+            return
         yield problem(
             "recordings",
-            f"{_user(os.geteuid())} may not write to {there}",
+            what,
             "chown it, or give `record` another directory; for a service, then run deploy/install-service.sh again",
         )
         return
@@ -123,6 +139,9 @@ def recordings(program: Program) -> Iterator[CheckResult]:
             f"`retention` is {settings.retention >> 20} MiB",
             "reduce `retention`: then the oldest files are deleted before the disk is full",
         )
+    elif free < LEAST_FREE:
+        what = f"the disk with {directory} has {free >> 20} MiB free: the recording of a stop may not fit"
+        yield warning("recordings", what, "free space, or give `record` another directory")
     else:
         yield fine("recordings", f"{directory}, with {free >> 20} MiB free")
 

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -17,13 +18,16 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from router.compiler.metrics import UNSAVED_REASONS
 from router.errors import StartError
+from router.recording import incidents as incidents_module
 from router.recording import recorder as recorder_module
 from router.recording import writer as writer_module
+from router.recording.about import tripped_in
 from router.recording.channels import Channels
 from router.recording.encoder import Chunk, Encoder
-from router.recording.mirror import MirroredDatagram
-from router.recording.reader import Recording
+from router.recording.mirror import TRIPPED, Action, MirroredDatagram
+from router.recording.reader import RecordedAction, Recording
 from router.recording.recorder import Recorder, RecordError, Ring
 from router.recording.writer import RecordingFile
 from tests.recording.recorder_rig import (
@@ -42,11 +46,13 @@ from tests.recording.recorder_rig import (
 )
 
 PATIENCE = 20.0
+NOTHING_UNSAVED = {**{f"recordings_unsaved {reason}": 0 for reason in UNSAVED_REASONS}, "recordings_lost": 0}
 
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "PERIOD", 10_000_000)
+    monkeypatch.setattr(recorder_module, "AFTERMATH", 0)
 
 
 @contextmanager
@@ -68,6 +74,24 @@ def show(made: Recorder, mirror: FakeMirror, batch: list[MirroredDatagram]) -> N
     while counted(made)["recorded_datagrams"] + counted(made)["record_dropped write_error"] < before + len(batch):
         assert monotonic() < deadline, "it was never written"
         sleep(0.01)
+
+
+def until(condition: Callable[[], object], otherwise: str) -> None:
+    deadline = monotonic() + PATIENCE
+    while not condition():
+        assert monotonic() < deadline, otherwise
+        sleep(0.01)
+
+
+def about(path: Path) -> dict[str, str]:
+    with closing(Recording(path)) as recording:
+        assert sum(1 for _ in recording.everything()) > 0
+        return recording.about
+
+
+def actions(path: Path) -> list[RecordedAction]:
+    with closing(Recording(path)) as recording:
+        return [each for each in recording.everything() if isinstance(each, RecordedAction)]
 
 
 def files(directory: Path) -> list[Path]:
@@ -93,6 +117,7 @@ def test_all_that_was_seen_is_in_the_file_when_it_is_closed(tmp_path: Path) -> N
         "recorded_bytes": sum(len(each.data) for batch in batches for each in batch),
         "record_dropped overflow": 0,
         "record_dropped write_error": 0,
+        **NOTHING_UNSAVED,
     }
 
 
@@ -210,18 +235,81 @@ def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_pat
     with running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
         mirror.show(now(imu(1)))
         made.deadman_tripped("drive_motor")
-        deadline = monotonic() + PATIENCE
-        while not files(tmp_path):
-            assert monotonic() < deadline, "it was never saved"
-            sleep(0.01)
+        until(lambda: files(tmp_path), "it was never saved")
         made.deadman_tripped("drive_motor")
         made.deadman_tripped("arm_target")
         made.save("in between")
         assert len(files(tmp_path)) == 2
         mirror.show(now(imu(2)))
-    reasons = [path.name.partition("Z_")[2] for path in files(tmp_path)]
-    assert reasons == ["deadman-drive_motor.mcap", "in-between.mcap", "deadman-arm_target.mcap"]  # the last at the end
-    assert len(read(files(tmp_path)[-1])) == 2
+    found = {path.name.partition("Z_")[2]: path for path in files(tmp_path)}
+    assert found.keys() == {"deadman-drive_motor.mcap", "in-between.mcap", "deadman-drive_motor-arm_target.mcap"}
+    assert len(read(last := found["deadman-drive_motor-arm_target.mcap"])) == 2  # saved at the end
+    assert tripped_in(about(last)) == ["drive_motor", "arm_target"]
+
+
+def test_a_stop_is_saved_with_what_follows_it_and_under_the_names_of_all_who_tripped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "AFTERMATH", 300_000_000)
+    with running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+        before = time_ns()
+        made.deadman_tripped("winch")
+        after = time_ns()
+        mirror.act([Action(time_ns(), TRIPPED, "winch")])
+        made.deadman_tripped("arm")
+        until(lambda: files(tmp_path), "it was never saved")
+    [path] = files(tmp_path)
+    assert path.name.endswith("_deadman-winch-arm.mcap")
+    at = datetime.strptime(path.name.split("_")[1], "%Y%m%dT%H%M%S.%fZ").replace(tzinfo=timezone.utc).timestamp()
+    assert before / 1e9 - 1e-6 <= at <= after / 1e9  # when it stopped, not when that was saved
+    assert [(each.action.what, each.action.route) for each in actions(path)] == [("tripped", "winch")]
+
+
+def test_a_stop_that_a_full_disk_does_not_accept_waits_in_memory_and_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(incidents_module, "RETRY", 50_000_000)
+    real = os.write
+    with capture_logs() as logs, running_recorder(tmp_path, continuous=False, last=50_000_000) as (made, mirror):
+        monkeypatch.setattr(os, "write", _full_after_the_head)
+        for route in ("drive", "arm"):
+            mirror.show(now(imu(1), imu(2)))
+            made.deadman_tripped(route)
+            waiting = len(("drive", "arm")[: 1 + (route == "arm")])
+            until(lambda: counted(made)["recordings_unsaved disk_full"] == waiting, "it is not said")  # noqa: B023
+            assert files(tmp_path) == []
+            sleep(0.1)  # longer than `last`: no datagram is in the ring any more
+        monkeypatch.setattr(os, "write", real)
+        until(lambda: counted(made)["recordings_unsaved disk_full"] == 0, "they are not saved")
+        assert [len(read(path)) for path in files(tmp_path)] == [2, 2]
+    assert [path.name.partition("Z_")[2] for path in files(tmp_path)] == ["deadman-drive.mcap", "deadman-arm.mcap"]
+    assert counted(made)["recordings_lost"] == 0
+    told = [(each["log_level"], each["event"].partition(";")[0]) for each in logs]
+    saved = ("info", "saved the last datagrams")
+    assert told == [("error", "cannot save the recording of a stop"), saved, saved]
+
+
+def test_a_stop_that_was_never_written_is_said_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with capture_logs() as logs, running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+        mirror.show(now(imu(1), imu(2)))
+        monkeypatch.setattr(os, "write", _full_after_the_head)
+        made.deadman_tripped("drive")
+    monkeypatch.undo()
+    assert files(tmp_path) == []
+    assert counted(made)["recordings_lost"] == 1
+    [lost] = [each for each in logs if "is lost" in each["event"]]
+    assert (lost["log_level"], lost["reason"], lost["had"]) == ("error", "deadman-drive", "2 datagrams")
+
+
+def test_where_there_is_no_room_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Filling the disk every 10 s would disturb other programs."""
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10))
+    monkeypatch.setattr(os, "write", _fault)
+    with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+        mirror.show(now(imu(1)))
+        with pytest.raises(RecordError, match="No space left"):
+            made.save("http")
+        monkeypatch.undo()
 
 
 def test_a_deadman_that_awaits_boards_is_saved_with_their_answers(tmp_path: Path) -> None:
@@ -431,7 +519,7 @@ def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
     with running_recorder(tmp_path, last=10**11) as (made, mirror):
         mirror.show(batch := now(imu(1)))
         with monkeypatch.context() as faulty:
-            faulty.setattr(Recorder, "_write_ring", _fault)
+            faulty.setattr(Recorder, "_write_chunks", _fault)
             with pytest.raises(RecordError, match="prevented saving; please report it: LookupError"):
                 made.save("http")
             made.deadman_tripped("drive_motor")

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -250,8 +251,8 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     assert gist(receive_buffers(compiled(table)), "the kernel does not show here") == [(Grade.WARNING, True)]
 
 
-def recorded(table: Path, folder: Path, keep: str) -> Program:
-    table.write_text(f"{table.read_text()}record: {{directory: {folder}, retention: {keep}}}\n")
+def recorded(table: Path, folder: Path, keep: str, more: str = "") -> Program:
+    table.write_text(f"{table.read_text()}record: {{directory: {folder}, retention: {keep}{more}}}\n")
     return compiled(table)
 
 
@@ -268,7 +269,7 @@ def test_recordings_need_a_folder_with_room(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 100 << 20))
-    assert gist(recordings(recorded(table, tmp_path / folder, keep)), text) == [(grade, True)]
+    assert gist(recordings(recorded(table, tmp_path / folder, keep), running=False), text) == [(grade, True)]
 
 
 @pytest.mark.parametrize("target", ["recordings", "unmounted/recordings"])
@@ -276,7 +277,7 @@ def test_a_link_that_leads_nowhere_is_a_problem_as_it_is_for_a_start(table: Path
     link = tmp_path / "recordings"
     link.symlink_to(target)
     program = recorded(table, link, "1GiB")
-    assert gist(recordings(program), f"{link} is a link that leads nowhere") == [(Grade.PROBLEM, True)]
+    assert gist(recordings(program, running=False), f"{link} is a link that leads nowhere") == [(Grade.PROBLEM, True)]
     assert program.table.record is not None
     with pytest.raises(StartError, match="cannot record"):
         RecordingDirectory(program.table.record, "table")
@@ -290,9 +291,30 @@ def test_only_our_recordings_make_room_for_new_ones(
         with (tmp_path / name).open("wb") as file:
             file.truncate(6 << 20)
     program = recorded(table, tmp_path, "260MiB")
-    assert gist(recordings(program)) == [(Grade.WARNING, True)]
+    assert gist(recordings(program, running=False)) == [(Grade.WARNING, True)]
     (tmp_path / "table_20260412T101500.000000Z_signal.mcap").write_bytes(bytes(4 << 20))
-    assert gist(recordings(program)) == [(Grade.FINE, True)]
+    assert gist(recordings(program, running=False)) == [(Grade.FINE, True)]
+
+
+@pytest.mark.parametrize("running", [False, True])
+def test_a_disk_that_is_almost_full_is_told(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, running: bool
+) -> None:
+    program = recorded(table, tmp_path, "1GiB", ", continuous: false, last: 60s")
+    assert [each.grade for each in recordings(program, running=running)] == [Grade.FINE]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 9 << 20))
+    assert gist(recordings(program, running=running), "has 9 MiB free: the recording of a stop may not fit") == [
+        (Grade.WARNING, True)
+    ]
+
+
+@pytest.mark.parametrize(("running", "grade"), [(False, Grade.WARNING), (True, Grade.PROBLEM)])
+def test_a_disk_that_is_read_only_records_nothing_but_prevents_no_start(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, running: bool, grade: Grade
+) -> None:
+    program = recorded(table, tmp_path, "1GiB")
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=os.ST_RDONLY))
+    assert gist(recordings(program, running=running), "is mounted read-only") == [(grade, True)]
 
 
 def test_a_folder_that_takes_no_recordings_is_a_problem(
@@ -311,7 +333,8 @@ def test_a_folder_that_takes_no_recordings_is_a_problem(
 
     monkeypatch.setattr(os, "stat", stat)
     monkeypatch.setattr(os, "access", lambda path, _: Path(path) != private)
-    assert gist(recordings(program), f"may not write to {private}") == [(Grade.PROBLEM, True)]
+    assert gist(recordings(program, running=False), f"may not write to {private}") == [(Grade.PROBLEM, True)]
+    assert gist(recordings(program, running=True), "the running router reports") == [(Grade.FINE, True)]
 
 
 @pytest.mark.parametrize(
