@@ -119,7 +119,7 @@ class Plane:
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
         self._acted = ActionRing(forwarding.acted, self._names)
         reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
-        self._events = EventThread(threads, reader, reporter.report, of_deadmen, self._pulse)
+        self._events = EventThread(threads, reader, reporter.report, of_deadmen, reporter.returned, self._pulse)
 
     @property
     def turns(self) -> int:

@@ -14,7 +14,17 @@ from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
-from router.declared import NO_NAME, AnswerEvent, DatagramEvent, DeadmanEvent, EventHead, EventKind, LostEvent, Reason
+from router.declared import (
+    NO_NAME,
+    AnswerEvent,
+    DatagramEvent,
+    DeadmanEvent,
+    EventHead,
+    EventKind,
+    LostEvent,
+    Reason,
+    ReturnedEvent,
+)
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
@@ -26,6 +36,14 @@ class DeadmanChange:
 
     route: str
     is_tripped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Returned:
+    """An endpoint is heard again after a silence (s)."""
+
+    endpoint: str
+    silence: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +77,16 @@ class EventReader:
         self._superseded = superseded
         self._place = place
 
-    def read(self, kind: int, record: memoryview) -> DeadmanEvents | CountedReport:
+    def read(self, kind: int, record: memoryview) -> DeadmanEvents | Returned | CountedReport:
         if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
             return self._of_datagram(record)
         if kind == EventKind.LOST:
             return self._lost(record)
         if kind in {EventKind.OBEYED, EventKind.DISOBEYED, EventKind.EVIDENCE}:
             return self._answer(kind, record)
+        if kind == EventKind.RETURNED:
+            returned = ReturnedEvent.from_buffer(record)
+            return Returned(self._name(returned.endpoint), returned.silence / 1e9)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -115,7 +136,8 @@ class EventThread:
     """Reads the events of native threads, and calls `pulse` every few seconds to signal that Python is alive.
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
-    that the event names. `of_deadmen` gets everything else.
+    that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s), `of_deadmen`
+    everything else.
     """
 
     def __init__(
@@ -124,12 +146,14 @@ class EventThread:
         reader: EventReader,
         report: Callable[[Report], None],
         of_deadmen: Callable[[DeadmanEvents], None],
+        returned: Callable[[str, float], None],
         pulse: Callable[[], None],
     ) -> None:
         self._threads = threads
         self._reader = reader
         self._report = report
         self._of_deadmen = of_deadmen
+        self._returned = returned
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
@@ -174,6 +198,8 @@ class EventThread:
         self, kind: int, record: memoryview, counters: Sequence[int], last: dict[int, tuple[int, Report]]
     ) -> None:
         match self._reader.read(kind, record):
+            case Returned(endpoint, silence):
+                self._returned(endpoint, silence)
             case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
             case of_deadman:

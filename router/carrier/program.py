@@ -18,10 +18,19 @@ from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetStates, TargetWriter
-from router.compiler.metrics import UNKNOWN_CASE, Counters
+from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Program, RoutePlan, source_label
-from router.table.model import Framing
+from router.table.model import Endpoint, Framing
+
+
+def _pause(endpoint: Endpoint) -> int:
+    """Return the longest pause (ns) between two datagrams that is no silence.
+
+    `stale_after` is the time after which silence is a problem. By default it is 5 s, and a board that is reset takes
+    about 2 s: so 2/5 of it. An endpoint that is never stale has no silences.
+    """
+    return c.NEVER if endpoint.stale_after is None else endpoint.stale_after * 2 // 5
 
 
 @dataclass(slots=True)
@@ -130,9 +139,20 @@ class _Writer:
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
         for address, _, port, name in sorted((_number(host), not port, port, name) for host, port, name in known):
-            last_seen = self.counters.index("endpoint_last_seen_timestamp_seconds", name)
-            number = self.outlets.names.number(name)
-            yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen, id=number)
+            last_seen, heard_since, silences, last_silence = (
+                self.counters.index(metric, name) for metric in ENDPOINT_METRICS
+            )
+            yield c.Peer(
+                address=address,
+                port=port,
+                column=self.columns[name],
+                last_seen=last_seen,
+                heard_since=heard_since,
+                silences=silences,
+                last_silence=last_silence,
+                id=self.outlets.names.number(name),
+                pause=_pause(self.program.table.endpoints[name]),
+            )
 
     def _choices(self) -> Iterator[c.Choice]:
         """Yield the choices by row, as in `cases`: a column for each endpoint, and a last one for unknown senders."""

@@ -14,7 +14,7 @@ from router import declared as c
 from router.carrier.boards import NativeBoards
 from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced, successors
 from router.carrier.deferrals import Adoption, timer_change
-from router.carrier.events import CountedReport, DeadmanEvents, EventReader
+from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned
 from router.carrier.names import Names
 from router.carrier.outlets import Outlets
 from router.carrier.program import NativeProgram, change_to, native_program
@@ -50,7 +50,7 @@ class Output(NamedTuple):
     data: bytes
 
 
-Record = Union[Time, Increment, Output, DeadmanEvents, CountedReport]
+Record = Union[Time, Increment, Output, DeadmanEvents, Returned, CountedReport]
 
 
 class Stage:

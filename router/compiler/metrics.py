@@ -93,6 +93,14 @@ METRICS = (
     Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last accepted a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
     Metric(
+        "endpoint_heard_since_timestamp_seconds",
+        "time",
+        ("endpoint",),
+        "Since when the endpoint has been heard without a silence.",
+    ),
+    Metric("endpoint_silences", "counter", ("endpoint",), "How often the endpoint was heard again after a silence."),
+    Metric("endpoint_last_silence_seconds", "time", ("endpoint",), "How long the last such silence was."),
+    Metric(
         "endpoint_stale_after_seconds", "number", ("endpoint", "kind"), "Silence after which the endpoint is stale."
     ),
     Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
@@ -139,6 +147,8 @@ METRICS = (
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
     Metric("recorded_bytes", "counter", (), "Bytes of the datagrams written to a recording."),
     Metric("record_dropped", "counter", ("reason",), "Datagrams missing from a recording, by reason."),
+    Metric("recordings_unsaved", "number", ("reason",), "Recordings of stops in memory that the disk does not accept."),
+    Metric("recordings_lost", "counter", (), "Recordings of stops that were never written."),
     Metric("config_reloads", "counter", ("result",), "Reloads of the table, by result."),
     Metric("config_last_reload_successful", "number", (), "1 unless the last reload failed."),
     Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was loaded."),
@@ -147,10 +157,16 @@ METRICS = (
         "number",
         ("route", "topic", "policy"),
         "Peers that currently cannot connect because of their QoS.",
-    Metric("recordings_unsaved", "number", ("reason",), "Recordings of stops in memory that the disk does not accept."),
-    Metric("recordings_lost", "counter", (), "Recordings of stops that were never written."),
     ),
 )
+
+ENDPOINT_METRICS = (
+    "endpoint_last_seen_timestamp_seconds",
+    "endpoint_heard_since_timestamp_seconds",
+    "endpoint_silences",
+    "endpoint_last_silence_seconds",
+)
+"""The metrics that the receive thread writes for each endpoint."""
 
 REJECT_REASONS: Mapping[str, str] = {
     "truncated": "longer than the router accepts",
@@ -225,6 +241,14 @@ RECORD_DROP_REASONS: Mapping[str, str] = {
 }
 """Reasons why a datagram is missing from a recording, with their meaning."""
 
+UNSAVED_REASONS: Mapping[str, str] = {
+    "disk_full": "the disk or the user's quota is full",
+    "read_only": "the disk is mounted read-only",
+    "no_permission": "the router's user may not write there",
+    "disk_error": "another error of the disk, which the log names",
+}
+"""Reasons why the recording of a stop is not on the disk yet, with their meaning."""
+
 RELOAD_RESULTS: Mapping[str, str] = {
     "ok": "the new table is running",
     "invalid": "the table has errors, or changes something that needs a restart",
@@ -241,14 +265,6 @@ STARTS: Mapping[str, str] = {
 """Ways in which a router can start, with their meaning."""
 
 CLIENTS = "clients"
-UNSAVED_REASONS: Mapping[str, str] = {
-    "disk_full": "the disk or the user's quota is full",
-    "read_only": "the disk is mounted read-only",
-    "no_permission": "the router's user may not write there",
-    "disk_error": "another error of the disk, which the log names",
-}
-"""Reasons why the recording of a stop is not on the disk yet, with their meaning."""
-
 """The `target` and `source` label of a gateway's clients."""
 
 QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")

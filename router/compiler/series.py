@@ -8,6 +8,7 @@ from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
     DROP_REASONS,
+    ENDPOINT_METRICS,
     GATEWAY_DROP_REASONS,
     GATEWAY_REJECT_REASONS,
     INBOUND_DROP_REASONS,
@@ -17,8 +18,8 @@ from router.compiler.metrics import (
     RELOAD_RESULTS,
     TOPIC_STATES,
     UNKNOWN_CASE,
-    Counters,
     UNSAVED_REASONS,
+    Counters,
 )
 from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, source_label
 from router.table.model import ROS, RouteTable
@@ -65,7 +66,8 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
         )
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
     _open_each(counters, "unhandled", last=(*envelope.cases, UNKNOWN_CASE))
-    _open_each(counters, "endpoint_last_seen_timestamp_seconds", last=table.endpoints)
+    for metric in ENDPOINT_METRICS:
+        _open_each(counters, metric, last=table.endpoints)
 
 
 def _open_own(counters: Counters, table: RouteTable) -> None:
@@ -75,9 +77,9 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
     if table.record is not None:
         _open(counters, ("recorded_datagrams", "recorded_bytes", "recordings_lost"))
         _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
-
-
         _open_each(counters, "recordings_unsaved", last=UNSAVED_REASONS)
+
+
 def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
     """Open the series of a route, or of one source topic of a route from ROS."""
     route = plan.route

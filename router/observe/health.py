@@ -29,6 +29,9 @@ PERIOD = 1.0
 WINDOW = 10
 """Seconds for which a loss remains a problem, so that a short one is not overlooked."""
 
+RETURNED = 300
+"""Seconds for which a silence that has ended is shown."""
+
 REMEDIES: Mapping[str, str] = {
     "send_error": "The network rejects them, or nothing listens there: check that the receiver runs, and its address.",
     "send_buffer_full": "The network is too slow for them: route less to this target.",
@@ -45,22 +48,22 @@ REMEDIES: Mapping[str, str] = {
     "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
     "truncated": "They are longer than the router accepts (16 KiB): send smaller ones.",
     "no_payload": "They are envelopes without a payload: run `router tap --only rejected` to see who sends them.",
-    "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
-}
-"""Remedies by the reason of a loss."""
     "disk_full": "Free space on the disk of `record.directory` (`df -h`) before you stop the router: it retries every 10 s.",
     "read_only": "Remount the disk of `record.directory` writable (`dmesg` says why it is not); the router retries.",
     "no_permission": "Make `record.directory` writable for the user of the router, which retries every 10 s.",
     "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",
+    "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
+}
+"""Remedies by the reason of a loss."""
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
     Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
     Kind.GATEWAY_TOPIC_NOT_SERVED: ", topics not served: {:.0f}",
+    Kind.RECORDING_UNSAVED: ", {:.0f} of them",
 }
 """The text that gives the value, for kinds where it matters."""
 
-    Kind.RECORDING_UNSAVED: ", {:.0f} of them",
 _GAUGES = (Kind.LISTENER_WAITING, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
@@ -74,11 +77,11 @@ _LOSSES = (
 _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
 """Reasons of intended losses, and the one that UNHANDLED_CASE reports."""
 
-_NAMED = 3
-"""Maximum routes that a text names."""
-
 _ALSO_LOST = "mirror_dropped", "recordings_lost"
 """Further metrics of RECORDING_INCOMPLETE."""
+
+_NAMED = 3
+"""Maximum routes that a text names."""
 
 _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
@@ -94,7 +97,7 @@ class Look:
     Times in seconds. `silence`: how long each endpoint has been silent, or has not been heard yet. `standing`: how long
     the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
     `mismatches`: recent senders of messages that no route accepts from them. `replies`: what boards have shown
-    about the brakes of active deadmen.
+    about the brakes of active deadmen. `returned`: how long ago each endpoint was heard again after its last silence.
     """
 
     program: Program
@@ -104,6 +107,7 @@ class Look:
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
     replies: Replies = field(default_factory=dict)
+    returned: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def now(self) -> Snapshot:
@@ -127,6 +131,7 @@ class Look:
         found = chain(
             self._states(),
             self._silent(),
+            self._returned(),
             self._tripped(),
             self._disobeyed(),
             self._waiting(),
@@ -208,6 +213,14 @@ class Look:
             elif len(silent) == len(self._limits) > 1:
                 problem = problem._replace(remedy=_ALL_SILENT)
             yield problem
+
+    def _returned(self) -> Iterator[Problem]:
+        """Yield endpoints that were silent a while ago."""
+        for name, ago in self.returned.items():
+            if ago < RETURNED and name not in self._stale:
+                silence = self.now.of("endpoint_last_silence_seconds", name).get((), 0.0)
+                more = f": for {silence:.1f} s, until {age_text(ago)} ago"
+                yield self._problem(Kind.ENDPOINT_RETURNED, {"endpoint": name}, more)
 
     def _expected(self, mismatch: Mismatch) -> list[str]:
         """Return the endpoints that routes accept this payload case from."""

@@ -167,6 +167,12 @@ class Kind(enum.Enum):
         "{endpoint} has not been heard since the router started",
         ENDPOINT_SILENT[2],
     )
+    ENDPOINT_RETURNED = (
+        Level.INFO,
+        "{endpoint} was silent and is back",
+        "If nobody restarted it, it may have been reset: check its power, and cable or radio.",
+        "endpoint_silences",
+    )
     GATEWAY_CLIENT_SLOW = (
         Level.INFO,
         "client {client} of {route} is behind",

@@ -1,4 +1,4 @@
-"""Logs losses and deadmen, and remembers senders whose messages no route accepts."""
+"""Logs losses, deadmen and silences, and remembers senders whose messages no route accepts."""
 
 from __future__ import annotations
 
@@ -110,6 +110,10 @@ class Reporter:
             logger.warning(what, route=route, target=lost.target, reason=lost.reason, detail=lost.detail)
         else:
             logger.warning("no commands arrive; the deadman sends in their place", route=route)
+
+    def returned(self, endpoint: str, silence: float) -> None:
+        """Log that an endpoint is heard again, after `silence` seconds: for example, a board was reset."""
+        logger.warning(f"{endpoint} was silent for {silence:.1f} s and is back", endpoint=endpoint)
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
         """Return the last command that was lost within the timeout, or None."""

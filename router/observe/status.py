@@ -32,6 +32,8 @@ PATHS = {
     "gateway_topics": "routes {route} topics {state}",
     "client_messages_dropped": "routes {route} clients_missed {reason}",
     "endpoint_last_seen_timestamp_seconds": "endpoints {endpoint} seen",
+    "endpoint_silences": "endpoints {endpoint} silences",
+    "endpoint_last_silence_seconds": "endpoints {endpoint} last_silence",
     "datagrams_received": "listeners {listener} received",
     "received_bytes": "listeners {listener} bytes",
     "kernel_drops": "listeners {listener} kernel_drops",
@@ -47,6 +49,8 @@ IF_ANY = {
     "client_messages_dropped",
     "superseded_members",
     "datagrams_rejected",
+    "endpoint_silences",
+    "endpoint_last_silence_seconds",
 }
 """Metrics that are omitted while they are 0."""
 

@@ -18,12 +18,13 @@ METRICS = {kind.metric for kind in Kind} | {
     "datagrams_received",
     "deadman_datagrams_sent",
     "deadman_trips",
+    "endpoint_last_silence_seconds",
     "gateway_clients",
     "messages_filtered",
     "messages_received",
     "mirror_dropped",
-    *DELIVERED,
     "recordings_lost",
+    *DELIVERED,
 }
 """The metrics read each second. Histograms, which have most of the series, are not among them."""
 
@@ -39,6 +40,7 @@ class Watch:
         self._snapshots: deque[Snapshot] = deque()
         self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, also on the boot clock
         self._tripped: dict[str, tuple[float, int]] = {}  # by route: number of trips, and when it was first seen
+        self._silences: dict[str, tuple[float, int]] = {}  # by endpoint: number of silences, likewise
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
@@ -53,6 +55,12 @@ class Watch:
                 for (route,), trips in latest.counts("deadman_trips").items()
                 if latest.of(Kind.DEADMAN_ACTIVE.metric, route).get(())
             }
+            self._silences = {
+                endpoint: found if (found := self._silences.get(endpoint, (-1, 0)))[0] == silences else (silences, now)
+                for (endpoint,), silences in latest.counts("endpoint_silences").items()
+                if silences
+            }
+            returned = {name: (now - since) / 1e9 for name, (_, since) in self._silences.items()}
             tripped = {route: (now - since) / 1e9 for route, (_, since) in self._tripped.items()}
             while self._snapshots and latest.at - self._snapshots[0].at > WINDOW + PERIOD / 2:
                 self._snapshots.popleft()
@@ -61,7 +69,8 @@ class Watch:
                 self._snapshots.append(latest)
         silence = {name: (now - then) / 1e9 for name, then in seen.items()}
         recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
-        return Look(program, snapshots, silence, self.standing(now), tripped, recent, self._running.replies())
+        replies = self._running.replies()
+        return Look(program, snapshots, silence, self.standing(now), tripped, recent, replies, returned)
 
     def standing(self, now: int) -> float:
         """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""

@@ -81,6 +81,8 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
             1,
             "nothing passes between imu_data and peers with another reliability, 1 of them",
         ),
+        ("recordings_unsaved disk_full", 2, "the recording of a stop is only in memory: disk_full, 2 of them"),
+        ("recordings_lost", 9, "recordings or taps are missing datagrams, 9 in 2 s"),
         ("record_dropped overflow", 9, "recordings or taps are missing datagrams, 9 in 2 s"),
         ("mirror_dropped", 9, "recordings or taps are missing datagrams, 9 in 2 s"),
         ("gateway_topics dashboard served", 9, None),
@@ -385,7 +387,12 @@ def test_each_reason_to_reject_a_datagram_has_a_remedy() -> None:
 
 
 def test_remedies_are_of_reasons_that_there_are() -> None:
-    assert REMEDIES.keys() <= {*metrics.DROP_REASONS, *metrics.REJECT_REASONS, *metrics.GATEWAY_REJECT_REASONS}
+    assert REMEDIES.keys() <= {
+        *metrics.DROP_REASONS,
+        *metrics.REJECT_REASONS,
+        *metrics.GATEWAY_REJECT_REASONS,
+        *metrics.UNSAVED_REASONS,
+    }
 
 
 # ---- the thread -----------------------------------------------------------------------------------------------------
@@ -419,3 +426,21 @@ def test_what_fails_is_logged_once_and_tried_again(
     assert enough.wait(10)
     health.close()
     assert capsys.readouterr().out.count("no counters") == 1
+
+
+def test_an_endpoint_that_was_silent_and_is_back_leaves_a_trace_for_some_minutes(router: Counting) -> None:
+    router.told(0)
+    for endpoint in router.program.table.endpoints:
+        router.hear(endpoint)
+    assert router.told(1) == []
+    router.count("endpoint_silences", "arm_board", to=1)
+    router.count("endpoint_last_silence_seconds", "arm_board", to=2_340_000_000)
+    [told] = router.look(1).problems
+    assert told.text == "arm_board was silent and is back: for 2.3 s, until 0.0 s ago"
+    assert not told.kind.level.is_fault
+    for _ in range(4):
+        for endpoint in router.program.table.endpoints:
+            router.hear(endpoint)
+        [later] = [each for each in router.told(60) if "is back" in each]
+    assert later.endswith("for 2.3 s, until 4 min ago")
+    assert not [each for each in router.told(70) if "is back" in each]

@@ -14,7 +14,8 @@ enum event_kind {
     EVENT_LOST,
     EVENT_OBEYED,
     EVENT_DISOBEYED,
-    EVENT_EVIDENCE
+    EVENT_EVIDENCE,
+    EVENT_RETURNED
 };
 
 /* The beginning of every event. */
@@ -42,6 +43,12 @@ struct datagram_event {
     uint32_t address, port;   /* of the sender, host byte order */
     uint32_t length;          /* of the datagram */
     uint32_t counter;         /* of such rejections, or of superseded payloads */
+};
+
+struct returned_event {
+    uint32_t size, kind; /* EVENT_RETURNED: an endpoint is heard again */
+    uint32_t endpoint, reserved;
+    int64_t silence;     /* ns */
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

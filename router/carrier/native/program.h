@@ -50,8 +50,10 @@ struct peer {
     uint32_t address; /* host byte order */
     uint32_t port;    /* 0: any */
     uint32_t column;  /* of the listener's choices */
-    uint32_t last_seen; /* counter */
-    uint32_t id;        /* of the endpoint, in mirror records */
+    uint32_t last_seen, heard_since, silences, last_silence; /* counters */
+    uint32_t id;      /* of the endpoint, in mirror records and events */
+    uint32_t reserved;
+    int64_t pause;    /* ns: a longer one is a silence */
 };
 
 struct listener {

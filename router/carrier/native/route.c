@@ -171,6 +171,32 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     return ROUTED;
 }
 
+/* ---- silences ---- */
+
+/* An endpoint is heard again after `silence`. That is its rhythm, not a silence, if it had been heard for less time before.
+ * If the clock was set meanwhile, the length is unknown. */
+static void end_silence(struct routing *routing, const struct received *received, int64_t before, int64_t silence) {
+    const struct peer *peer = received->peer;
+    counter *counters = routing->stage.counters;
+    int64_t heard_since = atomic_load_explicit(&counters[peer->heard_since], memory_order_relaxed);
+    counter_set(counters, peer->heard_since, received->received_at);
+    bool is_known = before && received->now - silence >= routing->freshness.since;
+    if (!is_known || before - heard_since < silence) return;
+    stage_count(&routing->stage, peer->silences, 1);
+    counter_set(counters, peer->last_silence, silence);
+    struct returned_event event = {.kind = EVENT_RETURNED, .endpoint = peer->id, .silence = silence};
+    if (may_report(&routing->stage.reporter, received->now))
+        put_event(routing->stage.reporter.events, &event, sizeof event, "");
+}
+
+static void hear(struct routing *routing, const struct received *received) {
+    const struct peer *peer = received->peer;
+    counter *last_seen = &routing->stage.counters[peer->last_seen];
+    int64_t before = atomic_load_explicit(last_seen, memory_order_relaxed);
+    atomic_store_explicit(last_seen, received->received_at, memory_order_relaxed);
+    if (received->received_at - before > peer->pause) end_silence(routing, received, before, received->received_at - before);
+}
+
 /* ---- public ---- */
 
 int route_datagram(struct routing *routing, struct received *received) {
@@ -182,7 +208,7 @@ int route_datagram(struct routing *routing, struct received *received) {
     received->peer = find_peer(listener, received->address, received->port);
     received->column = received->peer ? received->peer->column : listener->columns - 1;
     received->route = NULL;
-    if (received->peer) counter_set(routing->stage.counters, received->peer->last_seen, received->received_at);
+    if (received->peer) hear(routing, received);
     int reason = envelope_read(routing->program->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
     if (received->envelope.is_repaired) stage_count(&routing->stage, listener->padded, 1);

@@ -9,7 +9,8 @@
 enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 4 + REASONS };
 /* Counters of the one route behind those of listeners. */
 enum { ROUTE = LISTENERS * OF_LISTENER, ACCEPTED = ROUTE, SENT, SENT_BYTES, STALE, LIMITED, FULL, FAILED, WAITING,
-       QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, PACED, HELD, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
+       QUEUE_FULL, FILTERED, MET, UNMET, REFUSED, PACED, HELD, LAST_MESSAGE, SEEN, HEARD, SILENCES, SILENCE,
+       UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
 
 int LLVMFuzzerInitialize(int *count, char ***arguments);
 int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
@@ -47,7 +48,10 @@ static const struct route only = {
               .topic = NO_NAME},
     .publishes = {.targets = &published, .count = 1},
     .last_message = LAST_MESSAGE, .duration = DURATION};
-static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
+static const struct peer peers[] = {
+    {.address = 1, .port = 7, .last_seen = SEEN, .heard_since = HEARD, .silences = SILENCES, .last_silence = SILENCE},
+    {.address = 1, .column = 1, .last_seen = SEEN, .id = 1, .pause = INT64_MAX},
+    {.address = 2, .port = 9, .column = 1, .last_seen = SEEN, .id = 1, .pause = INT64_MAX}};
 static const struct choice choices[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];
 static struct listener listeners[LISTENERS];
