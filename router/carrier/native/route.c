@@ -174,14 +174,15 @@ static int route(struct routing *routing, const struct payload_case *found, stru
 /* ---- silences ---- */
 
 /* An endpoint is heard again after `silence`. That is its rhythm, not a silence, if it had been heard for less time before.
- * If the clock was set meanwhile, the length is unknown. */
+ * If the clock was set meanwhile, the length is unknown; if it was set back before, so is how long it had been heard. */
 static void end_silence(struct routing *routing, const struct received *received, int64_t before, int64_t silence) {
     const struct peer *peer = received->peer;
     counter *counters = routing->stage.counters;
     int64_t heard_since = atomic_load_explicit(&counters[peer->heard_since], memory_order_relaxed);
     counter_set(counters, peer->heard_since, received->received_at);
     bool is_known = before && received->now - silence >= routing->freshness.since;
-    if (!is_known || before - heard_since < silence) return;
+    bool is_rhythm = before >= heard_since && before - heard_since < silence;
+    if (!is_known || is_rhythm) return;
     stage_count(&routing->stage, peer->silences, 1);
     counter_set(counters, peer->last_silence, silence);
     struct returned_event event = {.kind = EVENT_RETURNED, .endpoint = peer->id, .silence = silence};

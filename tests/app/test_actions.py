@@ -1,0 +1,81 @@
+"""What a router does by itself is mirrored, whatever thread does it: commands from ROS, brakes, losses, trips."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from router.app import Router
+from router.recording.mirror import Acted, Action
+from tests.app.conftest import BRAKE, DRIVE, Site
+from tests.app.test_from_ros import TYPE, UNHURRIED, command, drive
+from tests.ros.peers import Publisher, wait_until
+
+MANUAL = """\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman: {timeout: 150ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 1h}
+"""
+FORWARDED = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
+PH = bytes.fromhex("0a00")
+DIVIDED = drive(fields='{distance_to_go: "float32(100 // round(distance_to_go))"}')
+
+
+def watched(router: Router) -> list[Action]:
+    """The actions from now on, without their times."""
+    seen: list[Action] = []
+
+    def see(actions: Sequence[Acted]) -> None:
+        assert [at for at, *_ in actions] == sorted(at for at, *_ in actions)
+        seen.extend(Action._make(each)._replace(at=0) for each in actions)
+
+    router.mirror.attach(lambda _: None, see)
+    return seen
+
+
+def test_commands_that_feed_a_deadman_are_actions_and_all_that_it_does(site: Site) -> None:
+    """The other datagrams are only forwarded: the mirror has them as received."""
+    with site.router(MANUAL + FORWARDED) as router:
+        seen = watched(router)
+        site.send(PH, DRIVE, PH)
+        wait_until(lambda: len(seen) >= 3)
+        site.send(DRIVE)
+        wait_until(lambda: len(seen) >= 5)
+    braked = Action(0, "braked", "manual_drive", "basestation", data=BRAKE)
+    sent = braked._replace(what="sent", data=DRIVE)
+    tripped, released = Action(0, "tripped", "manual_drive"), Action(0, "released", "manual_drive")
+    assert seen == [sent, tripped, braked, released, sent, braked]  # the last one at the end
+
+
+@pytest.mark.parametrize("table", [drive(), UNHURRIED], ids=["urgent", "unhurried"])
+def test_commands_from_ros_are_actions(site: Site, table: str) -> None:
+    with closing(Publisher("drive_motor", TYPE)) as publisher, site.router(table) as router:
+        seen = watched(router)
+        wait_until(lambda: publisher.publish([command(7)]) or seen)
+    assert seen[0]._replace(data=b"") == Action(0, "sent", "drive_motor", "basestation", "drive_motor")
+    arrived = [site.basestation.recv(1000) for _ in range(2)]
+    assert seen[0].data in arrived  # perhaps after the brake of the start
+
+
+def test_commands_that_are_lost_are_actions_with_the_reason(site: Site) -> None:
+    with closing(Publisher("drive_motor", TYPE)) as publisher, site.router(DIVIDED) as router:
+        seen = watched(router)
+        wait_until(lambda: publisher.publish([command(0)]) or seen)
+    lost = Action(0, "lost", "drive_motor", "basestation", "drive_motor", "mapping_error", "division by zero")
+    assert set(seen) == {lost}
+
+
+def test_what_the_full_mirror_drops_is_counted_and_delays_no_brake(site: Site) -> None:
+    with site.router(MANUAL) as router:
+        router._runtime.plane.observe(is_observed=True)  # and nobody takes
+        for _ in range(60):
+            site.send(*[DRIVE] * 100)
+            received = router.total("datagrams_received")
+            wait_until(lambda: router.total("datagrams_received") >= received)
+        wait_until(lambda: router.total("mirror_dropped") > 0)
+        wait_until(lambda: router.total("deadman_trips") > 0)

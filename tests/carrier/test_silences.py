@@ -1,0 +1,92 @@
+"""An endpoint that was silent and is heard again: noted once, but not where pauses are its rhythm or a clock was set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.carrier.events import Returned
+from router.carrier.library import library
+from router.carrier.rehearsal import Stage
+from router.compiler.program import Program
+from tests.small_tables import MS, SECOND, SENSOR_BOARD, Ledger, enveloped, program
+
+ROUTE = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
+PH = enveloped(ph_info={})
+
+
+class Heard:
+    """One run, with the time in ms at which each endpoint sends."""
+
+    def __init__(self, compiled: Program) -> None:
+        self.compiled = compiled
+        self.stage = Stage(library(), 10**12)
+        self.stage.adopt(compiled)
+        self.returned: list[Returned] = []
+        self.ahead = 0
+
+    def hear(self, after: int, times: int = 1, sender: tuple[str, int] = SENSOR_BOARD) -> None:
+        """Receive datagrams, each `after` this many ms."""
+        for _ in range(times):
+            self.stage.advance(self.stage.now + after * MS)
+            self.stage.datagram("trimmed", sender, PH, self.stage.now + self.ahead)
+            self.returned += [each for each in self.stage.records() if isinstance(each, Returned)]
+
+    def set_clock(self, ahead: int) -> None:
+        self.ahead = ahead
+        self.stage.set_clock(ahead)
+
+    def count(self, metric: str) -> int:
+        counters = self.stage.counters(len(self.compiled.counters.fresh_counts()))
+        return counters[self.compiled.counters.index(metric, "sensor_board")]
+
+
+@pytest.fixture
+def heard(tmp_path: Path) -> Heard:
+    return Heard(program(tmp_path, ROUTE))
+
+
+def test_a_board_that_is_reset_leaves_a_trace(heard: Heard) -> None:
+    heard.hear(20, 200)
+    heard.hear(2300)
+    heard.hear(20, 200)
+    assert heard.returned == [Returned("sensor_board", 2.3)]
+    heard.hear(2600)
+    assert heard.returned == [Returned("sensor_board", 2.3), Returned("sensor_board", 2.6)]
+    assert heard.count("endpoint_silences") == 2
+    assert heard.count("endpoint_last_silence_seconds") == 2600 * MS
+    assert heard.count("endpoint_last_seen_timestamp_seconds") == heard.count("endpoint_heard_since_timestamp_seconds")
+
+
+def test_short_pauses_and_slow_senders_have_no_silences(heard: Heard) -> None:
+    heard.hear(1900, 20)
+    heard.hear(3000, 20)
+    assert len(heard.returned) == 1  # when its rhythm changed
+    heard.returned.clear()
+    heard.hear(3000, 20)
+    assert heard.returned == []
+
+
+def test_who_is_never_stale_is_never_silent(tmp_path: Path) -> None:
+    head = "version: 1\nenvelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}\n" + (
+        "listen: {trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}}\n"
+        "endpoints:\n"
+        "  sensor_board: {address: 192.168.0.30:8, kind: board, stale_after: never}\n"
+        "  basestation: {address: 192.168.0.10:9000, kind: basestation}\n"
+        "routes:\n"
+    )
+    heard = Heard(program(tmp_path, ROUTE, head))
+    heard.hear(20, 300)
+    heard.hear(5000)
+    assert heard.returned == []
+
+
+def test_a_clock_that_is_set_is_no_silence(heard: Heard) -> None:
+    heard.hear(20, 300)
+    for ahead in (3600 * SECOND, 0, -3600 * SECOND):
+        heard.set_clock(ahead)
+        heard.hear(20, 300)
+    assert heard.returned == []
+    heard.hear(2300)
+    assert heard.returned == [Returned("sensor_board", 2.3)]
