@@ -38,6 +38,11 @@ def watched(router: Router) -> list[Action]:
     return seen
 
 
+def published(publisher: Publisher, number: int) -> bool:
+    publisher.publish([command(number)])
+    return True
+
+
 def test_commands_that_feed_a_deadman_are_actions_and_all_that_it_does(site: Site) -> None:
     """The other datagrams are only forwarded: the mirror has them as received."""
     with site.router(MANUAL + FORWARDED) as router:
@@ -56,7 +61,7 @@ def test_commands_that_feed_a_deadman_are_actions_and_all_that_it_does(site: Sit
 def test_commands_from_ros_are_actions(site: Site, table: str) -> None:
     with closing(Publisher("drive_motor", TYPE)) as publisher, site.router(table) as router:
         seen = watched(router)
-        wait_until(lambda: publisher.publish([command(7)]) or seen)
+        wait_until(lambda: published(publisher, 7) and seen)
     assert seen[0]._replace(data=b"") == Action(0, "sent", "drive_motor", "basestation", "drive_motor")
     arrived = [site.basestation.recv(1000) for _ in range(2)]
     assert seen[0].data in arrived  # perhaps after the brake of the start
@@ -65,7 +70,7 @@ def test_commands_from_ros_are_actions(site: Site, table: str) -> None:
 def test_commands_that_are_lost_are_actions_with_the_reason(site: Site) -> None:
     with closing(Publisher("drive_motor", TYPE)) as publisher, site.router(DIVIDED) as router:
         seen = watched(router)
-        wait_until(lambda: publisher.publish([command(0)]) or seen)
+        wait_until(lambda: published(publisher, 0) and seen)
     lost = Action(0, "lost", "drive_motor", "basestation", "drive_motor", "mapping_error", "division by zero")
     assert set(seen) == {lost}
 

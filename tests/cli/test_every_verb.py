@@ -20,12 +20,13 @@ ARGUMENTS = {
     "replay": "it.mcap --against other.yaml",
     "send": "battery --to 127.0.0.1:9",
     "listen": "envelope://9",
+    "show": "it.mcap",
     "new": "SensorBoardDose --number 99 --board sensor",
     "schema": "lock",
 }
 """What a verb needs besides a table."""
 
-WITHOUT_TABLE = {"init", "demo"}
+WITHOUT_TABLE = {"init", "demo", "show"}
 WITH_SHIPPED_PROTOS = {"send", "listen"}
 """Without a table they take the protos that come with the router, unless a place is a name."""
 
