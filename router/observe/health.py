@@ -48,7 +48,7 @@ REMEDIES: Mapping[str, str] = {
     "malformed": "They cannot be parsed: check that sender and router have the same protos, and the `framing`.",
     "truncated": "They are longer than the router accepts (16 KiB): send smaller ones.",
     "no_payload": "They are envelopes without a payload: run `router tap --only rejected` to see who sends them.",
-    "disk_full": "Free space on the disk of `record.directory` (`df -h`) before you stop the router: it retries every 10 s.",
+    "disk_full": "Free space on the disk of `record.directory` before you stop the router, which retries every 10 s.",
     "read_only": "Remount the disk of `record.directory` writable (`dmesg` says why it is not); the router retries.",
     "no_permission": "Make `record.directory` writable for the user of the router, which retries every 10 s.",
     "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",

@@ -183,9 +183,7 @@ def _raw(reason: str, _: int, message: bytes) -> _Decoded:
 
 def _event(at: int, message: bytes) -> Action:
     event: Any = Event.FromString(message)
-    return Action(
-        at, event.what, event.route, event.endpoint, event.ros, event.reason, event.detail, event.data
-    )
+    return Action(at, event.what, event.route, event.endpoint, event.ros, event.reason, event.detail, event.data)
 
 
 def _peer(text: str) -> Peer:

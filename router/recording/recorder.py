@@ -1,4 +1,4 @@
-"""The recorder: writes mirrored datagrams and actions to disk, and keeps the newest chunks in memory to save on request.
+"""The recorder: writes datagrams and actions of the mirror to disk, and keeps the newest in memory to save on request.
 
 The mirror's thread encodes each datagram once, into chunks for both; the thread `recorder` writes them.
 """

@@ -116,8 +116,8 @@ def tap(
 
     Only those with these payload cases, from these endpoints (empty: all) and with this decision (`only`: one of
     DECISIONS; None: both). They arrive in batches; while nothing is received, an empty batch arrives each second.
-    Datagrams without a known payload case are always included, actions only if no filter is given. Raises UsageError if the router rejects the request,
-    TransportError if none answers, or later if the router stops.
+    Datagrams without a known payload case are always included, actions only if no filter is given. Raises UsageError if
+    the router rejects the request, TransportError if none answers, or later if the router stops.
     """
     parameters = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(parameters + ([("only", only)] if only else []))

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from router.table.model import ANY
 from router.datagrams import Wire
 from router.observe.health import REMEDIES
 from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
 from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, first_field
 from router.recording.reader import Recorded, RecordedAction
+from router.table.model import ANY
 from router.tools.tap import clock_text, local_time
 from router.values import compact
 
@@ -145,7 +145,10 @@ class Stop:
             return "; ".join((worst.words, *silent)), REMEDIES.get(worst.reason, "")
         if self.settings.is_from_ros:
             topics = " or ".join(sources)
-            return f"no message arrived on {topics}", "`ros2 topic info -v` shows who publishes, `ros2 topic hz` how often."
+            return (
+                f"no message arrived on {topics}",
+                "`ros2 topic info -v` shows who publishes, `ros2 topic hz` how often.",
+            )
         if not sources:
             return f"no command of {self.route} was sent", ""
         hosts = [heard[source][1] for source in sources if source in heard and self._is_silent(source)]

@@ -1,4 +1,4 @@
-"""An endpoint that was silent and is heard again: noted once, but not where pauses are its rhythm or a clock was set."""
+"""An endpoint that was silent is heard again: noted once, but not if pauses are its rhythm or the clock was set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from router.carrier.events import Returned
 from router.carrier.library import library
 from router.carrier.rehearsal import Stage
 from router.compiler.program import Program
-from tests.small_tables import MS, SECOND, SENSOR_BOARD, Ledger, enveloped, program
+from tests.small_tables import HEAD, MS, SECOND, SENSOR_BOARD, enveloped, program
 
 ROUTE = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 PH = enveloped(ph_info={})
@@ -69,14 +69,9 @@ def test_short_pauses_and_slow_senders_have_no_silences(heard: Heard) -> None:
 
 
 def test_who_is_never_stale_is_never_silent(tmp_path: Path) -> None:
-    head = "version: 1\nenvelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}\n" + (
-        "listen: {trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}}\n"
-        "endpoints:\n"
-        "  sensor_board: {address: 192.168.0.30:8, kind: board, stale_after: never}\n"
-        "  basestation: {address: 192.168.0.10:9000, kind: basestation}\n"
-        "routes:\n"
-    )
-    heard = Heard(program(tmp_path, ROUTE, head))
+    board = "sensor_board: {address: 192.168.0.30:8, kind: board"
+    assert board in HEAD
+    heard = Heard(program(tmp_path, ROUTE, HEAD.replace(board, f"{board}, stale_after: never")))
     heard.hear(20, 300)
     heard.hear(5000)
     assert heard.returned == []

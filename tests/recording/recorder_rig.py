@@ -74,7 +74,13 @@ def endpoints() -> dict[str, Endpoint]:
 def table(**changed: Any) -> RouteTable:
     """The part of a table that a recording contains."""
     listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
-    told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, "routes": (), **changed}
+    told = {
+        "path": Path("routes/rover.yaml"),
+        "endpoints": endpoints(),
+        "listeners": {"rover": listener},
+        "routes": (),
+        **changed,
+    }
     return cast("RouteTable", SimpleNamespace(**told))
 
 

@@ -50,6 +50,8 @@ def test_the_keys_of_the_table_have_the_defaults_that_are_shown(tmp_path: Path) 
 
 def test_what_channels_hold_is_listed() -> None:
     text = (DOCS / "reference" / "recordings.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `(\w+)` \| (?:the payload case|`raw|`sent/|`router/)", text, re.MULTILINE) == [hold.value for hold in Holds]
+    assert re.findall(r"^\| `(\w+)` \| (?:the payload case|`raw|`sent/|`router/)", text, re.MULTILINE) == [
+        hold.value for hold in Holds
+    ]
     assert f"Beyond {MOST_CHANNELS:,} channels" in text
     assert f"on `{DATAGRAMS}`" in text
