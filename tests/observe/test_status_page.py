@@ -389,6 +389,14 @@ def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
     assert others(page).startswith("□manual_drive is halted: no commands for 27 min, and basestation is silent")
 
 
+def test_an_endpoint_tells_its_last_silence(running: FakeRunning, page: Page) -> None:
+    running.count("endpoint_silences", "arm_board", to=2)
+    running.count("endpoint_last_silence_seconds", "arm_board", to=2_340_000_000)
+    choose(page, "from:@arm_board")
+    words = "; 2 silences since the start, the last of 2.3 s"
+    page.until(f"document.querySelector('#facts').textContent.includes({json.dumps(words)})")
+
+
 def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: FakeHealth, page: Page) -> None:
     for endpoint in running.program.table.endpoints:
         running.count("endpoint_last_seen_timestamp_seconds", endpoint, to=0)
