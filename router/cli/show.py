@@ -138,6 +138,7 @@ def _explain(
     for entry in entries:
         stops.take(entry)
         last = entry.at
+    stops.note_answers(recording.about.get("obeyed", ""))
     found = [stop for stop in stops.found if span is None or span[0] <= stop.at <= span[1]]
     for number, stop in enumerate(found):
         if args.json:

@@ -50,7 +50,6 @@ _PATIENCE = 30.0
 """Timeout of `save`, s."""
 
 
-
 class RecordError(RouterError):
     """The last datagrams could not be saved; the message says why."""
 
@@ -144,7 +143,7 @@ class Recorder:
             raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
 
     def deadman_tripped(self, route: str, awaited: Iterable[str] = ()) -> None:
-        """Request to save the datagrams in memory after AFTERMATH and the answers of `awaited` boards. Returns at once."""
+        """Request to save what is in memory after AFTERMATH and the answers of `awaited` boards. Returns at once."""
         if self._ring is not None:
             with self._tripping:
                 self._trips.append(_Trip(route, set(awaited), wall_ns(), boottime_ns()))

@@ -9,7 +9,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from router.types.boards import NO_OPTIONS
+from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types
 
 _FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "payload"

@@ -71,7 +71,7 @@ class Stop:
 
     `lost` are the commands of its route that did not get through since `fed`. `heard` and `heard_again`: when each
     source was heard last before the stop, and first after it. `brakes` counts what the deadman sent, by payload case,
-    endpoint and reason of failure ("" if it was sent).
+    endpoint and reason of failure ("" if it was sent). `obeyed` tells which boards have shown that they stopped.
     """
 
     at: int
@@ -83,6 +83,7 @@ class Stop:
     heard: Mapping[str, tuple[int, str]]
     heard_again: dict[str, int] = field(default_factory=dict)
     brakes: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    obeyed: list[str] = field(default_factory=list)
     released: int | None = None
 
     def lines(self) -> list[str]:
@@ -95,6 +96,7 @@ class Stop:
             f"  last fed  {self._last_fed()}",
             *(f"  lost      {each}" for each in self.lost),
             *(f"  sent      {each}" for each in self._sent()),
+            *(f"  obeyed    {each}" for each in self.obeyed),
             f"  released  {self._release()}",
         ]
 
@@ -127,6 +129,7 @@ class Stop:
                     {"case": case, "endpoint": endpoint, "problem": problem, "count": count}
                     for (case, endpoint, problem), count in self.brakes.items()
                 ],
+                "obeyed": self.obeyed,
                 "released": None if self.released is None else local_time(self.released).isoformat(),
             }
         )
@@ -228,6 +231,14 @@ class Stops:
         else:
             self.has_actions = True
             self._did(entry.action)
+
+    def note_answers(self, answers: str) -> None:
+        """Add what boards have shown (the key `obeyed` of the metadata) to the stops that caused the recording."""
+        last = {stop.route: stop for stop in self.found}
+        for answer in filter(None, answers.split("; ")):
+            route, _, text = answer.partition(": ")
+            if route in last:
+                last[route].obeyed.append(text)
 
     def _received(self, it: Recorded) -> None:
         sender, case = it.endpoint or it.peer[0], self._names.get(first_field(it.data), "")

@@ -260,7 +260,7 @@ def test_a_stop_is_saved_with_what_follows_it_and_under_the_names_of_all_who_tri
         until(lambda: files(tmp_path), "it was never saved")
     [path] = files(tmp_path)
     assert path.name.endswith("_deadman-winch-arm.mcap")
-    at = datetime.strptime(path.name.split("_")[1], "%Y%m%dT%H%M%S.%fZ").replace(tzinfo=timezone.utc).timestamp()
+    at = datetime.strptime(path.name.split("_")[2], "%Y%m%dT%H%M%S.%fZ").replace(tzinfo=timezone.utc).timestamp()
     assert before / 1e9 - 1e-6 <= at <= after / 1e9  # when it stopped, not when that was saved
     assert [(each.action.what, each.action.route) for each in actions(path)] == [("tripped", "winch")]
 
@@ -312,36 +312,35 @@ def test_where_there_is_no_room_nothing_is_written(tmp_path: Path, monkeypatch: 
         monkeypatch.undo()
 
 
-def test_a_deadman_that_awaits_boards_is_saved_with_their_answers(tmp_path: Path) -> None:
-    with running_recorder(tmp_path, continuous=False, last=10**6) as (made, _):
+def test_a_stop_is_saved_with_the_answers_of_all_boards_that_it_awaits(tmp_path: Path) -> None:
+    with running_recorder(tmp_path, continuous=False, last=10**6) as (made, mirror):
+        mirror.show(now(imu(1)))
         made.deadman_tripped("drive", ["left", "right"])
         made.deadman_tripped("arm", ["arm"])
-        made.deadman_tripped("mast", ["mast"])
         made.board_answered("drive", "left", "stopped after 0.43 s")
         made.board_answered("drive", "left", "stopped after 0.90 s")  # it moved again
         made.board_answered("drive", "right", "did not obey for 2.00 s")
-        wait_for_file(tmp_path, "deadman-drive")
+        sleep(0.1)
+        assert files(tmp_path) == []
         made.deadman_released("arm")
-        wait_for_file(tmp_path, "deadman-arm")
+        until(lambda: files(tmp_path), "it was never saved")
+        mirror.show(now(imu(2)))
+        made.deadman_tripped("mast", ["mast"])
     notes = {path.name.partition("Z_")[2]: about(path).get("obeyed") for path in files(tmp_path)}
     assert notes == {
-        "deadman-drive.mcap": "drive: left stopped after 0.43 s; drive: right did not obey for 2.00 s",
-        "deadman-arm.mcap": None,
+        "deadman-drive-arm.mcap": "drive: left stopped after 0.43 s; drive: right did not obey for 2.00 s",
         "deadman-mast.mcap": None,  # at the end
     }
 
 
-def wait_for_file(folder: Path, reason: str) -> None:
-    deadline = monotonic() + PATIENCE
-    while not any(reason in path.name for path in files(folder)):
-        assert monotonic() < deadline, "it was never saved"
-        sleep(0.01)
-
-
-def about(path: Path) -> dict[str, str]:
-    with closing(Recording(path)) as recording:
-        assert list(recording.datagrams()) == []
-        return recording.about
+def test_a_board_that_does_not_answer_delays_a_recording_for_some_seconds_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "LONGEST_AFTERMATH", 100_000_000)
+    with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+        mirror.show(now(imu(1)))
+        made.deadman_tripped("drive", ["left"])
+        until(lambda: files(tmp_path), "it was never saved")
 
 
 def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:

@@ -6,10 +6,11 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from datetime import datetime, timezone
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -83,11 +84,17 @@ def stopped(second: float, route: str = "manual_drive") -> list[Action]:
     return [did(second, TRIPPED, route), *brakes]
 
 
-def recording(folder: Path, *entries: MirroredDatagram | Action, routes: object = ROUTES, tripped: object = ()) -> str:
+def recording(
+    folder: Path,
+    *entries: MirroredDatagram | Action,
+    routes: object = ROUTES,
+    tripped: object = (),
+    more: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """A recording as the recorder makes it: batches of 50 ms, actions after datagrams."""
     path = folder / "it.mcap"
     channels = Channels()
-    about = {"reason": "test", "table": "rover.yaml", "routes": json.dumps(routes)}
+    about = {"reason": "test", "table": "rover.yaml", "routes": json.dumps(routes), **more}
     file = RecordingFile(path, channels, {**about, "tripped": json.dumps(tripped)} if tripped else about)
     encoder = Encoder(channels)
     batches: dict[int, list[MirroredDatagram | Action]] = {}
@@ -278,6 +285,17 @@ def test_a_stop_is_also_json(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         }
     ]
     assert found["sent"] == [{"case": "manual_brake", "endpoint": "driving_board", "problem": "", "count": 3}]
+
+
+def test_a_stop_tells_which_boards_have_shown_that_they_obey(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = "manual_drive: driving_board stopped after 0.43 s; manual_drive: arm_board did not obey for 2.00 s"
+    path = recording(tmp_path, *driven(0), *stopped(0.5), more={"obeyed": answers})
+    assert [line for line in explained(capsys, path) if "obeyed" in line] == [
+        "  obeyed    driving_board stopped after 0.43 s",
+        "  obeyed    arm_board did not obey for 2.00 s",
+    ]
 
 
 def test_a_recording_of_an_earlier_version_says_what_it_lacks(
