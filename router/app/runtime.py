@@ -7,7 +7,7 @@ between two messages), finish (close what is no longer used). The first program 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from router.app.plane import Built, Opened, Plane
 from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.carrier.state import State
+from router.compiler.metrics import PUBLISHER, SHARES_NODE, SHARES_TOPIC, SUBSCRIBER
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import ConfigurationError, SourceSpan, StartError
@@ -81,6 +82,30 @@ class Runtime:
             if seconds >= _STALLED_S:
                 stalled[topic] = max(seconds, stalled.get(topic, 0.0))
         return stalled
+
+    def subscribers(self) -> Iterator[tuple[tuple[str], int]]:
+        """Yield the series of `topic_subscribers`."""
+        for topic, number in self._ros.subscribers() if self._ros else ():
+            yield (topic,), number
+
+    def type_incompatible(self) -> Iterator[tuple[tuple[str, ...], int]]:
+        """Yield the series of `type_incompatible`."""
+        if self._ros is None or self.program is None:
+            return
+        for found, nodes in self._ros.surroundings.mistyped.items():
+            for (route, topic, peer), are_commands in _uses_of_topics(self.program).items():
+                if (topic, peer) == (found.topic, found.peer):
+                    yield (route, topic, peer, found.type_name, str(are_commands).lower()), len(nodes)
+
+    def other_routers(self) -> Iterator[tuple[tuple[str, ...], int]]:
+        """Yield the series of `other_routers`."""
+        for (host, process, _), name, is_node in self._ros.surroundings.shared if self._ros else ():
+            yield (host, str(process), SHARES_NODE if is_node else SHARES_TOPIC, name), 1
+
+    def node_namesakes(self) -> Iterator[tuple[tuple[str], int]]:
+        """Yield the series of `node_namesakes`."""
+        if self._ros is not None:
+            yield (f"/{self._ros.name}",), self._ros.surroundings.namesakes
 
     def start(self, change: Change) -> None:
         """Run the prepared program, then open its gateways. Raises StartError; then the program runs without them."""
@@ -331,6 +356,26 @@ def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
     if table.node.diagnostics is not None:
         spans[DIAGNOSTICS] = table.node.diagnostics
     return spans
+
+
+def _uses_of_topics(program: Program) -> Mapping[tuple[str, str, str], bool]:
+    """Return the routes and gateways that use a topic, with the peers that they need there: (route, topic, peer).
+
+    The value says whether the messages are commands.
+    """
+    uses: dict[tuple[str, str, str], bool] = {}
+    for plan in program.routes:
+        if plan.topic is not None:
+            are_commands = any(target.is_command for target in plan.targets)
+            uses[plan.route, plan.topic, PUBLISHER] = are_commands
+        else:
+            for target in plan.targets:
+                if target.is_topic:
+                    uses[plan.route, target.label, SUBSCRIBER] = target.is_command
+    for gateway in program.gateways:
+        for topic, inbound in gateway.inbound.items():
+            uses[gateway.settings.name, topic, SUBSCRIBER] = inbound.is_command
+    return uses
 
 
 def _users_of_topics(program: Program) -> Mapping[str, Sequence[str]]:

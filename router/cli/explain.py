@@ -48,7 +48,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--code", action="store_true", help="also list the operations that the router executes")
     given = "show what each target gets from a payload with these fields, sent by the route's first source"
     completes(parser.add_argument("--given", nargs="*", metavar="FIELD=VALUE", help=given), fields)
-    parser.add_argument("--live", action="store_true", help="also look for topics in the ROS network")
+    live = "also look for topics in the ROS network, and for publishers and subscribers of another type"
+    parser.add_argument("--live", action="store_true", help=live)
     add_for(parser, f"how long --live looks for topics, for example 5s (default: {_LIVE:g}s)")
 
 
@@ -66,6 +67,7 @@ def _explain(args: argparse.Namespace) -> int:
         explained_route,
         ignored_gateway,
         known_topics,
+        live_route,
         seen_topics,
         tried_route,
     )
@@ -84,12 +86,13 @@ def _explain(args: argparse.Namespace) -> int:
             raise UsageError(f"{path} has no route or gateway '{name}'", did_you_mean(name, known))
     if args.given is not None and (len(args.names) != 1 or args.names[0] not in routes):
         raise UsageError("--given takes the fields of one payload case", "name it: router explain CASE --given x=1")
-    topics = seen_topics(program.table, args.seconds or _LIVE) if args.live else known_topics(program.table)
+    topics, mistyped = seen_topics(program, args.seconds or _LIVE) if args.live else (known_topics(program.table), ())
     for name in args.names or known:
         for route in routes.get(name, ()):
             code = listed_route(route, program) if args.code else ()
             given = () if args.given is None else tried_route(route, checked, program, args.given)
-            print(*explained_route(route, checked), *code, *given, sep="\n", end="\n\n")
+            now = live_route(route.route, mistyped)
+            print(*explained_route(route, checked), *now, *code, *given, sep="\n", end="\n\n")
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:

@@ -158,6 +158,20 @@ METRICS = (
         ("route", "topic", "policy"),
         "Peers that currently cannot connect because of their QoS.",
     ),
+    Metric(
+        "type_incompatible",
+        "number",
+        ("route", "topic", "peer", "type", COMMAND),
+        "Publishers and subscribers of a topic that currently have another type than the table.",
+    ),
+    Metric("topic_subscribers", "number", ("topic",), "Subscribers that currently get what the router publishes."),
+    Metric(
+        "other_routers",
+        "number",
+        ("host", "process", "shares", "name"),
+        "1 for each topic from which another router also takes messages, and if its node has the same name.",
+    ),
+    Metric("node_namesakes", "number", ("node",), "Other nodes with the name of the router's node, without routers."),
 )
 
 ENDPOINT_METRICS = (
@@ -223,10 +237,23 @@ INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 
 TOPIC_STATES: Mapping[str, str] = {
     "served": "a client gets it",
-    "several_types": "served with the type that most of its publishers use",
+    "several_types": "served with the table's type, or else with the one that most of its publishers use",
     "not_installed": "not served: its type is not installed here",
+    "refused": "not served: the router uses the topic with another type, or ROS refuses the subscription",
 }
 """States of a topic that a gateway's patterns match."""
+
+SERVED_STATES = frozenset({"served", "several_types"})
+"""The TOPIC_STATES in which clients get the topic."""
+
+PUBLISHER, SUBSCRIBER = "publisher", "subscriber"
+"""Values of the label `peer`: an endpoint of a topic that is not the router's."""
+
+
+def only(peer: str, type_name: str) -> str:
+    """Say why nothing passes between the router, which has a topic as this type, and a peer of another type."""
+    return f"only {type_name} is {'received' if peer == PUBLISHER else 'published'}"
+
 
 CLIENT_DROP_REASONS: Mapping[str, str] = {
     "superseded": "a newer value of the topic took its place, because the client is slow",
@@ -263,6 +290,9 @@ STARTS: Mapping[str, str] = {
     "replaced": "it forwarded with a kept program until an input turned out to have changed",
 }
 """Ways in which a router can start, with their meaning."""
+
+SHARES_NODE, SHARES_TOPIC = "node", "topic"
+"""Values of the label `shares`: what another router has in common with this one."""
 
 CLIENTS = "clients"
 """The `target` and `source` label of a gateway's clients."""

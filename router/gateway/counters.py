@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from router.compiler.metrics import CLIENT_DROP_REASONS, CLIENTS, GATEWAY_DROP_REASONS, TOPIC_STATES, Counters, Report
 from router.table.model import ROS, Gateway
@@ -39,7 +39,7 @@ class GatewayCounters:
         self._arrived = counters.index("datagrams_received", name)
         self._arrived_bytes = counters.index("received_bytes", name)
         self._clients = counters.index("gateway_clients", name)
-        self._topics = [counters.index("gateway_topics", name, state) for state in TOPIC_STATES]
+        self._topics = {state: counters.index("gateway_topics", name, state) for state in TOPIC_STATES}
         zenoh = settings.zenoh
         self._contended = counters.index("gateway_key_conflicts", name) if zenoh else None
         self._connections = counters.index("gateway_connections", name, zenoh.mode) if zenoh else None
@@ -102,6 +102,7 @@ class GatewayCounters:
     def clients(self, number: int) -> None:
         self._counts[self._clients] = number
 
-    def topics(self, served: int, several_types: int, not_installed: int) -> None:
-        for index, number in zip(self._topics, (served, several_types, not_installed), strict=True):
-            self._counts[index] = number
+    def topics(self, numbers: Mapping[str, int]) -> None:
+        """Set the number of topics, by one of TOPIC_STATES; 0 if it is absent."""
+        for state, index in self._topics.items():
+            self._counts[index] = numbers.get(state, 0)

@@ -30,8 +30,13 @@ class Selection(NamedTuple):
         return bool(self.keepers) and not self.keeps
 
 
-def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Selection | None:
-    """Return the most frequent type (in a tie, the first by name), and a QoS compatible with all its publishers.
+def select(
+    publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool, table_type: str | None = None
+) -> Selection | None:
+    """Return a type, and a QoS compatible with all its publishers.
+
+    It is `table_type`, the only one that the router can use if the table has the topic. If that has no publisher, it is
+    the most frequent type (in a tie, the first by name).
 
     On an inbound topic this router's publishers do not count: clients would get back their own messages. Returns None
     if no publisher is left.
@@ -39,7 +44,9 @@ def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Se
     counted = [publisher for publisher in publishers if not (is_inbound and publisher.is_ours)]
     if not counted:
         return None
-    type_name, *others = by_frequency(publisher.type_name for publisher in counted)
+    types = list(by_frequency(publisher.type_name for publisher in counted))
+    type_name = table_type if table_type in types else types[0]
+    others = [each for each in types if each != type_name]
     selected = [publisher for publisher in counted if publisher.type_name == type_name]
     is_reliable = all(publisher.is_reliable for publisher in selected)
     keeps = is_reliable and all(publisher.keeps for publisher in selected)

@@ -27,6 +27,10 @@ DEPTH = 100
 """Queue length of a subscription to every message; the oldest are dropped first."""
 
 
+class NotInstalledError(StartError):
+    """A type that cannot be received here."""
+
+
 class TopicSubscription:
     """A subscription to one topic as one type, to every message or the latest value, shared by gateways.
 
@@ -225,7 +229,8 @@ class Subscriptions:
             await asyncio.sleep(0)
             if not is_wanted(topic):
                 continue
-            if selection := select(self._topics.publishers(topic), is_inbound=topic in inbound):
+            publishers, table_type = self._topics.publishers(topic), self._topics.types.get(topic)
+            if selection := select(publishers, is_inbound=topic in inbound, table_type=table_type):
                 found[topic] = selection
                 if selection.type_name not in self._types:
                     ready = await self._loop.run_in_executor(self._loader, self._load, selection.type_name)
@@ -240,7 +245,8 @@ class Subscriptions:
         """Use a subscription. `callback` is called for every message; without one, call `latest`.
 
         To change the selection, join again and leave the old subscription, which may be the same, afterwards. A
-        subscription of another type is closed for all its users. Raises StartError; then nothing was joined.
+        subscription of another type is closed for all its users. Raises StartError, NotInstalledError for the type;
+        then nothing was joined.
         """
         ready = self._ready(wanted.type_name)
         for key in ((topic, False), (topic, True)):
@@ -278,7 +284,7 @@ class Subscriptions:
         if (ready := self._types.get(type_name)) is None:
             ready = self._types[type_name] = self._load(type_name)
         if isinstance(ready, str):
-            raise StartError(ready)
+            raise NotInstalledError(ready)
         return ready
 
     def _load(self, type_name: str) -> ReadyType | str:

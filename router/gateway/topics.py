@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import aclosing, suppress
 from functools import partial
@@ -18,7 +19,7 @@ from router.gateway.encoding import Sample
 from router.gateway.kept import FRESH_S, Kept
 from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
-from router.gateway.subscriptions import TopicSubscription
+from router.gateway.subscriptions import NotInstalledError, TopicSubscription
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Frame
 from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
@@ -70,7 +71,7 @@ class Topics:
         )
         self._selector = TopicSelector(plan.settings, self._inbound)
         self._served: dict[str, ServedTopic] = {}
-        self._not_installed: set[str] = set()
+        self._not_served: dict[str, str] = {}  # by topic: its state
         self._numbers = count()
         self._discover_now = asyncio.Event()
         self._is_udp = plan.settings.transport.value is Transport.UDP
@@ -112,7 +113,7 @@ class Topics:
         if not self._clients:
             # While a topic has subscribers, the router publishes on it: do not subscribe without clients.
             found = {topic: selection for topic, selection in found.items() if not selection.is_ours}
-        self._not_installed &= found.keys()
+        self._not_served = {topic: state for topic, state in self._not_served.items() if topic in found}
         for topic in self._served.keys() - found.keys():
             self._forget(topic)
         for topic, selection in found.items():
@@ -122,8 +123,8 @@ class Topics:
                 await asyncio.sleep(0)
             elif served.period == EACH:
                 self._sender.count_missed(served)
-        several = sum(bool(served.selection.others) for served in self._served.values())
-        self._counters.topics(len(self._served) - several, several, len(self._not_installed))
+        served_as = ("several_types" if served.selection.others else "served" for served in self._served.values())
+        self._counters.topics(Counter(chain(served_as, self._not_served.values())))
 
     def _try_to_serve(self, topic: str, selection: Selection) -> None:
         try:
@@ -131,8 +132,9 @@ class Topics:
         except StartError as error:
             if topic in self._served:
                 self._forget(topic)
-            if topic not in self._not_installed:
-                self._not_installed.add(topic)
+            state = "not_installed" if isinstance(error, NotInstalledError) else "refused"
+            if self._not_served.get(topic) != state:
+                self._not_served[topic] = state
                 logger.warning("topic cannot be served", gateway=self._name, topic=topic, error=str(error))
         except Exception as error:  # noqa: BLE001 reported; other topics are still served
             self._failed(error)
@@ -144,7 +146,7 @@ class Topics:
         callback = self._on_sample if period == EACH else None
         is_new = not self._subscriptions.is_joined(topic, callback)
         subscription = self._subscriptions.join(topic, selection, callback)
-        self._not_installed.discard(topic)
+        self._not_served.pop(topic, None)
         if before and before.subscription is subscription:
             self._subscriptions.leave(subscription, callback)  # it was already joined
             if selection.is_mixed and selection.keepers - before.selection.keepers:
@@ -161,7 +163,7 @@ class Topics:
             self._introduce(served)
         if selection.others:
             logger.warning(
-                "the topic has several types; serving the one that most publishers use",
+                "the topic has several types; serving one of them",
                 gateway=self._name,
                 topic=topic,
                 type=selection.type_name,

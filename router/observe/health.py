@@ -13,7 +13,17 @@ from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from router.compiler.metrics import INTENDED_REASONS, Mismatch
+from router.compiler.metrics import (
+    COMMAND,
+    INTENDED_REASONS,
+    PUBLISHER,
+    SERVED_STATES,
+    SHARES_NODE,
+    SHARES_TOPIC,
+    SUBSCRIBER,
+    Mismatch,
+    only,
+)
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
@@ -53,18 +63,20 @@ REMEDIES: Mapping[str, str] = {
     "no_permission": "Make `record.directory` writable for the user of the router, which retries every 10 s.",
     "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",
     "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
+    "not_installed": "`router explain {route} --live` shows their types: source their packages, or exclude the topics.",
+    "refused": "The log names them, with the reason. If the table has them with another type, exclude them.",
 }
-"""Remedies by the reason of a loss."""
+"""Remedies by the reason of a loss, or the state of a gateway's topic."""
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
     Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
-    Kind.GATEWAY_TOPIC_NOT_SERVED: ", topics not served: {:.0f}",
+    Kind.GATEWAY_TOPIC_NOT_SERVED: ", {:.0f} of them",
     Kind.RECORDING_UNSAVED: ", {:.0f} of them",
 }
 """The text that gives the value, for kinds where it matters."""
 
-_GAUGES = (Kind.LISTENER_WAITING, *_MORE)
+_GAUGES = (Kind.LISTENER_WAITING, Kind.NODE_NAME_TAKEN, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
     *DROPS,
@@ -135,6 +147,8 @@ class Look:
             self._tripped(),
             self._disobeyed(),
             self._waiting(),
+            self._mistyped(),
+            self._other_routers(),
             *map(self._above, _GAUGES),
             *map(self._lost, _LOSSES),
         )
@@ -291,10 +305,35 @@ class Look:
         if waiting > Kind.MESSAGES_WAITING.threshold:
             yield self._problem(Kind.MESSAGES_WAITING, {}, f", at least {waiting:.0f}")
 
+    def _mistyped(self) -> Iterator[Problem]:
+        """Yield the types of peers with which nothing is exchanged."""
+        plans = {PUBLISHER: self.program.subscriptions, SUBSCRIBER: self.program.publishers}
+        for values, number in self.now.counts(Kind.TYPE_INCOMPATIBLE.metric).items():
+            if not number:
+                continue
+            labels = dict(zip(SERIES[Kind.TYPE_INCOMPATIBLE.metric], values, strict=True))
+            kind = Kind.COMMANDS_MISTYPED if labels[COMMAND] == "true" else Kind.TYPE_INCOMPATIBLE
+            ours = (plan.type_name for plan in plans[labels["peer"]] if plan.label == labels["topic"])
+            more = "".join(f"; {only(labels['peer'], each)}" for each in ours)  # not if a reload has removed the topic
+            yield self._problem(kind, labels, more, (labels["route"],))
+
+    def _other_routers(self) -> Iterator[Problem]:
+        """Yield the other routers, with what they share with this one."""
+        found: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+        for (host, process, shares, name), value in sorted(self.now.counts(Kind.OTHER_ROUTER.metric).items()):
+            if value:
+                found[host, process][shares].append(name)
+        for (host, process), shared in found.items():
+            topics, nodes = shared[SHARES_TOPIC], shared[SHARES_NODE]
+            more = f"; boards of both get messages on {' and '.join(topics)} twice" if topics else ""
+            more += "".join(f"; both are called {name}" for name in nodes)
+            routes = tuple(plan.route for topic in topics for plan in self.program.outbound.get(topic, ()))
+            yield self._problem(Kind.OTHER_ROUTER, {"host": host, "process": process}, more, routes)
+
     def _above(self, kind: Kind) -> Iterator[Problem]:
         for values, value in self.now.counts(kind.metric).items():
             labels = dict(zip(SERIES[kind.metric], values, strict=True))
-            if value > kind.threshold and labels.get("state", "not_installed") == "not_installed":
+            if value > kind.threshold and labels.get("state") not in SERVED_STATES:
                 routes = (self._owner(labels["route"]),) if "route" in labels else ()
                 yield self._problem(kind, labels, _MORE.get(kind, "").format(value), routes)
 
@@ -334,5 +373,5 @@ class Look:
             address = table.listeners[labels["listener"]].bound_to
         elif (endpoint := table.endpoints.get(labels.get("endpoint") or labels.get("destination", ""))) is not None:
             address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
-        remedy = kind.remedy or REMEDIES.get(labels.get("reason", ""), "")
+        remedy = kind.remedy or REMEDIES.get(labels.get("reason") or labels.get("state", ""), "")
         return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)

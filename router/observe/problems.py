@@ -73,6 +73,18 @@ class Kind(enum.Enum):
         "messages_dropped",
         0.05,
     )
+    COMMANDS_MISTYPED = (
+        Level.CRITICAL,
+        "commands on {topic} are lost: it has a {peer} of {type}",
+        "Give that {peer} the table's type, or stop it; `ros2 topic info -v {topic}` names its node.",
+        "type_incompatible",
+    )
+    OTHER_ROUTER = (
+        Level.WARNING,
+        "another router interferes with this one: process {process} on {host}",
+        "Stop one of them: each brakes the rover when it starts and stops. If both are needed, separate their topics.",
+        "other_routers",
+    )
     ENDPOINT_SILENT = (
         Level.WARNING,
         "{endpoint} is silent",
@@ -144,6 +156,18 @@ class Kind(enum.Enum):
         "Compare their QoS (`ros2 topic info -v {topic}`) with the router's (`router explain {route}`).",
         "qos_incompatible",
     )
+    TYPE_INCOMPATIBLE = (
+        Level.WARNING,
+        "{topic} has a {peer} of {type}",
+        COMMANDS_MISTYPED[2],
+        "type_incompatible",
+    )
+    NODE_NAME_TAKEN = (
+        Level.WARNING,
+        "another node is called {node}, as this router is",
+        "Stop it, or give one of them another name: `node: {{name: ...}}`, or `-r __node:=...` after `--ros-args`.",
+        "node_namesakes",
+    )
     GATEWAY_DISCONNECTED = (
         Level.WARNING,
         "gateway {route} is not connected to its Zenoh router",
@@ -182,8 +206,8 @@ class Kind(enum.Enum):
     )
     GATEWAY_TOPIC_NOT_SERVED = (
         Level.INFO,
-        "types that {route} needs are not installed",
-        "`router explain {route} --live` names them: source their packages, or exclude the topics.",
+        "{route} does not serve topics: {state}",
+        "",
         "gateway_topics",
     )
     HALTED = (

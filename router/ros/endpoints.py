@@ -20,6 +20,7 @@ from router.compiler.program import TopicPlan
 from router.errors import ConfigurationError, SourceSpan
 from router.log import logger
 from router.ros.events import PeerEvents, WantedFlag
+from router.ros.marks import Mark
 from router.ros.node import RCL_ERRORS, start_error
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
 from router.ros.rcl import RCL, ErrorString, SerializedMessage, function
@@ -52,7 +53,7 @@ def _rcl_error() -> Exception:
 
 
 class Publication:
-    """A publisher. `wanted` says whether it has subscribers or serves late joiners.
+    """A publisher. `wanted` says whether it has subscribers or serves late joiners, `subscribers` how many it has.
 
     `publish` takes CDR bytes, is thread-safe, and releases the interpreter lock while the middleware works. It raises
     RCLError if the middleware fails or the publisher is closed.
@@ -62,12 +63,13 @@ class Publication:
         """Open the publisher. Raises StartError if the middleware refuses it."""
         self.plan = plan
         self.wanted: WantedFlag = (ctypes.c_uint8 * 1)(plan.qos.serves_late_joiners)
+        self.subscribers = 0
         with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
             self._publisher = node.create_publisher(
                 message,
                 plan.topic,
                 qos_profile(plan.qos),
-                event_callbacks=peers.of_publisher(plan, self.wanted),
+                event_callbacks=peers.of_publisher(plan, self._matched),
                 callback_group=ReentrantCallbackGroup(),  # the node's own group would leak memory
             )
             opening.callback(node.destroy_publisher, self._publisher)
@@ -83,11 +85,15 @@ class Publication:
         self.qos = publisher_qos(handle.pointer)
         self.events: Sequence[EventHandler] = self._publisher.event_handlers
 
+    def _matched(self, subscribers: int) -> None:
+        self.subscribers = subscribers
+        self.wanted[0] = subscribers > 0 or self.plan.qos.serves_late_joiners
+
     def await_subscribers(self) -> None:
         """Wait up to 0.5 s until subscribers of an earlier publisher of the topic have discovered this one."""
         for _ in range(int(_DISCOVERY_S / _POLL_S)):
-            if self._publisher.get_subscription_count():
-                self.wanted[0] = 1
+            if subscribers := self._publisher.get_subscription_count():
+                self._matched(subscribers)
                 return
             sleep(_POLL_S)
 
@@ -141,7 +147,7 @@ class Publication:
 
 
 class Subscription:
-    """A subscription. Messages are taken through `raw`."""
+    """A subscription, marked for other routers. Messages are taken through `raw`."""
 
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
         """Open the subscription. Raises StartError if the middleware refuses it."""
@@ -151,6 +157,7 @@ class Subscription:
         self.events: Sequence[EventHandler] = self.raw.events
         self.topic: str = self.raw.handle.get_topic_name()
         self.qos = subscription_qos(self.raw.handle.pointer)
+        self._mark = Mark(node, self.topic)
 
     def await_publishers(self) -> None:
         """Wait up to 0.5 s until publishers have discovered this subscription, while an earlier one receives.
@@ -165,6 +172,7 @@ class Subscription:
 
     def close(self) -> None:
         """Close the subscription, when no thread takes from it or waits for its events."""
+        self._mark.close()
         self.raw.close()
 
 

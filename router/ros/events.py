@@ -53,11 +53,11 @@ class PeerEvents:
         self._incompatible = incompatible
         self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: remaining checks
 
-    def of_publisher(self, plan: TopicPlan, wanted: WantedFlag) -> PublisherEventCallbacks:
-        """Return callbacks that also keep `wanted` up to date: whether there are subscribers."""
+    def of_publisher(self, plan: TopicPlan, matched: Callable[[int], None]) -> PublisherEventCallbacks:
+        """Return callbacks; `matched` is called with each new number of subscribers."""
 
         def on_matched(status: Any) -> None:
-            wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
+            matched(status.current_count)
             if status.total_count_change > 0:
                 self._subscriber_joined(plan.label)
 
@@ -65,12 +65,8 @@ class PeerEvents:
             problem = "a subscriber requests a QoS that the table does not offer: it receives nothing"
             self._on_incompatible_qos(problem, plan, status)
 
-        def on_incompatible_type(_: Any) -> None:
-            what = "a subscriber expects another type: it receives nothing"
-            logger.warning(what, topic=plan.label, type=plan.type_name)
-
         return PublisherEventCallbacks(
-            matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
+            matched=on_matched, incompatible_qos=on_incompatible_qos, use_default_callbacks=False
         )
 
     def check(
@@ -93,11 +89,7 @@ class PeerEvents:
             problem = "a publisher offers a weaker QoS than the table requests: its messages are not received"
             self._on_incompatible_qos(problem, plan, status)
 
-        def on_incompatible_type(_: Any) -> None:
-            what = "a publisher has another type: its messages are not received"
-            logger.warning(what, topic=plan.label, type=plan.type_name)
-
-        return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
+        return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, use_default_callbacks=False)
 
     def _on_incompatible_qos(self, problem: str, plan: TopicPlan, status: Any) -> None:
         """Log the problem. The middleware names only the last policy of the last peer."""

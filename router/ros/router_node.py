@@ -12,6 +12,8 @@ from router.compiler.program import TopicPlan
 from router.errors import SourceSpan
 from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
 from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
+from router.ros.graph import GraphWatch, Ours, Surroundings
+from router.ros.marks import Mark
 from router.ros.node import close_node, open_node
 from router.ros.topics import RosTopics
 from router.table.model import NodeSettings
@@ -48,14 +50,18 @@ class RouterNode:
         self.wanted: dict[str, WantedFlag] = {}
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
+        self._types: dict[str, str] = {}
         self._is_stuck = False
         self._is_abandoned = False  # a stuck thread uses subscriptions or publishers
         self._peers = PeerEvents(incompatible, subscriber_joined)
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(self._close_node)
-            self.name = self._node.get_fully_qualified_name().removeprefix("/")
-            self.topics = RosTopics(self._node)
+            self._full_name = self._node.get_fully_qualified_name()
+            self.name = self._full_name.removeprefix("/")
+            opening.callback(Mark(self._node, self._full_name).close)
+            self._graph = GraphWatch(self._node)
+            self.topics = RosTopics(self._node, self._types)
             opening.callback(self._close_topics)
             change = self.prepare(publishers, subscriptions, spans)
             self._use(change)
@@ -103,6 +109,16 @@ class RouterNode:
         for opened in change.opened:
             opened.close()
 
+    @property
+    def surroundings(self) -> Surroundings:
+        """What was last seen in the graph."""
+        return self._graph.now
+
+    def subscribers(self) -> Iterator[tuple[str, int]]:
+        """Yield the published topics, each with the number of its subscribers."""
+        for topic, publication in list(self._publications.items()):
+            yield topic, publication.subscribers
+
     def stalled(self) -> Iterator[tuple[str, float]]:
         """Yield the topics on which Python threads are publishing now, each with the seconds since they began."""
         for topic, publication in list(self._publications.items()):
@@ -133,6 +149,13 @@ class RouterNode:
 
     def _use(self, change: RosChange) -> None:
         self._publications, self._subscriptions = change.publications, change.subscriptions
+        received, published = (
+            {each.topic: each.plan for each in endpoints.values()}
+            for endpoints in (change.subscriptions, change.publications)
+        )
+        self._ours = Ours(self._full_name, received, published)
+        self._types.clear()
+        self._types.update((topic, plan.type_name) for topic, plan in (received | published).items())
         self.publish.update((topic, each.publish) for topic, each in change.publications.items())
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
 
@@ -141,8 +164,12 @@ class RouterNode:
             self._node,
             [event for each in self._publications.values() for event in each.events],
             [event for each in self._subscriptions.values() for event in each.events],
-            lambda: self._peers.check(self._node, self._publications, self._subscriptions),
+            self._check,
         )
+
+    def _check(self) -> None:
+        self._peers.check(self._node, self._publications, self._subscriptions)
+        self._graph.check(self._ours)
 
     def _stop_events(self) -> None:
         self._events.stop()

@@ -43,9 +43,10 @@ class DiscoveredPublisher(NamedTuple):
 
 
 class RosTopics:
-    """The topics that `node` has discovered. Names are absolute."""
+    """The topics that `node` has discovered. Names are absolute. `types` are those of the table's topics."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, types: Mapping[str, str]) -> None:
+        self.types = types
         self._node = node
         self._handle = node.handle
         self._name = node.get_name(), node.get_namespace()
@@ -202,7 +203,7 @@ class TopicListener:
 
 def _publishers(node: Node, topic: str, patience: float) -> Sequence[DiscoveredPublisher]:
     """Return the publishers discovered so far; waits up to `patience` seconds for the first one."""
-    topics, name, until = RosTopics(node), node.resolve_topic_name(topic), monotonic() + patience
+    topics, name, until = RosTopics(node, {}), node.resolve_topic_name(topic), monotonic() + patience
     while not (publishers := topics.publishers(name)) and monotonic() < until:
         sleep(_DISCOVERY_INTERVAL)
     return publishers

@@ -8,11 +8,13 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from time import sleep
+from typing import TYPE_CHECKING
 
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.mapping import Row
+from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.program import GatewayPlan, InboundPlan, Program
 from router.compiler.selection import TopicSelector
@@ -46,6 +48,9 @@ from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.boards import framed_size
 from router.types.protobuf import PayloadCase
 from router.values import payload
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.ros.graph import Mistyped
 
 _WIDEST_CELL = 48
 
@@ -386,10 +391,14 @@ def known_topics(table: RouteTable) -> Topics:
     return {resolved(topic.topic.value, table.node): topic.type_name for topic in topics}
 
 
-def seen_topics(table: RouteTable, seconds: float) -> Topics:
-    """Return the known topics, and all topics that a node discovers in `seconds`. Raises StartError."""
+def seen_topics(program: Program, seconds: float) -> tuple[Topics, Sequence[Mistyped]]:
+    """Return the known topics with all that a node discovers in `seconds`, and the peers of another type.
+
+    Raises StartError.
+    """
     check_environment(os.environ)
     try:
+        from router.ros.graph import Ours, look
         from router.ros.node import close_node, open_node
         from router.ros.topics import RosTopics
     except ImportError as error:
@@ -397,17 +406,34 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
     node = open_node("router_explain")
     try:
         sleep(seconds)
-        topics = RosTopics(node)
+        topics = RosTopics(node, known := known_topics(program.table))
         seen = {name: [publisher.type_name for publisher in topics.publishers(name)] for name in topics.names()}
+        mistyped = sorted(look(node, Ours.of(program)).mistyped)
     finally:
         close_node(node)
-    known = {name: f"{type_name}, no publisher" for name, type_name in known_topics(table).items()}
-    return known | {name: _publishers(types) for name, types in seen.items() if types}
+    unseen = {name: f"{type_name}, no publisher" for name, type_name in known.items()}
+    return unseen | {name: _publishers(types, known.get(name)) for name, types in seen.items() if types}, mistyped
 
 
-def _publishers(types: Iterable[str]) -> str:
-    """Return types with their number of publishers, first the type that gateways choose."""
-    return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
+def _publishers(types: Sequence[str], table_type: str | None) -> str:
+    """Return types with their number of publishers, first the type that gateways choose.
+
+    The table's type, which decides, is shown even without a publisher.
+    """
+    times = by_frequency(types)
+    if table_type is None:
+        return ", ".join(f"{name} of {number}" for name, number in times.items())
+    ours = f"{table_type} of {times.pop(table_type)}" if table_type in times else f"{table_type}, no publisher"
+    return ", ".join([ours, *(f"not {name} of {number}" for name, number in times.items())])
+
+
+def live_route(route: Route, mistyped: Sequence[Mistyped]) -> Iterator[str]:
+    """Yield the peers that now have another type than a topic of the route."""
+    used = {(topic.topic.value, PUBLISHER) for topic in route.source_topics}
+    used |= {(topic.topic.value, SUBSCRIBER) for topic in route.topics}
+    if found := [each for each in mistyped if (each.topic, each.peer) in used]:
+        yield ""
+        yield from (f"  now: {each}" for each in found)
 
 
 # Two tables

@@ -49,6 +49,30 @@ def test_live_shows_topics_of_the_network_with_who_publishes_them(
     assert "/imu_data  comms/msg/ImuSensorInformation, no publisher  " in explained("vr_headset")
 
 
+def test_live_names_publishers_and_subscribers_of_another_type(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from tests.ros.peers import Publisher, Subscriber
+
+    table = tmp_path / "gateways.yaml"
+    table.write_text(GATEWAYS.format(base=BASE))
+    other, ours = "geometry_msgs/msg/Twist", "comms/msg/ImuSensorInformation"
+
+    def explained(name: str) -> str:
+        assert main(["explain", name, "--live", "--for", "500ms", "--table", str(table)]) == OK
+        return capsys.readouterr().out
+
+    with closing(Subscriber("imu_data", other)), closing(Publisher("imu_data", other)):
+        while "  now: " not in (told := explained("imu_info")):
+            pass
+        assert f"\n  now: imu_data has a subscriber of {other}; only {ours} is published\n" in told
+        assert "now: imu_data has a publisher" not in told  # the route does not receive there
+        while f"/imu_data  {ours}, no publisher, not {other} of 1  " not in explained("vr_headset"):
+            pass
+    assert "now:" not in explained("imu_info")
+
+
 TABLE = """\
 extends: {base}
 listen: {{rover: {{address: "127.0.0.1:${{LISTEN_PORT:-{port}}}"}}}}

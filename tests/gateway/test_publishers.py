@@ -44,6 +44,15 @@ def test_quality_is_what_every_publisher_of_the_type_offers(
     assert (chosen.is_reliable, chosen.keeps) == (is_reliable, keeps)
 
 
+def test_the_type_of_the_table_is_served_if_it_has_a_publisher() -> None:
+    publishers = [OTHER, OTHER, RELIABLE]
+    expected = Selection("a/msg/A", is_reliable=True, keeps=False, others=("b/msg/B",))
+    assert select(publishers, is_inbound=False, table_type="a/msg/A") == expected
+    served = select(publishers, is_inbound=False, table_type="c/msg/C")
+    assert served
+    assert served.type_name == "b/msg/B"  # for the state `refused`, with a reason
+
+
 @pytest.mark.parametrize(
     ("publishers", "type_name", "others"),
     [

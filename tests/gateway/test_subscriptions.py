@@ -23,7 +23,7 @@ from router.gateway.json_codec import UnreadableError
 from router.gateway.json_types import Style
 from router.gateway.packets import decompress
 from router.gateway.publishers import Selection
-from router.gateway.subscriptions import Subscriptions, TopicSubscription
+from router.gateway.subscriptions import NotInstalledError, Subscriptions, TopicSubscription
 from router.gateway.transport.base import PER_TURN
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
@@ -397,7 +397,7 @@ async def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
 async def test_a_type_that_is_not_installed_is_refused_each_time() -> None:
     async with opened() as subscriptions:
         for type_name in ["std_msgs/msg/NoSuch", "no_such/msg/Thing", "some::Idl_", "a/action/B_Feedback"] * 2:
-            with pytest.raises(StartError, match=f"{type_name} is not installed"):
+            with pytest.raises(NotInstalledError, match=f"{type_name} is not installed"):
                 subscriptions.join("/greeting", PLAIN._replace(type_name=type_name), None)
 
 
@@ -407,6 +407,17 @@ async def test_a_topic_that_a_route_has_with_another_type_is_refused_and_can_be_
         with pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
             subscriptions.join("/greeting", PLAIN._replace(type_name=INT32), None)
         assert subscriptions.join("/greeting", PLAIN, None).type_name == STRING
+
+
+@asynchronous
+async def test_a_topic_of_a_route_is_seen_with_the_type_of_the_route_though_others_have_more_publishers(
+    publisher: Publish,
+) -> None:
+    publisher(INT32)
+    publisher(INT32)
+    async with opened(string_topic()) as subscriptions:
+        selection = await seen(subscriptions, lambda choice: choice.others == (INT32,))
+        assert subscriptions.join("/greeting", selection, None).type_name == STRING
 
 
 class Counted(ReadyType):

@@ -83,7 +83,7 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
             "gateway_topics dashboard not_installed",
             "gateway/dashboard",
             Level.OK,
-            "types that dashboard needs are",
+            "dashboard does not serve topics: not_installed",
         ),
         ("deadman_send_errors manual_drive driving_board", "endpoint/driving_board", Level.ERROR, "the deadman of"),
         (

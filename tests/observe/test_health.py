@@ -25,6 +25,9 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
     assert router.told(2) == []
 
 
+TWIST, DRIVE = "geometry_msgs/msg/Twist", "comms/msg/DrivingBoardMotorMessage"
+
+
 @pytest.mark.parametrize(
     ("series", "value", "told"),
     [
@@ -89,8 +92,22 @@ def test_a_router_of_which_nothing_is_known_yet_has_no_problem(router: Counting)
         (
             "gateway_topics dashboard not_installed",
             2,
-            "types that dashboard needs are not installed, topics not served: 2",
+            "dashboard does not serve topics: not_installed, 2 of them",
         ),
+        ("gateway_topics dashboard several_types", 9, None),
+        ("gateway_topics dashboard refused", 1, "dashboard does not serve topics: refused, 1 of them"),
+        (
+            "type_incompatible drive_motor drive_motor publisher geometry_msgs/msg/Twist true",
+            1,
+            f"commands on drive_motor are lost: it has a publisher of {TWIST}; only {DRIVE} is received",
+        ),
+        (
+            "type_incompatible imu_info imu_data subscriber sensor_msgs/msg/Imu false",
+            1,
+            "imu_data has a subscriber of sensor_msgs/msg/Imu; only comms/msg/ImuSensorInformation is published",
+        ),
+        ("node_namesakes /rover_router", 1, "another node is called /rover_router, as this router is"),
+        ("topic_subscribers imu_data", 9, None),
     ],
 )
 def test_what_is_counted_is_a_problem_unless_the_table_asks_for_it(
@@ -120,6 +137,22 @@ def test_of_a_deadman_that_sends_the_stopping_times_are_told(router: Counting) -
     sent = "its deadman sends in their place; driving_board stopped after 0.43 s"
     assert router.told(1) == [f"commands of manual_drive do not get through: {sent}"]
     assert "manual_drive is halted: no commands for 61 s; driving_board stopped after 0.43 s" in router.told(61)
+
+
+def test_all_that_another_router_shares_is_one_problem(router: Counting) -> None:
+    for shared in ("topic drive_motor", "topic detected_objects", "node /rover_router"):
+        router.count("other_routers", "nuc", "4711", *shared.split(), to=1)
+    router.count("other_routers", "pi", "12", "node", "/rover_router", to=1)
+    one, two = router.look(1).problems
+    assert one.text == (
+        "another router interferes with this one: process 4711 on nuc; "
+        "boards of both get messages on detected_objects and drive_motor twice; both are called /rover_router"
+    )
+    assert set(one.routes) == {"drive_motor", "detected_object_from_ros_2"}
+    assert (two.text, two.kind.level) == (
+        "another router interferes with this one: process 12 on pi; both are called /rover_router",
+        Level.WARNING,
+    )
 
 
 def test_what_is_asked_for_at_each_look_is_a_problem(router: Counting) -> None:
@@ -392,6 +425,7 @@ def test_remedies_are_of_reasons_that_there_are() -> None:
         *metrics.REJECT_REASONS,
         *metrics.GATEWAY_REJECT_REASONS,
         *metrics.UNSAVED_REASONS,
+        *metrics.TOPIC_STATES.keys() - metrics.SERVED_STATES,
     }
 
 

@@ -1,0 +1,146 @@
+"""What the ROS graph says about the surroundings of a router: peers of another type, other routers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import sleep
+from typing import NamedTuple
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+
+from router.compiler.metrics import PUBLISHER, SUBSCRIBER, only
+from router.compiler.program import Program, TopicPlan
+from router.compiler.topics import resolved
+from router.log import logger
+from router.ros.marks import Router, marks, this_router
+from router.ros.node import close_node, open_node
+
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+"""The name in the graph until the node of a publisher or subscriber has been discovered."""
+
+
+class Mistyped(NamedTuple):
+    """A PUBLISHER or SUBSCRIBER of a topic with another type than `ours`: nothing passes between it and the router.
+
+    `topic` is the topic's label in metrics.
+    """
+
+    topic: str
+    peer: str
+    type_name: str
+    ours: str
+
+    def __str__(self) -> str:
+        return f"{self.topic} has a {self.peer} of {self.type_name}; {only(self.peer, self.ours)}"
+
+
+class Shared(NamedTuple):
+    """A topic from which another router also takes messages, or the name of the node of both if `is_node`."""
+
+    router: Router
+    name: str
+    is_node: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ours:
+    """The absolute name of a router's node, and its topics by absolute name: those it receives and publishes."""
+
+    node: str
+    received: Mapping[str, TopicPlan]
+    published: Mapping[str, TopicPlan]
+
+    @classmethod
+    def of(cls, program: Program) -> Ours:
+        """Return what a program opens, without remaps."""
+        settings = program.table.node
+        received, published = (
+            {resolved(plan.topic, settings): plan for plan in plans}
+            for plans in (program.subscriptions, program.publishers)
+        )
+        return cls(resolved(settings.name, settings), received, published)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """`mistyped` has the names of the peers' nodes. `namesakes`: other nodes of the router's name, without routers."""
+
+    mistyped: Mapping[Mistyped, Sequence[str]] = field(default_factory=dict)
+    shared: frozenset[Shared] = frozenset()
+    namesakes: int = 0
+
+
+def look(node: Node, ours: Ours) -> Surroundings:
+    """Query the graph of `node`, which is the router's or that of a tool."""
+    types = dict(node.get_topic_names_and_types())
+    mistyped: dict[Mistyped, list[str]] = defaultdict(list)
+    for plans, peer, ask in (
+        (ours.received, PUBLISHER, rclpy_implementation.rclpy_get_publishers_info_by_topic),
+        (ours.published, SUBSCRIBER, rclpy_implementation.rclpy_get_subscriptions_info_by_topic),
+    ):
+        for topic, plan in plans.items():
+            if set(types.get(topic, ())) <= {plan.type_name}:
+                continue
+            with node.handle:
+                found = ask(node.handle, topic, False)
+            for each in found:
+                if each["topic_type"] != plan.type_name:
+                    name = _absolute(each["node_name"], each["node_namespace"])
+                    mistyped[Mistyped(plan.label, peer, each["topic_type"], plan.type_name)].append(name)
+    marked = [each for each in marks(types) if each[1] != this_router()]
+    shared = frozenset(
+        Shared(router, name if name == ours.node else ours.received[name].label, name == ours.node)
+        for name, router in marked
+        if (name == ours.node or name in ours.received) and not router.has_ended
+    )
+    with node.handle:
+        nodes = [_absolute(*each) for each in node.handle.get_node_names_and_namespaces()]
+    known = sum(name == ours.node for name, _ in marked) + (node.get_fully_qualified_name() == ours.node)
+    return Surroundings(dict(mistyped), shared, max(0, nodes.count(ours.node) - known))
+
+
+def look_once(tool: str, program: Program, seconds: float) -> Surroundings:
+    """Query the graph with a node of this name, `seconds` after opening it. Raises StartError."""
+    node = open_node(tool)
+    try:
+        sleep(seconds)
+        return look(node, Ours.of(program))
+    finally:
+        close_node(node)
+
+
+class GraphWatch:
+    """Looks at the graph, and logs what is new there. For one thread; others may read `now`."""
+
+    def __init__(self, node: Node) -> None:
+        self.now = Surroundings()
+        self._node = node
+        self._namesakes = 0
+
+    def check(self, ours: Ours) -> None:
+        latest = look(self._node, ours)
+        # A node and its topics are discovered one after the other.
+        namesakes, self._namesakes = min(latest.namesakes, self._namesakes), latest.namesakes
+        before, self.now = self.now, replace(latest, namesakes=namesakes)
+        for each in self.now.mistyped.keys() - before.mistyped.keys():
+            nodes = {name for name in self.now.mistyped[each] if not name.endswith(_UNKNOWN)}
+            logger.warning(str(each), topic=each.topic, nodes=sorted(nodes))
+        _log_routers(self.now.shared - before.shared)
+        if self.now.namesakes > before.namesakes:
+            logger.warning("another node has the name of this router", node=ours.node)
+
+
+def _log_routers(new: Iterable[Shared]) -> None:
+    found: dict[Router, list[str]] = defaultdict(list)
+    for each in sorted(new):
+        found[each.router].append(each.name)
+    for router, names in found.items():
+        what = "another router has the name of this one or takes messages from the same topics"
+        logger.warning(what, host=router.host, process=router.process, shared=names)
+
+
+def _absolute(name: str, namespace: str) -> str:
+    return f"{namespace.rstrip('/')}/{name}"
