@@ -33,7 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--pre-start",
         action="store_true",
-        help="report only what would make the start fail, and missing networks; print nothing else",
+        help="report only what would make the start fail, missing networks and other routers; print nothing else",
     )
     parser.add_argument("--json", action="store_true", help="print each result as JSON on one line")
 

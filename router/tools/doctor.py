@@ -28,6 +28,7 @@ from router.tools.doctor_checks import (
     receive_buffers,
     recordings,
     ros,
+    ros_peers,
     ros_ports,
     shared_memory,
     warning,
@@ -45,7 +46,9 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
         return
     running = _health(program)
     yield from carrier()
-    yield from ros(program)
+    yield from (found := [*ros(program)])
+    if running is None and all(each.grade is Grade.FINE for each in found):
+        yield from ros_peers(program)
     yield from listeners(program)
     yield from ports(program, running=running is not None)
     yield from ros_ports(program, variables)
@@ -59,7 +62,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
 
 
 def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Yield only what would make the start fail, and warnings of missing networks that the table needs.
+    """Yield only what would make the start fail, and warnings of missing networks and of what is in the ROS domain.
 
     Ports of listeners are not checked: systemd may hold them for the router.
     """
@@ -69,8 +72,11 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     if program is not None:
         needed += [carrier(), ros(program), ports(program, running=False, with_listeners=False)]
         needed += [recordings(program, running=False), ros_ports(program, variables)]
-    yield from (result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM)
+    problems = [result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM]
+    yield from problems
     if program is not None:
+        if not any(result.about == "ROS" for result in problems):
+            yield from ros_peers(program)
         yield from (result for result in listeners(program) if result.grade is not Grade.FINE)
         yield from ways(program, warning)
 

@@ -421,6 +421,40 @@ def ros(program: Program) -> Iterator[CheckResult]:
         yield fine("ROS", f"{middleware()} in domain {domain}, and {types} of the table")
 
 
+DISCOVERY_S = 2.0
+"""Seconds for the discovery of nodes, which rarely takes longer."""
+
+
+def ros_peers(program: Program) -> Iterator[CheckResult]:
+    """Warn of what a router would meet in the ROS domain: another router, and peers of another type."""
+    if not (program.publishers or program.subscriptions or program.gateways):
+        return
+    from router.ros.graph import look_once
+
+    try:
+        found = look_once("router_doctor", program, DISCOVERY_S)
+    except StartError as error:
+        yield problem("ROS", error.what, error.hint)
+        return
+    shared: dict[str, list[str]] = {}
+    for each in sorted(found.shared):
+        router = f"process {each.router.process} on {each.router.host}"
+        what = "has the name of its node" if each.is_node else f"takes messages from {each.name}"
+        shared.setdefault(router, []).append(what)
+    for router, whats in shared.items():
+        yield warning(
+            "ROS",
+            f"another router runs, {router}: it {' and '.join(whats)}",
+            "do not start this one beside it: it would brake the rover at its start, and send commands twice",
+        )
+    if found.namesakes:
+        name = program.table.node.name
+        yield warning("ROS", f"another node is called {name}", "stop it, or give one of them another name")
+    for peer in found.mistyped:
+        remedy = f"give that {peer.peer} the table's type, or stop it; `ros2 topic info -v {peer.topic}` names its node"
+        yield warning("ROS", str(peer), remedy)
+
+
 def carrier() -> Iterator[CheckResult]:
     """Check the carrier's library, which receives, forwards, publishes and brakes."""
     try:

@@ -6,8 +6,8 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from types import SimpleNamespace
@@ -99,6 +99,31 @@ def test_message_types_are_counted(table: Path) -> None:
     program = rewritten(table, "[basestation]}\n  arm", f"[basestation], {topic}}}\n  arm")
     [found] = ros(program)
     assert found.text.endswith(", and 1 message type of the table")
+
+
+def test_what_a_router_would_meet_in_its_ros_domain_is_said_before_its_start(table: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from router.ros.marks import this_router
+    from tests.ros.peers import Publisher, wait_until
+    from tests.ros.test_graph import OtherRouter
+
+    def of_ros(look: Callable[[Path, Mapping[str, str]], Iterator[CheckResult]]) -> list[str]:
+        return [each.text for each in look(table, {}) if each.about == "ROS" and each.grade is Grade.WARNING]
+
+    route = "ph_info: {source: {topic: greeting, type: std_msgs/msg/Float32}, fields: {ph_value: data}, "
+    rewritten(table, "ph_info: {source: sensor_board, ", route)
+    with (
+        closing(OtherRouter("--ros-args", "-r", "__node:=rover_router")) as router,
+        closing(Publisher("greeting", "geometry_msgs/msg/Twist")),
+    ):
+        who = f"process {router.process.pid} on {this_router().host}"
+        met = [
+            f"another router runs, {who}: it has the name of its node and takes messages from greeting",
+            "greeting has a publisher of geometry_msgs/msg/Twist; only std_msgs/msg/Float32 is received",
+        ]
+        wait_until(lambda: of_ros(before_start) == met)  # discovery may take longer on a busy computer
+        wait_until(lambda: set(met) <= set(of_ros(examine)))
+    assert of_ros(before_start) == []
 
 
 def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
