@@ -34,6 +34,7 @@ PATHS = {
     "endpoint_last_seen_timestamp_seconds": "endpoints {endpoint} seen",
     "endpoint_silences": "endpoints {endpoint} silences",
     "endpoint_last_silence_seconds": "endpoints {endpoint} last_silence",
+    "topic_subscribers": "topics {topic} subscribers",
     "datagrams_received": "listeners {listener} received",
     "received_bytes": "listeners {listener} bytes",
     "kernel_drops": "listeners {listener} kernel_drops",
@@ -118,11 +119,11 @@ class Status:
 
 
 def numbers(now: Snapshot) -> Json:
-    """Return all metrics by route, endpoint and listener. Times in seconds, counts since the start.
+    """Return all metrics by route, endpoint, topic and listener. Times in seconds, counts since the start.
 
     `routes` includes gateways. A route's `buckets` are cumulative, in the order of bounds.
     """
-    groups = ("routes", "endpoints", "listeners")
+    groups = ("routes", "endpoints", "topics", "listeners")
     found: Json = {group: {} for group in groups}
     for metric, path in _PATHS.items():
         for labels, value in now.counts(metric).items():

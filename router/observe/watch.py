@@ -24,6 +24,7 @@ METRICS = {kind.metric for kind in Kind} | {
     "messages_received",
     "mirror_dropped",
     "recordings_lost",
+    "topic_subscribers",
     *DELIVERED,
 }
 """The metrics read each second. Histograms, which have most of the series, are not among them."""
