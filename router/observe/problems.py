@@ -31,7 +31,7 @@ class Level(enum.Enum):
 
 
 class Kind(enum.Enum):
-    """A kind of problem; kinds that explain others come first.
+    """A kind of problem, in the order in which they are shown: what stops the rover, its causes, other losses.
 
     `words` contain labels of `metric`. There is a problem while its value exceeds `threshold`: for losses per second,
     for times in seconds. `remedy` can also contain the `{address}` of what the labels name.
@@ -57,7 +57,7 @@ class Kind(enum.Enum):
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",
-        "Stop the rover by other means. Nothing listens at {address}, or the network rejects the datagrams.",
+        "Stop the rover by other means. Then check power and cable of {destination}, and what rejects datagrams to {address}.",
         "deadman_send_errors",
     )
     DEADMAN_DISOBEYED = (
@@ -66,24 +66,24 @@ class Kind(enum.Enum):
         "Stop the rover by other means. Check that its firmware executes this; `router explain {route}` has `obeyed`.",
         "deadman_disobeyed",
     )
+    DEADMAN_ACTIVE = (
+        Level.WARNING,
+        "{route} is stopped by its deadman: no commands get through",
+        "Check that they are sent, and more often than the deadman's `timeout`: `router explain` says who sends them.",
+        "deadman_active",
+    )
+    ENDPOINT_SILENT = (
+        Level.WARNING,
+        "{endpoint} is silent",
+        "Check its power, cable or radio, and address: `ping {address}`, `tcpdump -n udp and host {address}`.",
+        "endpoint_silence_seconds",  # the threshold is the endpoint's `stale_after`
+    )
     COMMANDS_DROPPED = (
         Level.CRITICAL,
         "commands for {target} are dropped: {reason}",
         "",
         "messages_dropped",
         0.05,
-    )
-    ENDPOINT_SILENT = (
-        Level.WARNING,
-        "{endpoint} is silent",
-        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what arrives.",
-        "endpoint_last_seen_timestamp_seconds",  # the threshold is the endpoint's `stale_after`
-    )
-    DEADMAN_ACTIVE = (
-        Level.WARNING,
-        "commands of {route} do not get through: its deadman sends in their place",
-        "Check that they arrive often enough, and that both clocks agree; `router explain` says who sends them.",
-        "deadman_active",
     )
     PUBLISH_STALLED = (
         Level.WARNING,
@@ -134,7 +134,7 @@ class Kind(enum.Enum):
     )
     UNHANDLED_CASE = (
         Level.WARNING,
-        "{payload_case} is received but has no route",
+        "{payload_case} is received, but no route accepts it",
         "Write a route for it, or `ignore: reason`; `router tap` shows it.",
         "unhandled",
     )
@@ -160,6 +160,7 @@ class Kind(enum.Enum):
         Level.INFO,
         "{endpoint} has not been heard since the router started",
         ENDPOINT_SILENT[2],
+        "endpoint_unheard_seconds",  # the threshold is the endpoint's `stale_after`
     )
     GATEWAY_CLIENT_SLOW = (
         Level.INFO,

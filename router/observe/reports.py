@@ -43,6 +43,11 @@ class Reporter:
         with self._lock:
             return self._mismatches.copy()
 
+    def forget_mismatches(self) -> None:
+        """Forget what an earlier table rejected."""
+        with self._lock:
+            self._mismatches.clear()
+
     def _remember(self, mismatch: Mismatch) -> None:
         with self._lock:
             self._mismatches.pop(mismatch, None)
