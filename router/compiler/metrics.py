@@ -212,6 +212,9 @@ GATEWAY_DROP_REASONS: Mapping[str, str] = {
 INTENDED_REASONS = frozenset({"rate_limited", "ignored"})
 """Drops and rejections that the table requests: they are not reported."""
 
+UNSENT_REASONS = ("send_error", "send_buffer_full", "queue_full")
+"""The DROP_REASONS that follow when an endpoint does not answer."""
+
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """The DROP_REASONS that apply to messages of clients."""
 

@@ -13,7 +13,7 @@ from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from router.compiler.metrics import INTENDED_REASONS, UNKNOWN_CASE, Mismatch
+from router.compiler.metrics import INTENDED_REASONS, UNKNOWN_CASE, UNSENT_REASONS, Mismatch
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
@@ -59,9 +59,6 @@ _STALE_FROM_ROS = (
     "slow."
 )
 """ROS messages have the time when they were sent; the age of a datagram counts from its arrival."""
-
-_UNSENT = ("send_error", "send_buffer_full", "queue_full")
-"""Reasons of losses that follow when an endpoint does not answer."""
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
@@ -206,7 +203,7 @@ class Look:
         """By endpoint that messages could not be sent to, how many of which route."""
         unsent: dict[str, Counter[str]] = defaultdict(Counter)
         for (route, target, reason), count in self.grown(Kind.MESSAGES_DROPPED.metric):
-            if target in self.program.table.endpoints and reason in _UNSENT:
+            if target in self.program.table.endpoints and reason in UNSENT_REASONS:
                 unsent[target][route] += count
         return unsent
 
@@ -323,7 +320,7 @@ class Look:
         dropped = sorted(self.grown(Kind.MESSAGES_DROPPED.metric), key=lambda found: -found[1])
         for (of, target, reason), count in dropped:
             if of == self._owner(route) and reason not in _NO_LOSS and self._are_commands(of, target):
-                if target in self._stale and reason in _UNSENT:
+                if target in self._stale and reason in UNSENT_REASONS:
                     return f", and {target} does not answer", self._remedy_for_silence(target)
                 return f", and {count} for {target} were dropped: {reason}", self._remedy_for_loss(reason, of, target)
         return "", ""
@@ -384,7 +381,7 @@ class Look:
         if kind is Kind.UNHANDLED_CASE:
             return labels["payload_case"] == UNKNOWN_CASE
         target = labels.get("target", "")
-        return labels.get("reason") in _UNSENT and target in self._stale and self.was_heard(target)
+        return labels.get("reason") in UNSENT_REASONS and target in self._stale and self.was_heard(target)
 
     def _loss(self, kind: Kind, labels: Mapping[str, str], counts: Counter[str]) -> Problem:
         routes = tuple(route for route, _ in counts.most_common() if route)
@@ -398,7 +395,7 @@ class Look:
         elif reason == "unknown_case":
             more += f": {who}" if (who := self._unknown(labels["listener"])) else ""
         problem = self._problem(kind, labels, more, routes)
-        if (target := labels.get("target", "")) in self._stale and reason in _UNSENT:
+        if (target := labels.get("target", "")) in self._stale and reason in UNSENT_REASONS:
             more += f": {target} has not been heard since the router started"
             return problem._replace(more=more, remedy=self._remedy_for_silence(target))
         if kind in DROPS:
