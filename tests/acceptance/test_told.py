@@ -25,7 +25,7 @@ http: {{address: 127.0.0.1:9108}}
 listen: {{rover: {{address: 0.0.0.0:5000}}}}
 endpoints:
   driving_board: {{address: 10.78.1.222:8, kind: board, stale_after: 1s}}
-  basestation: {{address: 10.78.2.10:PORT, kind: basestation}}
+  basestation: {{address: 10.78.2.10:9000, kind: basestation, source_port: PORT}}
 routes:
   drive_diag: {{source: driving_board, destinations: basestation}}
   manual_drive:
@@ -92,5 +92,9 @@ def test_after_a_reload_that_repairs_an_address_nobody_is_said_to_use_another(si
 
 def test_who_sends_a_case_without_a_route_is_named(site: Rover) -> None:
     with site.router(TABLE.replace("PORT", "9000")):
-        site.board.sendto(UNHANDLED, LAN)
-        wait_until(lambda: "driving_board (10.78.1.222) sent it" in str(problems(site)), "the sender")
+
+        def is_named() -> bool:
+            site.board.sendto(UNHANDLED, LAN)
+            return "driving_board (10.78.1.222) sent it" in str(problems(site))
+
+        wait_until(is_named, "the sender")
