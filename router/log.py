@@ -249,4 +249,3 @@ class FloodLog:
             for flood in self._floods.values():
                 if flood.is_due(now) or (final and flood.pending):
                     flood.summarise(now)
-

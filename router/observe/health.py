@@ -14,6 +14,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import INTENDED_REASONS, UNKNOWN_CASE, UNSENT_REASONS, Mismatch
+from router.observe.bursts import Burst
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
@@ -55,8 +56,8 @@ REMEDIES: Mapping[str, str] = {
 """Remedies by the reason of a loss."""
 
 _STALE_FROM_ROS = (
-    "They are older than `ttl`: their node sends them late, the router is behind, or the clock of the node's computer is "
-    "slow."
+    "They are older than `ttl`: their node sends them late, the router is behind, or the clock of the node's computer "
+    "is slow."
 )
 """ROS messages have the time when they were sent; the age of a datagram counts from its arrival."""
 
@@ -95,9 +96,10 @@ _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, s
 class Look:
     """The state of a router. `snapshots` are those of the last WINDOW seconds, oldest first.
 
-    Times in seconds. `standing`: how long the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
-    `mismatches`: recent senders of messages that no route accepts from them, judged by this program. `replies`: what boards have shown
-    about the brakes of active deadmen.
+    Times in seconds. `standing`: how long the receive thread has made no progress. `tripped`: how long each active
+    deadman has been sending, by route. `mismatches`: recent senders of messages that no route accepts from them, judged
+    by this program. `replies`: what boards have shown about the brakes of active deadmen. `bursts`: recent bursts of
+    commands, by route.
     """
 
     program: Program
@@ -106,6 +108,7 @@ class Look:
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
     replies: Replies = field(default_factory=dict)
+    bursts: Mapping[str, Burst] = field(default_factory=dict)
 
     @property
     def now(self) -> Snapshot:
@@ -141,6 +144,7 @@ class Look:
             self._tripped(),
             self._disobeyed(),
             self._waiting(),
+            self._burst(),
             *map(self._above, _GAUGES),
             *map(self._lost, _LOSSES),
         )
@@ -351,6 +355,12 @@ class Look:
         waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
         if waiting > Kind.MESSAGES_WAITING.threshold:
             yield self._problem(Kind.MESSAGES_WAITING, {}, f", at least {waiting:.0f}")
+
+    def _burst(self) -> Iterator[Problem]:
+        """Yield routes whose commands may have been stored on their way."""
+        for route, burst in self.bursts.items():
+            more = f", {burst.messages} in {burst.seconds:.1f} s after {age_text(burst.silence)}"
+            yield self._problem(Kind.COMMAND_BURST, {"route": route}, more, (route,))
 
     def _above(self, kind: Kind) -> Iterator[Problem]:
         for values, value in self.now.counts(kind.metric).items():

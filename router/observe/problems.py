@@ -57,7 +57,7 @@ class Kind(enum.Enum):
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",
-        "Stop the rover by other means. Then check power and cable of {destination}, and what rejects datagrams to {address}.",
+        "Stop the rover by other means. Check power and cable of {destination}, and the firewall for {address}.",
         "deadman_send_errors",
     )
     DEADMAN_DISOBEYED = (
@@ -161,6 +161,12 @@ class Kind(enum.Enum):
         "{endpoint} has not been heard since the router started",
         ENDPOINT_SILENT[2],
         "endpoint_unheard_seconds",  # the threshold is the endpoint's `stale_after`
+    )
+    COMMAND_BURST = (
+        Level.INFO,
+        "{route} has received a burst of commands after a silence",
+        "A radio or switch may have stored them while its link was lost. They look new: switch off its buffer.",
+        "messages_received",
     )
     GATEWAY_CLIENT_SLOW = (
         Level.INFO,

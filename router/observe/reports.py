@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from router.clock import boottime_ns
 from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
@@ -123,12 +124,12 @@ class Reporter:
             logger.warning("no commands arrive; the deadman sends in their place", route=route)
         else:
             what = "commands arrive but are dropped; the deadman sends in their place"
-            values = {"route": route, "target": lost.target, "reason": lost.reason, "detail": lost.detail}
+            values: dict[str, Any] = {"target": lost.target, "reason": lost.reason, "detail": lost.detail}
             if lost.reason in UNSENT_REASONS:
                 self._unsent[route] = lost
-                self._floods.note(("tripped", route), logger.warning, what, **values)
+                self._floods.note(("tripped", route), logger.warning, what, route=route, **values)
             else:
-                logger.warning(what, **values)
+                logger.warning(what, route=route, **values)
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
         """Return the last command that was lost within the timeout, or None."""

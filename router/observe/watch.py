@@ -7,6 +7,7 @@ from collections import deque
 
 from router.clock import boottime_ns
 from router.log import logger
+from router.observe.bursts import Bursts
 from router.observe.health import PERIOD, WINDOW, Look
 from router.observe.problems import Kind
 from router.observe.running import Running
@@ -28,7 +29,7 @@ METRICS = {kind.metric for kind in Kind} | {
 
 
 class Watch:
-    """Keeps the last snapshots, and since when deadmen send and the receive thread is stuck.
+    """Keeps the last snapshots and bursts, and since when deadmen send and the receive thread is stuck.
 
     Thread-safe.
     """
@@ -37,6 +38,7 @@ class Watch:
         self._running = running
         self._snapshots: deque[Snapshot] = deque()
         self._tripped: dict[str, tuple[float, int]] = {}  # by route: number of trips, and when it was first seen
+        self._bursts = Bursts()
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
@@ -53,10 +55,15 @@ class Watch:
             while self._snapshots and latest.at - self._snapshots[0].at > WINDOW + PERIOD / 2:
                 self._snapshots.popleft()
             snapshots = (*self._snapshots, latest)
-            if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
+            if len(snapshots) == 1:
                 self._snapshots.append(latest)
+            elif latest.at - snapshots[-2].at > 0.9 * PERIOD:
+                driven = [route.name for route in program.table.routes if route.deadman and route.sources]
+                self._bursts.note(snapshots[-2], latest, driven)
+                self._snapshots.append(latest)
+            bursts = self._bursts.recent(latest.at, WINDOW)
         recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
-        return Look(program, snapshots, self.standing(now), tripped, recent, self._running.replies())
+        return Look(program, snapshots, self.standing(now), tripped, recent, self._running.replies(), bursts)
 
     def standing(self, now: int) -> float:
         """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""

@@ -34,7 +34,7 @@ class Counting(FakeRunning):
 
     def __init__(self, program: Program) -> None:
         super().__init__(program)
-        self.now = self.shift = 0
+        self.now = self.shift = self.sent = 0
         self.silences = Silences(lambda: self.now, lambda: self.wall)
         self.watch = Watch(self)
         self.count("config_last_reload_successful", to=1)

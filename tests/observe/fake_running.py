@@ -44,12 +44,12 @@ def sim_program() -> Program:
 class FullSilences(Silences):
     """Endpoints are silent since their last datagram, however long ago this began to look."""
 
-    def __init__(self) -> None:
+    def __init__(self, began: int | None = None) -> None:
         super().__init__()
-        self.began = wall_ns()
+        self._began = began or wall_ns()
 
     def of(self, stamps: Mapping[str, int]) -> Mapping[str, float]:
-        return {endpoint: (wall_ns() - (stamp or self.began)) / 1e9 for endpoint, stamp in stamps.items()}
+        return {endpoint: (wall_ns() - (stamp or self._began)) / 1e9 for endpoint, stamp in stamps.items()}
 
 
 class FakeRunning:
@@ -68,7 +68,7 @@ class FakeRunning:
         self.lost = 0
         self.waiting: deque[Mirrored] = deque()
         self.counts = program.counters.fresh_counts()
-        self.silences = FullSilences()
+        self.silences: Silences = FullSilences()
         self._turns = 0
 
     def observe(self, *, is_observed: bool) -> None:

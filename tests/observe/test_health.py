@@ -6,6 +6,7 @@ import json
 import threading
 
 import pytest
+from structlog.testing import capture_logs
 
 from router.compiler import metrics
 from router.compiler.metrics import Mismatch
@@ -401,7 +402,9 @@ def test_an_operator_who_is_out_of_reach_is_named_for_as_long_as_that_lasts(rout
         lost_for(router, "imu_info", "basestation", 50 * number)
         found = router.look(1).problems
     stopped, silent = found
-    assert stopped.text.startswith("manual_drive is stopped by its deadman: no commands get through, and basestation is")
+    assert stopped.text.startswith(
+        "manual_drive is stopped by its deadman: no commands get through, and basestation is"
+    )
     assert silent.text.startswith("basestation is silent: last heard 7")
     assert ", and does not answer: 450 of imu_info for it lost in 10 s" in silent.text
 
@@ -429,7 +432,9 @@ def test_commands_that_are_dropped_are_told_as_the_cause_of_the_stop(router: Cou
     assert stopped.remedy == dropped.remedy == REMEDIES["mapping_error"]
 
 
-@pytest.mark.parametrize(("route", "remedy"), [("manual_drive", "waited in this computer"), ("drive_motor", "clock of")])
+@pytest.mark.parametrize(
+    ("route", "remedy"), [("manual_drive", "waited in this computer"), ("drive_motor", "clock of")]
+)
 def test_clocks_of_other_computers_matter_for_messages_of_ros_only(router: Counting, route: str, remedy: str) -> None:
     router.count("messages_dropped", route, "driving_board", "stale", to=9)
     [dropped] = router.look(1).problems
@@ -466,6 +471,42 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
     router.hear("sensor_board")
     router.look(1)
     assert router.look(0).silence["sensor_board"] == 1.0
+
+
+def drive(router: Counting, *numbers: int) -> list[Problem]:
+    """Receive these numbers of commands, one number per second; return the bursts after the last second."""
+    for number in numbers:
+        router.sent += number
+        router.count("messages_received", "manual_drive", "basestation", to=router.sent)
+        found = router.look(1).problems
+    return [problem for problem in found if problem.kind is Kind.COMMAND_BURST]
+
+
+def test_commands_that_were_stored_while_the_link_was_lost_are_told_once_with_their_number(router: Counting) -> None:
+    with capture_logs() as logged:
+        assert drive(router, 40, 41, 39, 40, 0, 0, 0, 0) == []
+        [burst] = drive(router, 190)
+        assert burst.kind.level is Level.INFO
+        assert burst.text.endswith("a burst of commands after a silence, 190 in 1.0 s after 4.0 s")
+        drive(router, 70, 40, 40)  # a burst may extend over two snapshots
+        assert drive(router, 40, 40, 40, 40, 40, 40, 40) == []
+    assert [line["event"] for line in logged if "silence" in line["event"]] == [
+        "many commands arrived at once after a silence: they may be old"
+    ]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (0, 0, 0, 200),  # how fast this sender usually is, is not known yet
+        (40, 40, 40, 40, 0, 0, 0, 40, 2, 0, 0, 60),
+        (40, 40, 40, 40, 0, 200),
+        (1, 1, 1, 1, 0, 0, 0, 8),
+    ],
+    ids=["first", "short driving", "no silence", "few"],
+)
+def test_other_driving_is_no_burst(router: Counting, numbers: tuple[int, ...]) -> None:
+    assert drive(router, *numbers) == []
 
 
 def test_what_explains_other_problems_comes_first(router: Counting) -> None:

@@ -18,8 +18,8 @@ from router.compiler.metrics import LATENCY_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
-from router.observe.silences import Silences
 from router.observe.running import Running
+from router.observe.silences import Silences
 from router.observe.watch import Health
 from router.table.addresses import Address
 

@@ -89,7 +89,9 @@ def test_a_deadman_that_trips_says_whether_commands_come_and_are_dropped(
 
 
 @pytest.mark.parametrize(("reason", "lines"), [("send_buffer_full", 2 + 2), ("mapping_error", 20)])
-def test_a_deadman_that_is_fed_by_commands_that_only_the_kernel_takes_is_told_in_summary(reason: str, lines: int) -> None:
+def test_a_deadman_that_is_fed_by_commands_that_only_the_kernel_takes_is_told_in_summary(
+    reason: str, lines: int
+) -> None:
     with capture_logs() as logged:
         reporter = Reporter(lambda _: None)
         for _ in range(10):

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from router.clock import wall_ns
 from router.compiler import check_table
 from router.observe import responses
 from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
 from tests.gateway.browser import Browser, Page
-from tests.observe.fake_running import FakeHealth, FakeRunning, served, sim_program
+from tests.observe.fake_running import FakeHealth, FakeRunning, FullSilences, served, sim_program
 
 pytestmark = pytest.mark.slow
 
@@ -274,7 +275,9 @@ def test_much_that_is_wrong_is_folded(running: FakeRunning, page: Page) -> None:
     page.until("document.querySelectorAll('#others li').length === 5")
 
 
-def test_a_rover_that_is_stopped_is_said_first_with_the_operator_who_is_silent(running: FakeRunning, page: Page) -> None:
+def test_a_rover_that_is_stopped_is_said_first_with_the_operator_who_is_silent(
+    running: FakeRunning, page: Page
+) -> None:
     running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
     running.count("endpoint_last_seen_timestamp_seconds", "basestation", to=time.time_ns() - 14 * 10**9)
     for route in ("manual_drive", "manual_arm"):
@@ -401,7 +404,7 @@ def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: F
     for endpoint in running.program.table.endpoints:
         running.count("endpoint_last_seen_timestamp_seconds", endpoint, to=0)
     page.until(f"{box('from:@sensor_board')}.innerText.includes('○ not heard yet')")
-    running.silences.began -= 60 * 10**9
+    running.silences = FullSilences(began=wall_ns() - 60 * 10**9)
     until_said(page, "has not been heard since the router started", "")
     assert page.text("#todo").startswith("All endpoints are silent: check this computer's network")
 
