@@ -73,9 +73,9 @@ _OWN = """\
 [Recordings](../guides/record-and-replay.md) and taps do not affect routing: datagrams that they miss are counted only
 here. A reload keeps all counters: the series of a removed route remain until the process ends, unless they are 0."""
 _LOG = """\
-The first drop of a kind (route, target, reason) is logged at once, further ones in at most one line per 10 s. That line
-shows the last drop, and the number of drops (`more`) in the `in_seconds` before it. So a flood may be over when its
-last line appears; metrics are up to date."""
+The first drop of a kind (route, target, reason) is logged at once, further ones in summaries after 10 s, 20 s, 40 s and
+so on up to 5 minutes. A summary shows the last drop, and the number of drops (`more`) in the `in_seconds` before it. So
+a flood may be over when its last line appears; metrics are up to date."""
 _DURATION = """\
 `router_route_duration_seconds` ends when a datagram has been forwarded and queued for the thread that publishes it on
 topics; for a message from ROS, when all targets are served. Its upper bounds, in microseconds:"""

@@ -26,6 +26,7 @@ Emit = Callable[..., None]
 LEVELS = ("debug", "info", "warning", "error")
 
 SUMMARY_INTERVAL_NS = 10_000_000_000
+LONGEST_INTERVAL_NS = 300_000_000_000
 MOST_KEYS = 1000
 
 
@@ -171,20 +172,42 @@ def _is_file(stream: TextIO) -> bool:
 
 
 class _Flood:
-    """Events of one kind: the time of the last line, and the number of events since."""
+    """Events of one kind: the times of the last line and the last event, and the number of events since that line."""
 
-    __slots__ = ("emit", "event", "last_line_ns", "pending", "values")
+    __slots__ = ("emit", "event", "interval_ns", "last_event_ns", "last_line_ns", "pending", "values")
 
-    def __init__(self, emit: Emit, event: str, values: dict[str, Any], last_line_ns: int, pending: int) -> None:
+    def __init__(self, emit: Emit, event: str, values: dict[str, Any], now: int, pending: int) -> None:
         self.emit = emit
         self.event = event
         self.values = values
-        self.last_line_ns = last_line_ns
+        self.interval_ns = SUMMARY_INTERVAL_NS
+        self.last_line_ns = self.last_event_ns = now
         self.pending = pending
+
+    def note(self, now: int, times: int, values: dict[str, Any]) -> None:
+        """Count events. After a pause the interval is the shortest one again."""
+        if now - self.last_event_ns >= SUMMARY_INTERVAL_NS:
+            self.interval_ns = SUMMARY_INTERVAL_NS
+        self.last_event_ns = now
+        self.pending += times
+        self.values = values
+
+    def is_due(self, now: int) -> bool:
+        """Return whether pending events are to be logged: after the interval, or sooner if no more have come."""
+        is_over = now - self.last_event_ns >= SUMMARY_INTERVAL_NS
+        return self.pending > 0 and now - self.last_line_ns >= (SUMMARY_INTERVAL_NS if is_over else self.interval_ns)
+
+    def summarise(self, now: int) -> None:
+        seconds = round((now - self.last_line_ns) / 1e9, 1)
+        self.emit(self.event, **self.values, more=self.pending, in_seconds=seconds)
+        self.pending, self.last_line_ns = 0, now
+        self.interval_ns = min(2 * self.interval_ns, LONGEST_INTERVAL_NS)
 
 
 class FloodLog:
-    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their count.
+    """Logs the first event of a kind at once, then summaries with the last event and their count.
+
+    The first summary comes after 10 s; while events go on, each comes after twice the time, up to 5 minutes.
 
     Thread-safe. Call `flush()` regularly, or the last events of a flood are not logged. Kinds beyond `MOST_KEYS` share
     a summary.
@@ -212,10 +235,9 @@ class FloodLog:
                 flood = self._floods.get(None)
                 key, event, values = None, "events of many further kinds", {}
             if flood is not None:
-                flood.values = values
-                flood.pending += times
-                if now - flood.last_line_ns >= SUMMARY_INTERVAL_NS:
-                    _summarise(flood, now)
+                flood.note(now, times, values)
+                if flood.is_due(now):
+                    flood.summarise(now)
                 return
             self._floods[key] = _Flood(emit, event, values, now, times - 1)
         emit(event, exc_info=exc_info, **values)
@@ -225,11 +247,5 @@ class FloodLog:
         now = self._clock_ns()
         with self._lock:
             for flood in self._floods.values():
-                if flood.pending and (final or now - flood.last_line_ns >= SUMMARY_INTERVAL_NS):
-                    _summarise(flood, now)
-
-
-def _summarise(flood: _Flood, now: int) -> None:
-    seconds = round((now - flood.last_line_ns) / 1e9, 1)
-    flood.emit(flood.event, **flood.values, more=flood.pending, in_seconds=seconds)
-    flood.pending, flood.last_line_ns = 0, now
+                if flood.is_due(now) or (final and flood.pending):
+                    flood.summarise(now)

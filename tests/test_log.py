@@ -70,6 +70,25 @@ def test_flush_tells_the_end_of_a_flood_when_it_is_due(lines: Lines) -> None:
     assert [values.get("more") for _, values in lines.written] == [None, 1]
 
 
+def test_what_goes_on_for_an_hour_is_told_less_and_less_often_and_soon_again_after_a_pause(lines: Lines) -> None:
+    for second in range(3600):
+        lines.now = second * 10**9
+        lines.note("drop")
+        lines.floods.flush()
+    assert len(lines.written) == 16
+    assert [values["in_seconds"] for _, values in lines.written[1:8]] == [10, 20, 40, 80, 160, 300, 300]
+    lines.now += SUMMARY_INTERVAL_NS
+    lines.floods.flush()  # over: the rest is told without waiting for the interval
+    assert 1 + sum(values.get("more", 0) for _, values in lines.written) == 3600
+    lines.now += SUMMARY_INTERVAL_NS
+    lines.note("drop")
+    assert len(lines.written) == 18
+    lines.note("drop")
+    lines.now += SUMMARY_INTERVAL_NS
+    lines.floods.flush()
+    assert len(lines.written) == 19
+
+
 def test_the_number_of_kinds_is_bounded(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log, "MOST_KEYS", 2)
     for kind in "abcde":

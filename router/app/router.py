@@ -28,6 +28,7 @@ from router.net.udp import Listener
 from router.observe.obedience import Obedience, Replies
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
+from router.observe.silences import Silences
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, StopStack, background_threads
@@ -81,9 +82,10 @@ class Router:
             self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
         self._services = Services(self)
         self._keeper = keeper
-        self._reloader = Reloader(self._runtime, environ, self._watch, keeper)
+        self._reloader = Reloader(self._runtime, environ, self._replaced, keeper)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
+        self._silences = Silences()
         self._collector: tuple[Program, CountersCollector] | None = None
         self._open = StopStack()
 
@@ -208,6 +210,11 @@ class Router:
         else:
             self._services.deadman_released(route)
 
+    def _replaced(self) -> None:
+        """Follow a reload: the new table may accept what the old one rejected, and names other files and listeners."""
+        self._reporter.forget_mismatches()
+        self._watch()
+
     def _watch(self) -> None:
         """Watch the network interfaces of listeners, and the table's files if the table says so."""
         listeners = self.listeners.values()
@@ -260,7 +267,7 @@ class Router:
         }
         # Use this program's counters: those of the running program are adopted only once no thread is stuck.
         copies = partial(self._counts.copies, program.counters.size)
-        return CountersCollector(program.counters, copies, self._computed_series(), build)
+        return CountersCollector(program.counters, copies, self._computed_series(), self._silences, build)
 
 
 class Services:

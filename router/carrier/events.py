@@ -28,6 +28,7 @@ from router.declared import (
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
+_MISMATCHES = (Reason.UNKNOWN_CASE, Reason.UNHANDLED, Reason.SOURCE_MISMATCH)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +115,7 @@ class EventReader:
             return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))
         what = self._why_rejected(place, data, event.length)
         detail = sender + (f": {what}" if what else "")
-        mismatch = Mismatch(place, host, what) if event.reason == Reason.SOURCE_MISMATCH else None
+        mismatch = Mismatch(place, host, what) if event.reason in _MISMATCHES else None
         report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
         return CountedReport(event.counter, report)
 

@@ -101,6 +101,18 @@ METRICS = (
     Metric("endpoint_silences", "counter", ("endpoint",), "How often the endpoint was heard again after a silence."),
     Metric("endpoint_last_silence_seconds", "time", ("endpoint",), "How long the last such silence was."),
     Metric(
+        "endpoint_silence_seconds",
+        "number",
+        ("endpoint",),
+        "How long ago the endpoint last sent, by a clock that nobody sets; no series until it has sent.",
+    ),
+    Metric(
+        "endpoint_unheard_seconds",
+        "number",
+        ("endpoint",),
+        "How long the endpoint has not been heard since the router started; no series once it has sent.",
+    ),
+    Metric(
         "endpoint_stale_after_seconds", "number", ("endpoint", "kind"), "Silence after which the endpoint is stale."
     ),
     Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
@@ -232,6 +244,9 @@ GATEWAY_DROP_REASONS: Mapping[str, str] = {
 INTENDED_REASONS = frozenset({"rate_limited", "ignored"})
 """Drops and rejections that the table requests: they are not reported."""
 
+UNSENT_REASONS = ("send_error", "send_buffer_full", "queue_full")
+"""The DROP_REASONS that follow when an endpoint does not answer."""
+
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """The DROP_REASONS that apply to messages of clients."""
 
@@ -312,7 +327,10 @@ class Series(NamedTuple):
 
 
 class Mismatch(NamedTuple):
-    """A datagram from a host that is not a source of its payload case."""
+    """A datagram from a host that is not a source of its payload case.
+
+    `payload_case` may have no route for datagrams at all, or be a field that the envelope does not have: `field 77`.
+    """
 
     listener: str
     host: str
@@ -325,7 +343,7 @@ class Report:
     one in its datagram replaces) or `deadman` (of its own datagram).
 
     `place` is the route, or the listener for a reject or supersede, which have an empty `target`. `times` is the number
-    of such losses since the last report. `mismatch` is set for the reason `source_mismatch`.
+    of such losses since the last report. `mismatch` is set if no route accepts this payload case from there.
     """
 
     kind: str

@@ -18,7 +18,7 @@ from router.observe import problems
 from router.observe.health import PERIOD, Look
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
-from router.observe.watch import LAST_SEEN, Health
+from router.observe.watch import Health
 from router.table.model import Endpoint, Route
 from router.threads import Thread, background_threads, join_or_abandon
 from router.values import age_text
@@ -140,8 +140,7 @@ class Report:
             *((f"dropped: {reason}", n) for reason, n in self._dropped_for(name)),
         ]
         sends = any(source.value == name for route in routes for source in route.sources)
-        has_sent = self._look.now.total(LAST_SEEN, name)
-        well = "sends" if has_sent else "nothing received yet" if sends else "is not expected to send"
+        well = "sends" if self._look.was_heard(name) else "nothing received yet" if sends else "is not expected to send"
         if any(name in away for away in self._look.away.values()):
             well = "is silent: nobody drives"
         problems = self._labelled(name, *_TO_ENDPOINTS)
@@ -210,9 +209,9 @@ _TO_ENDPOINTS = ("endpoint", "target", "destination")
 def _status(
     name: str, host: str, problems: Iterable[Problem], well: str, values: Iterable[tuple[str, object]]
 ) -> Status:
-    """Make a status. The worst problem gives the level; the message lists all."""
-    found = sorted(problems, key=lambda problem: -_SEVERITY.index(_level(problem)))
-    level = _level(found[0]) if found else Level.OK
+    """Make a status. The worst problem gives the level; the message lists all, in their order."""
+    found = list(problems)
+    level = max(map(_level, found), key=_SEVERITY.index, default=Level.OK)
     message = "; ".join(problem.text for problem in found) or well
     return Status(level, name, message, host, tuple((key, str(value)) for key, value in values))
 

@@ -21,9 +21,12 @@ from router.compiler.metrics import (
     SHARES_NODE,
     SHARES_TOPIC,
     SUBSCRIBER,
+    UNKNOWN_CASE,
+    UNSENT_REASONS,
     Mismatch,
     only,
 )
+from router.observe.bursts import Burst
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.snapshot import SERIES, Labels, Snapshot
@@ -44,9 +47,14 @@ RETURNED = 300
 
 REMEDIES: Mapping[str, str] = {
     "send_error": "The network rejects them, or nothing listens there: check that the receiver runs, and its address.",
-    "send_buffer_full": "The network is too slow for them: route less to this target.",
+    "send_buffer_full": (
+        "{target} does not answer: check power, cable and address. If it answers, the network is too slow: route less."
+    ),
     "queue_full": "They exceed `bandwidth`, or a thread is behind: route less to this target, or raise the bandwidth.",
-    "stale": "They are older than `ttl`: check the link, and that the clocks of both computers agree.",
+    "stale": (
+        "They waited in this computer for longer than `ttl`: the router was stopped, or is behind (`router top`); or "
+        "`bandwidth` is too small."
+    ),
     "publish_error": "The ROS middleware rejects them: see the log for the reason.",
     "mapping_error": "The mapping fails on these values, for example dividing by zero: see `router explain`.",
     "non_finite": "A value is NaN or infinite: check what the sender measures.",
@@ -67,6 +75,12 @@ REMEDIES: Mapping[str, str] = {
     "refused": "The log names them, with the reason. If the table has them with another type, exclude them.",
 }
 """Remedies by the reason of a loss, or the state of a gateway's topic."""
+
+_STALE_FROM_ROS = (
+    "They are older than `ttl`: their node sends them late, the router is behind, or the clock of the node's computer "
+    "is slow."
+)
+"""ROS messages have the time when they were sent; the age of a datagram counts from its arrival."""
 
 _MORE: Mapping[Kind, str] = {
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
@@ -99,6 +113,7 @@ _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
     "`router tap --only rejected` shows what it sends."
 )
+_FROM_TOPIC = "Have it send what a route accepts, or write a route for {payload_case} with this `source`."
 _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
@@ -106,19 +121,19 @@ _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, s
 class Look:
     """The state of a router. `snapshots` are those of the last WINDOW seconds, oldest first.
 
-    Times in seconds. `silence`: how long each endpoint has been silent, or has not been heard yet. `standing`: how long
-    the receive thread has made no progress. `tripped`: how long each active deadman has been sending, by route.
-    `mismatches`: recent senders of messages that no route accepts from them. `replies`: what boards have shown
-    about the brakes of active deadmen. `returned`: how long ago each endpoint was heard again after its last silence.
+    Times in seconds. `standing`: how long the receive thread has made no progress. `tripped`: how long each active
+    deadman has been sending, by route. `mismatches`: recent senders of messages that no route accepts from them, judged
+    by this program. `replies`: what boards have shown about the brakes of active deadmen. `bursts`: recent bursts of
+    commands, by route. `returned`: how long ago each endpoint was heard again after its last silence.
     """
 
     program: Program
     snapshots: Sequence[Snapshot]
-    silence: Mapping[str, float]
     standing: float
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
     replies: Replies = field(default_factory=dict)
+    bursts: Mapping[str, Burst] = field(default_factory=dict)
     returned: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -138,6 +153,15 @@ class Look:
                 yield labels, int(value - before)
 
     @cached_property
+    def silence(self) -> Mapping[str, float]:
+        """How long each endpoint has been silent, or has not been heard yet."""
+        metrics = (Kind.ENDPOINT_NEVER_HEARD.metric, Kind.ENDPOINT_SILENT.metric)
+        return {name: seconds for metric in metrics for (name,), seconds in self.now.counts(metric).items()}
+
+    def was_heard(self, endpoint: str) -> bool:
+        return (endpoint,) in self.now.counts(Kind.ENDPOINT_SILENT.metric)
+
+    @cached_property
     def problems(self) -> tuple[Problem, ...]:
         """All problems, in the order of kinds."""
         found = chain(
@@ -149,6 +173,7 @@ class Look:
             self._waiting(),
             self._mistyped(),
             self._other_routers(),
+            self._burst(),
             *map(self._above, _GAUGES),
             *map(self._lost, _LOSSES),
         )
@@ -159,9 +184,14 @@ class Look:
     def halted(self) -> frozenset[str]:
         """The routes that nobody drives.
 
-        Their deadman has been sending for a long time, reaches its endpoints, and no command is dropped.
+        Their deadman has been sending for a long time, reaches its endpoints, no command is dropped or rejected, and
+        no sender of commands is out of reach.
         """
-        failing = {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
+        rejected = {each.payload_case for each in self.mismatches if self._expected(each)}
+        lost = self._stale & self._unsent.keys()
+        failing = {route.name for route in self.program.table.routes if route.case.value in rejected}
+        failing |= {route for route, names in self._sources.items() if names & lost}
+        failing |= {labels[0] for labels, _ in self.grown(Kind.DEADMAN_CANNOT_SEND.metric)}
         for labels, _ in self.grown(Kind.MESSAGES_DROPPED.metric):
             named = dict(zip(SERIES[Kind.MESSAGES_DROPPED.metric], labels, strict=True))
             if named["reason"] not in _NO_LOSS:
@@ -170,10 +200,15 @@ class Look:
 
     @cached_property
     def away(self) -> Mapping[str, Sequence[str]]:
-        """By halted route, the senders of its commands that are silent because nobody drives. Boards do not count."""
+        """By halted route, the senders of its commands that are silent because nobody drives.
+
+        Boards do not count, nor does a sender that is out of reach or has another address.
+        """
         endpoints = self.program.table.endpoints
         away = {
-            name for name in self._stale if endpoints[name].kind is not EndpointKind.BOARD and self._was_heard(name)
+            name
+            for name in self._stale - self._unsent.keys()
+            if endpoints[name].kind is not EndpointKind.BOARD and self.was_heard(name) and not self._in_place_of(name)
         }
         return {route: sorted(away & self._sources.get(route, set())) for route in sorted(self.halted)}
 
@@ -196,8 +231,14 @@ class Look:
     def _stale(self) -> set[str]:
         return {name for name, limit in self._limits.items() if self.silence.get(name, 0.0) > limit}
 
-    def _was_heard(self, endpoint: str) -> bool:
-        return bool(self.now.total(Kind.ENDPOINT_SILENT.metric, endpoint))
+    @cached_property
+    def _unsent(self) -> Mapping[str, Counter[str]]:
+        """By endpoint that messages could not be sent to, how many of which route."""
+        unsent: dict[str, Counter[str]] = defaultdict(Counter)
+        for (route, target, reason), count in self.grown(Kind.MESSAGES_DROPPED.metric):
+            if target in self.program.table.endpoints and reason in UNSENT_REASONS:
+                unsent[target][route] += count
+        return unsent
 
     def _states(self) -> Iterator[Problem]:
         if self.standing > Kind.RECEIVE_STUCK.threshold:
@@ -214,19 +255,34 @@ class Look:
         held = set(chain.from_iterable(self._sources.get(route, ()) for route in self.tripped))
         for name in sorted(silent - away, key=lambda name: (name not in held, name)):
             kind, more = Kind.ENDPOINT_NEVER_HEARD, ""
-            if self._was_heard(name):
+            if self.was_heard(name):
                 kind, more = Kind.ENDPOINT_SILENT, f": last heard {age_text(self.silence[name])} ago"
+                if lost := self._unsent.get(name):
+                    more += f", and does not answer: {self._amount(lost)} for it lost in {self._span}"
             routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
             problem = self._problem(kind, {"endpoint": name}, more, routes)
             if (sender := self._in_place_of(name)) is not None:
-                remedy = _OTHER_ADDRESS.format(endpoint=name, address=self._host(name), sender=sender)
                 labels = {"endpoint": name, "sender": sender}
-                problem = problem._replace(
-                    labels=labels, more=f"{more}, while {sender} sends its messages", remedy=remedy
-                )
-            elif len(silent) == len(self._limits) > 1:
-                problem = problem._replace(remedy=_ALL_SILENT)
-            yield problem
+                problem = problem._replace(labels=labels, more=f"{more}, while {sender} sends its messages")
+            yield problem._replace(remedy=self._remedy_for_silence(name))
+
+    def _remedy_for_silence(self, endpoint: str) -> str:
+        address = self._host(endpoint)
+        if (sender := self._in_place_of(endpoint)) is not None:
+            return _OTHER_ADDRESS.format(endpoint=endpoint, address=address, sender=sender)
+        if len(self._stale) == len(self._limits) > 1:
+            return _ALL_SILENT
+        return Kind.ENDPOINT_SILENT.remedy.format(address=address)
+
+    @property
+    def _span(self) -> str:
+        return f"{max(self.seconds, 1):.0f} s"
+
+    def _amount(self, counts: Counter[str]) -> str:
+        """Return a number of losses with the routes that have most of them."""
+        routes = [route for route, _ in counts.most_common() if route]
+        of = f" of {', '.join(routes[:_NAMED])}" if routes else ""
+        return f"{counts.total()}{of}" + (f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else "")
 
     def _returned(self) -> Iterator[Problem]:
         """Yield endpoints that were silent a while ago."""
@@ -249,13 +305,21 @@ class Look:
         hosts = (each.host for each in sorted(self.mismatches) if self._expected(each) == [endpoint])
         return next((host for host in hosts if host != self._host(endpoint)), None)
 
+    def _name_of(self, host: str) -> str:
+        """Return the host with the name of its endpoint, if it has one."""
+        found = (name for name in self.program.table.endpoints if self._host(name) == host)
+        return next((f"{name} ({host})" for name in found), host)
+
+    def _senders(self, payload_case: str) -> list[str]:
+        """Return who has recently sent messages of this case, which no route accepts from them."""
+        return [self._name_of(each.host) for each in sorted(self.mismatches) if each.payload_case == payload_case]
+
     def _mismatched(self, listener: str) -> tuple[str, tuple[str, ...]]:
         """Describe who sends messages expected from others to a listener; also return the routes that reject them."""
         found = sorted(each for each in self.mismatches if each.listener == listener and self._expected(each))
-        names = {self._host(endpoint.name): endpoint.name for endpoint in self.program.table.endpoints.values()}
         sentences: dict[str, None] = {}
         for each in found:
-            who = f"{names[each.host]} ({each.host})" if each.host in names else each.host
+            who = self._name_of(each.host)
             expected = self._expected(each)
             if each.host in map(self._host, expected):
                 sentences[f"{who} uses another port or listener than the table says"] = None
@@ -264,19 +328,43 @@ class Look:
                 sentences[f"{who} sends messages expected from {others}"] = None
         cases = {each.payload_case for each in found}
         routes = tuple(route.name for route in self.program.table.routes if route.case.value in cases)
-        more = f"; and {len(sentences) - _NAMED} more" if len(sentences) > _NAMED else ""
-        return "; ".join([*sentences][:_NAMED]) + more, routes
+        return _few([*sentences]), routes
+
+    def _unknown(self, listener: str) -> str:
+        """Describe who sends payloads to a listener that the envelope does not have."""
+        known = self.program.envelope.cases
+        found = sorted(each for each in self.mismatches if each.listener == listener and each.payload_case not in known)
+        return _few([f"{self._name_of(each.host)} sends {each.payload_case}" for each in found])
 
     def _tripped(self) -> Iterator[Problem]:
-        """Yield the deadmen that send in place of commands."""
+        """Yield the deadmen that send in place of commands, with the cause."""
         for route, seconds in self.tripped.items():
-            kind, more = Kind.DEADMAN_ACTIVE, ""
+            kind, more, remedy = Kind.DEADMAN_ACTIVE, *self._cause(route)
             if route in self.halted:
-                kind, more = Kind.HALTED, f" for {age_text(seconds)}"
+                kind, more, remedy = Kind.HALTED, f" for {age_text(seconds)}", ""
                 if silent := self.away[route]:
                     more += f", and {' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} silent"
             more += "".join(f"; {board} stopped after {time:.2f} s" for board, time in self._stopped(route))
-            yield self._problem(kind, {"route": route}, more, (self._owner(route),))
+            problem = self._problem(kind, {"route": route}, more, (self._owner(route),))
+            yield problem._replace(remedy=remedy or problem.remedy)
+
+    def _cause(self, route: str) -> tuple[str, str]:
+        """Return why commands of a route do not get through, and the remedy, as far as they are known."""
+        sources = self._sources.get(route, set()) - {ANY}
+        for name in sorted(sources):
+            if (sender := self._in_place_of(name)) is not None:
+                return f", while {sender} sends those of {name}", self._remedy_for_silence(name)
+        if sources and sources <= self._stale:
+            names = sorted(sources)
+            verb = "is" if len(names) == 1 else "are"
+            return f", and {' and '.join(names)} {verb} silent", self._remedy_for_silence(names[0])
+        dropped = sorted(self.grown(Kind.MESSAGES_DROPPED.metric), key=lambda found: -found[1])
+        for (of, target, reason), count in dropped:
+            if of == self._owner(route) and reason not in _NO_LOSS and self._are_commands(of, target):
+                if target in self._stale and reason in UNSENT_REASONS:
+                    return f", and {target} does not answer", self._remedy_for_silence(target)
+                return f", and {count} for {target} were dropped: {reason}", self._remedy_for_loss(reason, of, target)
+        return "", ""
 
     def _stopped(self, route: str) -> Iterator[tuple[str, float]]:
         """Yield the boards that have obeyed the deadman of a route, with their stopping times in seconds."""
@@ -330,6 +418,12 @@ class Look:
             routes = tuple(plan.route for topic in topics for plan in self.program.outbound.get(topic, ()))
             yield self._problem(Kind.OTHER_ROUTER, {"host": host, "process": process}, more, routes)
 
+    def _burst(self) -> Iterator[Problem]:
+        """Yield routes whose commands may have been stored on their way."""
+        for route, burst in self.bursts.items():
+            more = f", {burst.messages} in {burst.seconds:.1f} s after {age_text(burst.silence)}"
+            yield self._problem(Kind.COMMAND_BURST, {"route": route}, more, (route,))
+
     def _above(self, kind: Kind) -> Iterator[Problem]:
         for values, value in self.now.counts(kind.metric).items():
             labels = dict(zip(SERIES[kind.metric], values, strict=True))
@@ -338,29 +432,76 @@ class Look:
                 yield self._problem(kind, labels, _MORE.get(kind, "").format(value), routes)
 
     def _lost(self, kind: Kind) -> Iterator[Problem]:
-        """Yield unintended losses of the last seconds, summed over the labels that the words do not contain."""
+        """Yield unintended losses of the last seconds, summed over the labels that the words do not contain.
+
+        Losses towards a silent endpoint are left out where its silence is a problem, which names them.
+        """
         sums: dict[Labels, Counter[str]] = defaultdict(Counter)
         for metric in (kind.metric, *(_ALSO_LOST if kind is Kind.RECORDING_INCOMPLETE else ())):
             for values, count in self.grown(metric):
                 labels = dict(zip(SERIES[metric], values, strict=True))
-                if labels.get("reason") not in _NO_LOSS and (kind not in DROPS or kind is self._drop(labels)):
+                is_of_kind = kind not in DROPS or kind is self._drop(labels)
+                if is_of_kind and labels.get("reason") not in _NO_LOSS and not self._is_told(kind, labels):
                     route = self._owner(labels.get("route", ""))
                     sums[tuple(labels[label] for label in kind.labels)][route] += count
         for values, counts in sums.items():
-            if (count := sum(counts.values())) / self.seconds > kind.threshold:
-                labels = dict(zip(kind.labels, values, strict=True))
-                routes = tuple(route for route, _ in counts.most_common() if route)
-                of = f" of {', '.join(routes[:_NAMED])}" if routes and "route" not in labels else ""
-                others = f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else ""
-                more = f", {count}{of}{others} in {max(self.seconds, 1):.0f} s"
-                if labels.get("reason") == "source_mismatch" and labels["listener"] not in self.program.table.gateways:
-                    who, routes = self._mismatched(labels["listener"])
-                    more += f": {who}" if who else ""
-                yield self._problem(kind, labels, more, routes)
+            if counts.total() / self.seconds > kind.threshold:
+                yield self._loss(kind, dict(zip(kind.labels, values, strict=True)), counts)
+
+    def _is_told(self, kind: Kind, labels: Mapping[str, str]) -> bool:
+        """Return whether another problem names this loss."""
+        if kind is Kind.UNHANDLED_CASE:
+            return labels["payload_case"] == UNKNOWN_CASE
+        target = labels.get("target", "")
+        return labels.get("reason") in UNSENT_REASONS and target in self._stale and self.was_heard(target)
+
+    def _loss(self, kind: Kind, labels: Mapping[str, str], counts: Counter[str]) -> Problem:
+        routes = tuple(route for route, _ in counts.most_common() if route)
+        amount = str(counts.total()) if "route" in labels else self._amount(counts)
+        more, reason = f", {amount} in {self._span}", labels.get("reason", "")
+        if kind is Kind.UNHANDLED_CASE:
+            return self._unhandled(labels, more)
+        if reason == "source_mismatch" and labels["listener"] not in self.program.table.gateways:
+            who, routes = self._mismatched(labels["listener"])
+            more += f": {who}" if who else ""
+        elif reason == "unknown_case":
+            more += f": {who}" if (who := self._unknown(labels["listener"])) else ""
+        problem = self._problem(kind, labels, more, routes)
+        if (target := labels.get("target", "")) in self._stale and reason in UNSENT_REASONS:
+            more += f": {target} has not been heard since the router started"
+            return problem._replace(more=more, remedy=self._remedy_for_silence(target))
+        if kind in DROPS:
+            remedies = dict.fromkeys(self._remedy_for_loss(reason, route, target) for route in routes)
+            return problem._replace(remedy=" ".join(remedies))
+        return problem
+
+    def _unhandled(self, labels: Mapping[str, str], more: str) -> Problem:
+        """Return the problem of a payload case that no route accepts from endpoints, with its senders."""
+        case = labels["payload_case"]
+        routes = [route for route in self.program.table.routes if route.case.value == case]
+        topics = list(dict.fromkeys(topic.topic.value for route in routes for topic in route.source_topics))
+        if topics:
+            more += f": it is accepted only from {'topic' if len(topics) == 1 else 'topics'} {' and '.join(topics)}"
+        if senders := self._senders(case):
+            more += f"{'; ' if topics else ': '}{_few(senders)} sent it"
+        problem = self._problem(Kind.UNHANDLED_CASE, labels, more, tuple(route.name for route in routes))
+        return problem._replace(remedy=_FROM_TOPIC.format_map(labels)) if topics else problem
+
+    def _remedy_for_loss(self, reason: str, route: str, target: str) -> str:
+        if reason == "stale" and route in self._from_ros:
+            return _STALE_FROM_ROS
+        return REMEDIES.get(reason, "").format(target=target)
+
+    @cached_property
+    def _from_ros(self) -> set[str]:
+        """The routes whose messages have the time when they were sent."""
+        return {route.name for route in self.program.table.routes if route.is_outbound}
 
     def _drop(self, labels: Mapping[str, str]) -> Kind:
-        are_commands = self.program.counters.are_commands(labels["route"], labels["target"])
-        return Kind.COMMANDS_DROPPED if are_commands else Kind.MESSAGES_DROPPED
+        return Kind.COMMANDS_DROPPED if self._are_commands(labels["route"], labels["target"]) else Kind.MESSAGES_DROPPED
+
+    def _are_commands(self, route: str, target: str) -> bool:
+        return self.program.counters.are_commands(route, target)
 
     def _owner(self, route: str) -> str:
         """Return the gateway of a client's deadman, whose route is called GATEWAY:TOPIC; else the route itself."""
@@ -375,3 +516,7 @@ class Look:
             address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
         remedy = kind.remedy or REMEDIES.get(labels.get("reason") or labels.get("state", ""), "")
         return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)
+
+
+def _few(texts: Sequence[str]) -> str:
+    return "; ".join(texts[:_NAMED]) + (f"; and {len(texts) - _NAMED} more" if len(texts) > _NAMED else "")

@@ -13,12 +13,17 @@ from prometheus_client.samples import Sample
 
 from router.compiler.metrics import COMMAND, HISTOGRAM_CELLS, METRICS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
+from router.observe.silences import Silences
 from router.observe.snapshot import BUCKETS, PREFIX
 
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
 _EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
+
+_LAST_SEEN = "endpoint_last_seen_timestamp_seconds"
+_SILENCES = {"endpoint_silence_seconds": True, "endpoint_unheard_seconds": False}
+"""Metrics of silences: whether they are of endpoints that were heard."""
 
 SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]
 """Returns the label values, in the metric's order, and the value of each current series."""
@@ -28,7 +33,8 @@ class CountersCollector(Collector):
     """Exports all series of the counters from the first scrape on, even at 0.
 
     `counts()` copies the list of each counting thread: a counter or level is their sum, a number or time their maximum.
-    `computed` has, by metric, functions that are called at each scrape instead. `build`: labels of `router_build_info`.
+    `computed` has, by metric, functions that are called at each scrape instead; `silences` measures those of endpoints.
+    `build`: labels of `router_build_info`.
     """
 
     def __init__(
@@ -36,10 +42,12 @@ class CountersCollector(Collector):
         counters: Counters,
         counts: Callable[[], Sequence[Sequence[int]]],
         computed: Mapping[str, SeriesFunction],
+        silences: Silences,
         build: Mapping[str, str],
     ) -> None:
         self._counts = counts
         self._computed = computed
+        self._silences = silences
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
@@ -64,6 +72,9 @@ class CountersCollector(Collector):
             for values, value in self._computed[metric.name]():
                 yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
             return
+        if metric.name in _SILENCES:
+            yield from self._silent(name, threads, were_heard=_SILENCES[metric.name])
+            return
         for labels, index in self._indexes[metric.name]:
             if metric.kind == "histogram":
                 cells = [thread[index : index + HISTOGRAM_CELLS] for thread in threads]
@@ -74,6 +85,13 @@ class CountersCollector(Collector):
                 yield Sample(name, labels, max(thread[index] for thread in threads))
             else:
                 yield Sample(name + suffix, labels, sum(thread[index] for thread in threads))
+
+    def _silent(self, name: str, threads: Sequence[Sequence[int]], *, were_heard: bool) -> Iterator[Sample]:
+        indexes = {labels["endpoint"]: index for labels, index in self._indexes[_LAST_SEEN]}
+        stamps = {endpoint: max(thread[index] for thread in threads) for endpoint, index in indexes.items()}
+        for endpoint, seconds in self._silences.of(stamps).items():
+            if bool(stamps[endpoint]) is were_heard:
+                yield Sample(name, {"endpoint": endpoint}, seconds)
 
 
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:

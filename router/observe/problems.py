@@ -31,7 +31,7 @@ class Level(enum.Enum):
 
 
 class Kind(enum.Enum):
-    """A kind of problem; kinds that explain others come first.
+    """A kind of problem, in the order in which they are shown: what stops the rover, its causes, other losses.
 
     `words` contain labels of `metric`. There is a problem while its value exceeds `threshold`: for losses per second,
     for times in seconds. `remedy` can also contain the `{address}` of what the labels name.
@@ -57,7 +57,7 @@ class Kind(enum.Enum):
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",
-        "Stop the rover by other means. Nothing listens at {address}, or the network rejects the datagrams.",
+        "Stop the rover by other means. Check power and cable of {destination}, and the firewall for {address}.",
         "deadman_send_errors",
     )
     DEADMAN_DISOBEYED = (
@@ -65,6 +65,18 @@ class Kind(enum.Enum):
         "{endpoint} does not obey the brake of {route}",
         "Stop the rover by other means. Check that its firmware executes this; `router explain {route}` has `obeyed`.",
         "deadman_disobeyed",
+    )
+    DEADMAN_ACTIVE = (
+        Level.WARNING,
+        "{route} is stopped by its deadman: no commands get through",
+        "Check that they are sent, and more often than the deadman's `timeout`: `router explain` says who sends them.",
+        "deadman_active",
+    )
+    ENDPOINT_SILENT = (
+        Level.WARNING,
+        "{endpoint} is silent",
+        "Check its power, cable or radio, and address: `ping {address}`, `tcpdump -n udp and host {address}`.",
+        "endpoint_silence_seconds",  # the threshold is the endpoint's `stale_after`
     )
     COMMANDS_DROPPED = (
         Level.CRITICAL,
@@ -84,18 +96,6 @@ class Kind(enum.Enum):
         "another router interferes with this one: process {process} on {host}",
         "Stop one of them: each brakes the rover when it starts and stops. If both are needed, separate their topics.",
         "other_routers",
-    )
-    ENDPOINT_SILENT = (
-        Level.WARNING,
-        "{endpoint} is silent",
-        "Check power, cable or radio, and `ping {address}`; `tcpdump -n udp and host {address}` shows what arrives.",
-        "endpoint_last_seen_timestamp_seconds",  # the threshold is the endpoint's `stale_after`
-    )
-    DEADMAN_ACTIVE = (
-        Level.WARNING,
-        "commands of {route} do not get through: its deadman sends in their place",
-        "Check that they arrive often enough, and that both clocks agree; `router explain` says who sends them.",
-        "deadman_active",
     )
     PUBLISH_STALLED = (
         Level.WARNING,
@@ -146,7 +146,7 @@ class Kind(enum.Enum):
     )
     UNHANDLED_CASE = (
         Level.WARNING,
-        "{payload_case} is received but has no route",
+        "{payload_case} is received, but no route accepts it",
         "Write a route for it, or `ignore: reason`; `router tap` shows it.",
         "unhandled",
     )
@@ -190,6 +190,13 @@ class Kind(enum.Enum):
         Level.INFO,
         "{endpoint} has not been heard since the router started",
         ENDPOINT_SILENT[2],
+        "endpoint_unheard_seconds",  # the threshold is the endpoint's `stale_after`
+    )
+    COMMAND_BURST = (
+        Level.INFO,
+        "{route} has received a burst of commands after a silence",
+        "A radio or switch may have stored them while its link was lost. They look new: switch off its buffer.",
+        "messages_received",
     )
     ENDPOINT_RETURNED = (
         Level.INFO,

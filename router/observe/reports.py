@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from router.clock import boottime_ns
-from router.compiler.metrics import Mismatch, Report
+from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
 from router.compiler.program import DeadmanPlan
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import why_not_sent
@@ -18,7 +19,7 @@ MOST_MISMATCHES = 64
 
 
 class Reporter:
-    """Logs the first report of a kind at once, then at most one line per 10 s, in a thread of its own."""
+    """Logs the first report of a kind at once, then summaries, in a thread of its own."""
 
     def __init__(self, address_of: Callable[[str], Address | None]) -> None:
         """`address_of` returns the address of an endpoint of the running table, None for any other target."""
@@ -28,6 +29,8 @@ class Reporter:
         self._lock = threading.Lock()
         self._lost: dict[tuple[str, str], tuple[int, Report]] = {}
         """The time and report of the last loss, by route and target."""
+        self._unsent: dict[str, Report] = {}
+        """By route whose deadman tripped because commands could not be sent: the last loss."""
         self._stopped = threading.Event()
         self._thread = Thread(self._summarise, "log")  # the start may fail
         self._thread.start()
@@ -42,6 +45,11 @@ class Reporter:
         """Return when each of the latest mismatches last occurred (boot clock, ns)."""
         with self._lock:
             return self._mismatches.copy()
+
+    def forget_mismatches(self) -> None:
+        """Forget what an earlier table rejected."""
+        with self._lock:
+            self._mismatches.clear()
 
     def _remember(self, mismatch: Mismatch) -> None:
         with self._lock:
@@ -102,14 +110,26 @@ class Reporter:
         self._floods.note(("bug", type(error)), found.emit, found.event, found.error)
 
     def deadman_changed(self, route: str, active: bool, plan: DeadmanPlan | None) -> None:
-        """Log that the deadman of a route has tripped or was released. `plan` is its plan in the running table."""
-        if not active:
+        """Log that the deadman of a route has tripped or was released. `plan` is its plan in the running table.
+
+        While a board does not answer, the kernel takes a few commands every 3 s, and drops them: each time the deadman
+        is released and trips again. So these two lines are summarised.
+        """
+        if not active and (unsent := self._unsent.pop(route, None)):
+            what = "commands are sent again; the deadman has stopped sending, but the target may not get them"
+            self._floods.note(("released", route), logger.warning, what, route=route, target=unsent.target)
+        elif not active:
             logger.warning("commands arrive again; the deadman has stopped sending", route=route)
-        elif lost := self._lost_for(plan):
-            what = "commands arrive but are dropped; the deadman sends in their place"
-            logger.warning(what, route=route, target=lost.target, reason=lost.reason, detail=lost.detail)
-        else:
+        elif (lost := self._lost_for(plan)) is None:
             logger.warning("no commands arrive; the deadman sends in their place", route=route)
+        else:
+            what = "commands arrive but are dropped; the deadman sends in their place"
+            values: dict[str, Any] = {"target": lost.target, "reason": lost.reason, "detail": lost.detail}
+            if lost.reason in UNSENT_REASONS:
+                self._unsent[route] = lost
+                self._floods.note(("tripped", route), logger.warning, what, route=route, **values)
+            else:
+                logger.warning(what, route=route, **values)
 
     def returned(self, endpoint: str, silence: float) -> None:
         """Log that an endpoint is heard again, after `silence` seconds: for example, a board was reset."""

@@ -5,20 +5,21 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from router.clock import boottime_ns, wall_ns
+from router.clock import boottime_ns
 from router.log import logger
+from router.observe.bursts import Bursts
 from router.observe.health import PERIOD, WINDOW, Look
 from router.observe.problems import Kind
 from router.observe.running import Running
 from router.observe.snapshot import DELIVERED, Snapshot, snapshot
 from router.threads import Thread, background_threads, join_or_abandon
 
-LAST_SEEN = Kind.ENDPOINT_SILENT.metric
 METRICS = {kind.metric for kind in Kind} | {
     "datagrams_received",
     "deadman_datagrams_sent",
     "deadman_trips",
     "endpoint_last_silence_seconds",
+    "endpoint_stale_after_seconds",
     "gateway_clients",
     "messages_filtered",
     "messages_received",
@@ -31,7 +32,7 @@ METRICS = {kind.metric for kind in Kind} | {
 
 
 class Watch:
-    """Keeps the last snapshots, and since when endpoints are silent, deadmen send and the receive thread is stuck.
+    """Keeps the last snapshots and bursts, and since when deadmen send and the receive thread is stuck.
 
     Thread-safe.
     """
@@ -39,18 +40,16 @@ class Watch:
     def __init__(self, running: Running) -> None:
         self._running = running
         self._snapshots: deque[Snapshot] = deque()
-        self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, also on the boot clock
         self._tripped: dict[str, tuple[float, int]] = {}  # by route: number of trips, and when it was first seen
         self._silences: dict[str, tuple[float, int]] = {}  # by endpoint: number of silences, likewise
+        self._bursts = Bursts()
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
-    def look(self, now: int, wall: int) -> Look:
-        """Return the state at `now` (boot clock) and `wall`, ns. One snapshot per PERIOD is kept for later calls."""
+    def look(self, now: int) -> Look:
+        """Return the state at `now` (boot clock, ns). One snapshot per PERIOD is kept for later calls."""
         with self._lock:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
-            earlier = int(self._snapshots[-1].at * 1e9) if self._snapshots else now
-            seen = {name: self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
             self._tripped = {
                 route: found if (found := self._tripped.get(route, (-1, 0)))[0] == trips else (trips, now)
                 for (route,), trips in latest.counts("deadman_trips").items()
@@ -66,12 +65,16 @@ class Watch:
             while self._snapshots and latest.at - self._snapshots[0].at > WINDOW + PERIOD / 2:
                 self._snapshots.popleft()
             snapshots = (*self._snapshots, latest)
-            if len(snapshots) == 1 or latest.at - snapshots[-2].at > 0.9 * PERIOD:
+            if len(snapshots) == 1:
                 self._snapshots.append(latest)
-        silence = {name: (now - then) / 1e9 for name, then in seen.items()}
+            elif latest.at - snapshots[-2].at > 0.9 * PERIOD:
+                driven = [route.name for route in program.table.routes if route.deadman and route.sources]
+                self._bursts.note(snapshots[-2], latest, driven)
+                self._snapshots.append(latest)
+            bursts = self._bursts.recent(latest.at, WINDOW)
         recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
         replies = self._running.replies()
-        return Look(program, snapshots, silence, self.standing(now), tripped, recent, replies, returned)
+        return Look(program, snapshots, self.standing(now), tripped, recent, replies, bursts, returned)
 
     def standing(self, now: int) -> float:
         """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""
@@ -80,14 +83,6 @@ class Watch:
             if progress != self._progress:
                 self._progress, self._progressed = progress, now
             return (now - self._progressed) / 1e9
-
-    def _seen(self, endpoint: str, latest: Snapshot, earlier: int, now: int, wall: int) -> int:
-        """Return when an endpoint was last heard, or first looked for (boot clock, ns). Its stamp is wall time."""
-        stamp = latest.of(LAST_SEEN, endpoint).get((), 0.0)
-        if endpoint not in self._last_seen or self._last_seen[endpoint][0] != stamp:
-            age = min(max(0, wall - int(stamp * 1e9)), now - earlier)
-            self._last_seen[endpoint] = stamp, now - age
-        return self._last_seen[endpoint][1]
 
 
 class Health:
@@ -110,7 +105,7 @@ class Health:
         join_or_abandon(self._thread)
 
     def look(self) -> Look:
-        return self._watch.look(boottime_ns(), wall_ns())
+        return self._watch.look(boottime_ns())
 
     def _run(self) -> None:
         has_failed = False

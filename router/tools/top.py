@@ -143,12 +143,13 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), no
     """
     now = after.at if now is None else now
     routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
-    seen = after.counts("endpoint_last_seen_timestamp_seconds")
     rejected: dict[str, int] = defaultdict(int)
     for (_, reason), count in after.counts("datagrams_rejected").items():
         if count:
             rejected[reason] += int(count)
-    silence = {endpoint: _age(stamp, now) for (endpoint,), stamp in seen.items()}
+    heard = {endpoint: seconds for (endpoint,), seconds in after.counts(Kind.ENDPOINT_SILENT.metric).items()}
+    unheard = [endpoint for (endpoint,) in after.counts(Kind.ENDPOINT_NEVER_HEARD.metric)]
+    silence: dict[str, float | None] = {**heard, **dict.fromkeys(unheard)}
     return View(
         routes=tuple(_route_row(route, before, after, problems, now) for route in routes),
         received=after.total("datagrams_received"),

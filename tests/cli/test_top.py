@@ -29,7 +29,7 @@ router_messages_received_total{route="gps_info",source="sensor_board"} 0
 router_datagrams_sent_total{route="imu_info",destination="basestation"} 7
 router_messages_dropped_total{route="gps_info",target="basestation",reason="stale"} 2
 router_datagrams_sent_total{route="gps_info",destination="basestation"} 0
-router_endpoint_last_seen_timestamp_seconds{endpoint="sensor_board"} 0
+router_endpoint_unheard_seconds{endpoint="sensor_board"} 12
 """
 
 

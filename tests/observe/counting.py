@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from router.compiler.program import Program
 from router.observe.health import Look
+from router.observe.silences import Silences
 from router.observe.watch import Watch
 from tests.observe.fake_running import FakeRunning
 
@@ -33,7 +34,8 @@ class Counting(FakeRunning):
 
     def __init__(self, program: Program) -> None:
         super().__init__(program)
-        self.now = self.shift = 0
+        self.now = self.shift = self.sent = 0
+        self.silences = Silences(lambda: self.now, lambda: self.wall)
         self.watch = Watch(self)
         self.count("config_last_reload_successful", to=1)
 
@@ -47,7 +49,7 @@ class Counting(FakeRunning):
     def look(self, after: float) -> Look:
         """Evaluate health this many seconds later."""
         self.now += int(after * SECOND)
-        return self.watch.look(self.now, self.wall)
+        return self.watch.look(self.now)
 
     def told(self, after: float) -> list[str]:
         """Evaluate health then, and return the problems as text."""

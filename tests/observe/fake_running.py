@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,8 @@ from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.obedience import Reply
 from router.observe.running import ReloadResult
-from router.observe.watch import LAST_SEEN, Health, Watch
+from router.observe.silences import Silences
+from router.observe.watch import Health, Watch
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.table.addresses import Address
 from tests.tables import ROUTES
@@ -38,6 +39,17 @@ def sim_program() -> Program:
     program = check_table(ROUTES / "sim.yaml").program
     assert program is not None
     return program
+
+
+class FullSilences(Silences):
+    """Endpoints are silent since their last datagram, however long ago this began to look."""
+
+    def __init__(self, began: int | None = None) -> None:
+        super().__init__()
+        self._began = began or wall_ns()
+
+    def of(self, stamps: Mapping[str, int]) -> Mapping[str, float]:
+        return {endpoint: (wall_ns() - (stamp or self._began)) / 1e9 for endpoint, stamp in stamps.items()}
 
 
 class FakeRunning:
@@ -57,6 +69,7 @@ class FakeRunning:
         self.waiting: deque[Mirrored] = deque()
         self.acted: deque[Acted] = deque()
         self.counts = program.counters.fresh_counts()
+        self.silences: Silences = FullSilences()
         self._turns = 0
 
     def observe(self, *, is_observed: bool) -> None:
@@ -85,8 +98,14 @@ class FakeRunning:
         computed = {
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
-        }
-        return CountersCollector(self.program.counters, lambda: [self.counts], computed, {"version": "1"}).collect()
+        } | {"endpoint_stale_after_seconds": self._stale_after}
+        counters = self.program.counters
+        return CountersCollector(counters, lambda: [self.counts], computed, self.silences, {"version": "1"}).collect()
+
+    def _stale_after(self) -> Iterator[tuple[tuple[str, str], float]]:
+        for endpoint in self.program.table.endpoints.values():
+            if endpoint.stale_after is not None:
+                yield (endpoint.name, endpoint.kind.value), endpoint.stale_after / 1e9
 
     def replies(self) -> dict[tuple[str, str], Reply]:
         return self.given_replies
@@ -103,7 +122,7 @@ class FakeRunning:
 
 
 class FakeHealth:
-    """Evaluated on request. Counts since `begin` are recent; endpoints are silent since their last datagram.
+    """Evaluated on request. Counts since `begin` are recent.
 
     `parked` is how long deadmen have been sending, in s.
     """
@@ -114,25 +133,23 @@ class FakeHealth:
         self.begin()
 
     def begin(self) -> None:
-        self._watch, self._began = Watch(self._running), wall_ns()
-        self._first = self._look(self._began)
+        self._watch = Watch(self._running)
+        self._first = self._look()
 
     @property
     def is_stuck(self) -> bool:
         return self._running.is_stuck
 
     def look(self) -> Look:
-        look = self._look(now := wall_ns())
-        seen = {name: int(stamp * 1e9) for (name,), stamp in look.now.counts(LAST_SEEN).items()}
-        silence = {name: (now - (seen.get(name) or self._began)) / 1e9 for name in look.silence}
+        look = self._look()
         snapshots = (self._first.now, look.now)
         tripped = dict.fromkeys(look.tripped, self.parked)
         standing = 3.0 if self.is_stuck else 0.0
-        return replace(look, snapshots=snapshots, silence=silence, standing=standing, tripped=tripped)
+        return replace(look, snapshots=snapshots, standing=standing, tripped=tripped)
 
-    def _look(self, wall: int) -> Look:
+    def _look(self) -> Look:
         collected = self._running.collected
-        look = self._watch.look(boottime_ns(), wall)
+        look = self._watch.look(boottime_ns())
         self._running.collected = collected
         return look
 

@@ -77,7 +77,7 @@ def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Count
             "deadman_active dashboard:/cmd_vel",
             "gateway/dashboard",
             Level.WARN,
-            "commands of dashboard:/cmd_vel do not get",
+            "dashboard:/cmd_vel is stopped by",
         ),
         (
             "gateway_topics dashboard not_installed",
@@ -112,8 +112,8 @@ def test_the_worst_problem_gives_the_level_and_the_message_has_all(router: Count
     assert status.level == Level.ERROR
     assert status.message == (
         "the deadman of manual_drive cannot reach driving_board, 3 in 6 s; "
-        "basestation has not been heard since the router started; "
-        "commands of manual_drive do not get through: its deadman sends in their place"
+        "manual_drive is stopped by its deadman: no commands get through, and basestation is silent; "
+        "basestation has not been heard since the router started"
     )
 
 

@@ -6,6 +6,7 @@ import json
 import threading
 
 import pytest
+from structlog.testing import capture_logs
 
 from router.compiler import metrics
 from router.compiler.metrics import Mismatch
@@ -34,12 +35,12 @@ TWIST, DRIVE = "geometry_msgs/msg/Twist", "comms/msg/DrivingBoardMotorMessage"
         (
             "deadman_active manual_drive",
             1,
-            "commands of manual_drive do not get through: its deadman sends in their place",
+            "manual_drive is stopped by its deadman: no commands get through",
         ),
         (
             "deadman_active dashboard:/cmd_vel",
             1,
-            "commands of dashboard:/cmd_vel do not get through: its deadman sends in their place",
+            "dashboard:/cmd_vel is stopped by its deadman: no commands get through",
         ),
         (
             "deadman_send_errors manual_drive driving_board",
@@ -78,7 +79,7 @@ TWIST, DRIVE = "geometry_msgs/msg/Twist", "comms/msg/DrivingBoardMotorMessage"
         ),
         ("datagrams_rejected rover ignored", 9, None),
         ("datagrams_rejected rover unhandled", 9, None),  # the next one says it
-        ("unhandled arm_diag", 9, "arm_diag is received but has no route, 9 in 2 s"),
+        ("unhandled arm_diag", 9, "arm_diag is received, but no route accepts it, 9 in 2 s"),
         (
             "qos_incompatible imu_info imu_data reliability",
             1,
@@ -134,8 +135,8 @@ def test_of_a_deadman_that_sends_the_stopping_times_are_told(router: Counting) -
     router.count("deadman_trips", "manual_drive", to=1)
     router.given_replies["manual_drive", "driving_board"] = Reply(0.4321)
     router.given_replies["drive_motor", "driving_board"] = Reply(9.0)
-    sent = "its deadman sends in their place; driving_board stopped after 0.43 s"
-    assert router.told(1) == [f"commands of manual_drive do not get through: {sent}"]
+    stopped = "no commands get through; driving_board stopped after 0.43 s"
+    assert router.told(1) == [f"manual_drive is stopped by its deadman: {stopped}"]
     assert "manual_drive is halted: no commands for 61 s; driving_board stopped after 0.43 s" in router.told(61)
 
 
@@ -314,11 +315,12 @@ def test_who_is_silent_while_a_deadman_acts_comes_before_others_that_are(router:
     router.hear("sensor_board")
     router.hear("basestation")
     router.count("deadman_active", "manual_drive", to=1)
-    first, second, *_ = router.told(10)
-    assert (first, second) == (
+    stopped, *silent, _ = router.told(10)
+    assert stopped == "manual_drive is stopped by its deadman: no commands get through, and basestation is silent"
+    assert silent == [
         "basestation is silent: last heard 10 s ago",
         "sensor_board is silent: last heard 10 s ago",
-    )
+    ]
 
 
 def parked(router: Counting, *routes: str) -> None:
@@ -383,6 +385,117 @@ def test_commands_that_are_refused_and_a_deadman_that_cannot_send_are_faults_how
     assert Kind.HALTED not in kinds
 
 
+def lost_for(router: Counting, route: str, endpoint: str, to: int, reason: str = "send_buffer_full") -> None:
+    router.count("messages_dropped", route, endpoint, reason, to=to)
+
+
+def told_of(router: Counting, after: float, kind: Kind) -> Problem:
+    [problem] = [each for each in router.look(after).problems if each.kind is kind]
+    return problem
+
+
+def test_losses_towards_an_endpoint_that_is_silent_are_told_with_its_silence_and_its_remedy(router: Counting) -> None:
+    router.hear("driving_board")
+    router.hear("basestation")
+    router.look(3)
+    router.hear("basestation")
+    router.count("deadman_active", "manual_drive", to=1)
+    lost_for(router, "manual_drive", "driving_board", 40)
+    lost_for(router, "drive_motor", "driving_board", 2)
+    router.count("messages_dropped", "manual_drive", "driving_board", "stale", to=1)  # no consequence of that
+    found = router.look(3).problems
+    assert [problem.kind for problem in found if problem.kind is not Kind.ENDPOINT_NEVER_HEARD] == [
+        Kind.DEADMAN_ACTIVE,
+        Kind.ENDPOINT_SILENT,
+        Kind.COMMANDS_DROPPED,
+    ]
+    stopped, silent, dropped = (each for each in found if each.kind is not Kind.ENDPOINT_NEVER_HEARD)
+    assert stopped.more == ", and driving_board does not answer"
+    answer = "does not answer: 42 of manual_drive, drive_motor for it lost in 6 s"
+    assert silent.text == f"driving_board is silent: last heard 6.0 s ago, and {answer}"
+    assert stopped.remedy == silent.remedy
+    assert silent.remedy.startswith("Check its power, cable or radio, and address: `ping 192.168.0.222`")
+    assert dropped.labels["reason"] == "stale"
+
+
+def test_losses_towards_an_endpoint_that_was_never_heard_have_the_remedy_of_its_silence(router: Counting) -> None:
+    router.hear("basestation")
+    lost_for(router, "manual_drive", "driving_board", 40)
+    dropped = told_of(router, 4.9, Kind.COMMANDS_DROPPED)  # may still come: both causes
+    assert dropped.remedy.startswith("driving_board does not answer: check power, cable and address. If it answers, ")
+    router.hear("basestation")
+    dropped = told_of(router, 1, Kind.COMMANDS_DROPPED)
+    assert dropped.text.endswith("in 6 s: driving_board has not been heard since the router started")
+    assert dropped.remedy.startswith("Check its power, cable or radio, and address: `ping 192.168.0.222`")
+
+
+def test_an_operator_who_is_out_of_reach_is_named_for_as_long_as_that_lasts(router: Counting) -> None:
+    parked(router, "manual_drive")
+    for number in range(10):
+        for board in ("sensor_board", "driving_board"):
+            router.hear(board)
+        lost_for(router, "imu_info", "basestation", 50 * number)
+        found = router.look(1).problems
+    stopped, silent = found
+    assert stopped.text.startswith(
+        "manual_drive is stopped by its deadman: no commands get through, and basestation is"
+    )
+    assert silent.text.startswith("basestation is silent: last heard 7")
+    assert ", and does not answer: 450 of imu_info for it lost in 10 s" in silent.text
+
+
+def test_an_operator_who_comes_back_with_another_address_is_named_after_any_time(router: Counting) -> None:
+    parked(router, "manual_drive", "manual_arm")
+    for board in ("sensor_board", "driving_board"):
+        router.hear(board)
+    mismatched(router, "192.168.0.77", "manual_drive")
+    found = {problem.kind: problem for problem in router.look(1).problems}
+    assert [*found] == [Kind.DEADMAN_ACTIVE, Kind.ENDPOINT_SILENT, Kind.DATAGRAMS_REJECTED, Kind.HALTED]
+    assert found[Kind.DEADMAN_ACTIVE].labels == {"route": "manual_drive"}
+    assert found[Kind.DEADMAN_ACTIVE].more == ", while 192.168.0.77 sends those of basestation"
+    assert found[Kind.ENDPOINT_SILENT].more.endswith("ago, while 192.168.0.77 sends its messages")
+    for kind in (Kind.DEADMAN_ACTIVE, Kind.ENDPOINT_SILENT):
+        assert found[kind].remedy.startswith("If 192.168.0.77 is basestation, give it the address 192.168.0.10")
+
+
+def test_commands_that_are_dropped_are_told_as_the_cause_of_the_stop(router: Counting) -> None:
+    router.hear("basestation")
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("messages_dropped", "manual_drive", "driving_board", "mapping_error", to=9)
+    stopped, dropped = router.look(1).problems
+    assert stopped.more == ", and 9 for driving_board were dropped: mapping_error"
+    assert stopped.remedy == dropped.remedy == REMEDIES["mapping_error"]
+
+
+@pytest.mark.parametrize(
+    ("route", "remedy"), [("manual_drive", "waited in this computer"), ("drive_motor", "clock of")]
+)
+def test_clocks_of_other_computers_matter_for_messages_of_ros_only(router: Counting, route: str, remedy: str) -> None:
+    router.count("messages_dropped", route, "driving_board", "stale", to=9)
+    [dropped] = router.look(1).problems
+    assert remedy in dropped.remedy
+    assert ("clock" in dropped.remedy) is (route == "drive_motor")
+
+
+def test_a_case_that_is_accepted_from_a_topic_only_is_told_with_who_sent_it(router: Counting) -> None:
+    router.count("unhandled", "drive_motor", to=9)
+    router.seen[Mismatch("rover", "192.168.0.10", "drive_motor")] = router.now
+    [problem] = router.look(1).problems
+    assert problem.text == (
+        "drive_motor is received, but no route accepts it, 9 in 1 s: it is accepted only from topic drive_motor; "
+        "basestation (192.168.0.10) sent it"
+    )
+    assert problem.remedy.endswith("or write a route for drive_motor with this `source`.")
+
+
+def test_a_field_that_the_envelope_lacks_is_one_problem_with_number_and_sender(router: Counting) -> None:
+    router.count("unhandled", metrics.UNKNOWN_CASE, to=9)
+    router.count("datagrams_rejected", "rover", "unknown_case", to=9)
+    router.seen[Mismatch("rover", "192.168.0.30", "field 77")] = router.now
+    [problem] = router.look(1).problems
+    assert problem.text == "rover rejects datagrams: unknown_case, 9 in 1 s: sensor_board (192.168.0.30) sends field 77"
+
+
 @pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])
 def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Counting, shift: int) -> None:
     router.hear("sensor_board")
@@ -392,7 +505,43 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
     assert router.told(1.5) == ["sensor_board is silent: last heard 3.5 s ago"]
     router.hear("sensor_board")
     router.look(1)
-    assert router.watch.look(router.now, router.wall).silence["sensor_board"] == 1.0
+    assert router.look(0).silence["sensor_board"] == 1.0
+
+
+def drive(router: Counting, *numbers: int) -> list[Problem]:
+    """Receive these numbers of commands, one number per second; return the bursts after the last second."""
+    for number in numbers:
+        router.sent += number
+        router.count("messages_received", "manual_drive", "basestation", to=router.sent)
+        found = router.look(1).problems
+    return [problem for problem in found if problem.kind is Kind.COMMAND_BURST]
+
+
+def test_commands_that_were_stored_while_the_link_was_lost_are_told_once_with_their_number(router: Counting) -> None:
+    with capture_logs() as logged:
+        assert drive(router, 40, 41, 39, 40, 0, 0, 0, 0) == []
+        [burst] = drive(router, 190)
+        assert burst.kind.level is Level.INFO
+        assert burst.text.endswith("a burst of commands after a silence, 190 in 1.0 s after 4.0 s")
+        drive(router, 70, 40, 40)  # a burst may extend over two snapshots
+        assert drive(router, 40, 40, 40, 40, 40, 40, 40) == []
+    assert [line["event"] for line in logged if "silence" in line["event"]] == [
+        "many commands arrived at once after a silence: they may be old"
+    ]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (0, 0, 0, 200),  # how fast this sender usually is, is not known yet
+        (40, 40, 40, 40, 0, 0, 0, 40, 2, 0, 0, 60),
+        (40, 40, 40, 40, 0, 200),
+        (1, 1, 1, 1, 0, 0, 0, 8),
+    ],
+    ids=["first", "short driving", "no silence", "few"],
+)
+def test_other_driving_is_no_burst(router: Counting, numbers: tuple[int, ...]) -> None:
+    assert drive(router, *numbers) == []
 
 
 def test_what_explains_other_problems_comes_first(router: Counting) -> None:
@@ -401,7 +550,7 @@ def test_what_explains_other_problems_comes_first(router: Counting) -> None:
     router.count("deadman_send_errors", "manual_drive", "driving_board", to=3)
     router.count("messages_dropped", "imu_info", "basestation", "stale", to=3)
     kinds = [problem.kind for problem in router.look(6).problems if problem.kind is not Kind.ENDPOINT_NEVER_HEARD]
-    assert kinds == [Kind.DEADMAN_CANNOT_SEND, Kind.ENDPOINT_SILENT, Kind.DEADMAN_ACTIVE, Kind.MESSAGES_DROPPED]
+    assert kinds == [Kind.DEADMAN_CANNOT_SEND, Kind.DEADMAN_ACTIVE, Kind.ENDPOINT_SILENT, Kind.MESSAGES_DROPPED]
 
 
 @pytest.mark.parametrize("kind", Kind, ids=lambda kind: kind.alert)

@@ -115,8 +115,8 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
     [problem] = ask(server, "/health.json").json["problems"]
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")
     assert (problem["labels"], problem["routes"]) == ({"route": "manual_drive"}, ["manual_drive"])
-    assert problem["words"] == "commands of manual_drive do not get through: its deadman sends in their place"
-    assert problem["remedy"].startswith("Check that they arrive often enough")
+    assert problem["words"] == "manual_drive is stopped by its deadman: no commands get through"
+    assert problem["remedy"].startswith("Check that they are sent, and more often than")
 
 
 def test_ready_is_that_everything_is_open(server: HttpServer, running: FakeRunning) -> None:

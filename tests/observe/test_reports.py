@@ -86,3 +86,24 @@ def test_a_deadman_that_trips_says_whether_commands_come_and_are_dropped(
     *_, line = logged
     assert line.get("reason") == reason
     assert line["event"].startswith("commands arrive but are dropped" if reason else "no commands arrive")
+
+
+@pytest.mark.parametrize(("reason", "lines"), [("send_buffer_full", 2 + 2), ("mapping_error", 20)])
+def test_a_deadman_that_is_fed_by_commands_that_only_the_kernel_takes_is_told_in_summary(
+    reason: str, lines: int
+) -> None:
+    with capture_logs() as logged:
+        reporter = Reporter(lambda _: None)
+        for _ in range(10):
+            reporter.report(Report("drop", "manual_drive", "driving_board", reason))
+            reporter.deadman_changed("manual_drive", active=True, plan=PLAN)
+            reporter.deadman_changed("manual_drive", active=False, plan=PLAN)
+        reporter.close()
+    of_deadman = [line for line in logged if "deadman" in line["event"]]
+    assert len(of_deadman) == lines
+    if reason == "send_buffer_full":
+        assert [line["event"].partition(";")[0] for line in of_deadman[:2]] == [
+            "commands arrive but are dropped",
+            "commands are sent again",
+        ]
+        assert all(line["more"] == 9 for line in of_deadman[2:])

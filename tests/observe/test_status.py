@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -74,7 +75,7 @@ def test_what_is_counted_is_found_by_route_and_target_and_endpoint(running: Fake
     assert route["targets"]["basestation"] == {"delivered": 7, "dropped": {"send_error": 2}}
     assert route["targets"]["imu_data"] == {"delivered": 0, "dropped": {}, "filtered": 9}
     assert (route["last"], route["buckets"][-1]) == (1.5, ["+Inf", 0])
-    assert found["endpoints"]["sensor_board"] == {"seen": 2.0}
+    assert found["endpoints"]["sensor_board"] == {"silence": pytest.approx(time.time() - 2.0, abs=60), "stale_after": 5}
 
 
 def test_every_series_that_the_page_knows_exists() -> None:

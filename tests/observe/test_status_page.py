@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -10,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from router.clock import wall_ns
 from router.compiler import check_table
 from router.observe import responses
 from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
 from tests.gateway.browser import Browser, Page
-from tests.observe.fake_running import FakeHealth, FakeRunning, served, sim_program
+from tests.observe.fake_running import FakeHealth, FakeRunning, FullSilences, served, sim_program
 
 pytestmark = pytest.mark.slow
 
@@ -239,14 +241,17 @@ def test_what_matters_most_is_said_in_the_banner_and_the_rest_beside_it(running:
     running.count("qos_incompatible", "imu_info", "imu_data", "reliability", to=1)
     running.count("datagrams_rejected", "rover", "unhandled", to=3)
     running.count("unhandled", "arm_diag", to=3)
-    until_said(page, "arm_board is silent", "warn")
-    assert page.text("#todo").startswith("Check power, cable or radio, and ping 127.0.0.40;")
-    assert page.evaluate("document.title") == "! rover_router: arm_board is silent"
+    until_said(page, "manual_drive is stopped by its deadman: no commands get through", "warn")
+    assert page.text("#todo").startswith("Check that they are sent, and more often than")
+    assert page.evaluate("document.title") == (
+        "! rover_router: manual_drive is stopped by its deadman: no commands get through"
+    )
     page.until("document.querySelectorAll('#others li').length === 4")
     said = others(page)
-    assert "Commands of manual_drive do not get through: its deadman sends in their place Check that they" in said
+    assert "arm_board is silent: last heard " in said
+    assert "Check its power, cable or radio, and address: ping 127.0.0.40," in said
     assert "The last reload failed; the old table is still running Run router validate, correct" in said
-    assert "arm_diag is received but has no route, 3 in " in said
+    assert "arm_diag is received, but no route accepts it, 3 in " in said
     assert "Nothing passes between imu_data and peers with another reliability, 1 of them Compare their QoS" in said
 
 
@@ -270,15 +275,19 @@ def test_much_that_is_wrong_is_folded(running: FakeRunning, page: Page) -> None:
     page.until("document.querySelectorAll('#others li').length === 5")
 
 
-def test_a_silent_operator_is_said_before_the_deadmen_that_act(running: FakeRunning, page: Page) -> None:
+def test_a_rover_that_is_stopped_is_said_first_with_the_operator_who_is_silent(
+    running: FakeRunning, page: Page
+) -> None:
     running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
     running.count("endpoint_last_seen_timestamp_seconds", "basestation", to=time.time_ns() - 14 * 10**9)
     for route in ("manual_drive", "manual_arm"):
         running.count("deadman_active", route, to=1)
-    page.until("/^basestation is silent: last heard 1[4-9] s ago$/.test(document.querySelector('#what').textContent)")
-    assert page.text("#todo").startswith("Check power, cable or radio, and ping 127.0.0.10;")
-    assert page.text("#spoken") == "warning: basestation is silent"
+    stopped = "is stopped by its deadman: no commands get through"
+    page.until(f"document.querySelector('#what').textContent === 'manual_drive {stopped}, and basestation is silent'")
+    assert page.text("#todo").startswith("Check its power, cable or radio, and address: ping 127.0.0.10,")
+    assert page.text("#spoken") == f"warning: manual_drive {stopped}"
     page.until("document.querySelectorAll('#others li').length === 3")
+    assert re.search(r"basestation is silent: last heard 1[4-9] s ago", others(page))
     assert "■ deadman" in page.evaluate(f"{box('case:manual_drive')}.innerText")
     for key in ("from:@basestation", "to:@basestation"):
         assert "▲ silent" in page.evaluate(f"{box(key)}.innerText")
@@ -385,6 +394,8 @@ def test_a_rover_that_nobody_drives_is_calm_and_a_fault_comes_first(
     assert page.evaluate("document.title") == "□ rover_router: manual_drive is halted: no commands"
     assert "□ halted" in page.evaluate(f"{box('case:manual_drive')}.innerText")
     assert page.evaluate("document.querySelectorAll('.silent, .troubled').length") == 0
+    sources = len({name for route in running.program.table.routes for name in (each.value for each in route.sources)})
+    assert f"{sources - 1} of {sources}" in page.text("#tiles")  # however normal, it is not heard now
     running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
     until_said(page, "arm_board is silent", "warn")
     assert others(page).startswith("□manual_drive is halted: no commands for 27 min, and basestation is silent")
@@ -402,7 +413,7 @@ def test_before_anything_has_come_the_page_waits(running: FakeRunning, health: F
     for endpoint in running.program.table.endpoints:
         running.count("endpoint_last_seen_timestamp_seconds", endpoint, to=0)
     page.until(f"{box('from:@sensor_board')}.innerText.includes('○ not heard yet')")
-    health._began -= 60 * 10**9
+    running.silences = FullSilences(began=wall_ns() - 60 * 10**9)
     until_said(page, "has not been heard since the router started", "")
     assert page.text("#todo").startswith("All endpoints are silent: check this computer's network")
 

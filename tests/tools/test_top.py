@@ -45,7 +45,8 @@ def snapshot(at: float, imu: int, gps: int = 0, **more: Counts) -> Snapshot:
         "messages_filtered": {("imu_info", "imu_data"): 4},
         "messages_dropped": {("imu_info", "imu_data", "stale"): 0, ("gps_info", "basestation", "stale"): 3},
         "route_last_message_timestamp_seconds": {("imu_info",): NOW - 5, ("gps_info",): 0},
-        "endpoint_last_seen_timestamp_seconds": {("sensor_board",): NOW - 1, ("arm_board",): 0},
+        "endpoint_silence_seconds": {("sensor_board",): 1},
+        "endpoint_unheard_seconds": {("arm_board",): 12},
         "route_duration_seconds_bucket": {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
     }
     return Snapshot(at, values | more)
