@@ -133,7 +133,9 @@ def clock(now: datetime | None = None, status: int | None = None) -> Iterator[Ch
     now = now or datetime.now(timezone.utc)
     status = _clock_status() if status is None else status
     if now < _BUILT:
-        yield problem("clock", f"it says {now:%Y-%m-%d %H:%M}", "set it: `timedatectl set-ntp true`, or `date -s`")
+        yield problem(
+            "clock", f"it says {now.astimezone():%Y-%m-%d %H:%M %z}", "set it: `timedatectl set-ntp true`, or `date -s`"
+        )
     elif status is None:
         yield warning("clock", "the kernel does not say whether it is synchronised", "run `timedatectl`")
     elif status & _UNSYNCHRONISED:
