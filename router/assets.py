@@ -1,6 +1,6 @@
 """Finds the files shipped with the router: within the package in a wheel, at the root in a checkout.
 
-They are in `routes/`, `protos/` and `schemas/`, for example.
+They are in `routes/`, `protos/`, `schemas/` and `docs/`.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def _configure(structlog: Any, level: str, *, coloured: bool) -> None:
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="%H:%M:%S.%f" if on_terminal else "iso", utc=not on_terminal),
+            structlog.processors.TimeStamper(fmt="%H:%M:%S.%f%z" if on_terminal else "iso", utc=not on_terminal),
             *rendering,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),

@@ -11,6 +11,7 @@ import re
 import struct
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
 from typing import Any, Union
 
 from google.protobuf.message import Message
@@ -258,6 +259,11 @@ def float_text(value: float, bits: int, digits: int | None = None) -> str:
         return repr(value)
     packed = struct.pack("<f", value)
     return next(text for p in range(6, 10) if struct.pack("<f", float(text := f"{value:.{p}g}")) == packed)
+
+
+def clock_text(at: datetime) -> str:
+    """Format the time of day of a local time, with its offset from UTC: `12:00:00.123+0200`."""
+    return f"{at:%H:%M:%S}.{at.microsecond // 1000:03}{at:%z}"
 
 
 def age_text(seconds: float | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from router.datagrams import wire_of_protos
 from router.errors import UsageError
 from router.types.protobuf import PayloadCase
 from router.values import (
+    clock_text,
     compact,
     float_text,
     protobuf_tree,
@@ -219,3 +221,8 @@ def test_json_has_numbers_for_octets_and_words_for_infinities() -> None:
 def test_a_long_name_keeps_its_beginning_and_end() -> None:
     assert shortened("sensor_board_diagnostics", 18) == "sensor_bo…gnostics"
     assert shortened("imu_data", 18) == "imu_data"
+
+
+def test_a_time_of_day_has_its_offset_from_utc() -> None:
+    at = datetime(2026, 4, 12, 10, 15, 0, 123456, timezone(timedelta(hours=5, minutes=30)))
+    assert clock_text(at) == "10:15:00.123+0530"

@@ -7,10 +7,10 @@ import json
 import os
 import sys
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import GREEN, RED, YELLOW, Paint, is_coloured
+from router.cli.findings import GREEN, RED, YELLOW, Paint, is_coloured, wrapped
 from router.cli.tool_options import add_table, table_path
 from router.errors import plural
 
@@ -25,6 +25,9 @@ code."""
 
 _STYLES = {"ok": GREEN, "warning": YELLOW, "problem": RED}
 """Styles by the value of a grade."""
+
+_COLUMN = 20
+"""The column at which texts begin."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -46,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     grades: Counter[Grade] = Counter()
     for result in (before_start if args.pre_start else examine)(path, os.environ):
         grades[result.grade] += 1
-        print(_json(result) if args.json else shown(result, coloured=is_coloured(sys.stdout)), flush=True)
+        print(_json(result) if args.json else shown(result, sys.stdout), flush=True)
     if not args.pre_start and not args.json:
         print(_summary(grades))
     if not os.access(path, os.R_OK):
@@ -54,11 +57,12 @@ def run(args: argparse.Namespace) -> int:
     return SICK if grades[Grade.PROBLEM] else OK
 
 
-def shown(result: CheckResult, *, coloured: bool) -> str:
-    """Return the result on one line, and its remedy, if there is one, on a second line."""
-    grade = Paint(coloured)(_STYLES[result.grade.value], f"{result.grade.value:8}")
-    text = f"{grade} {result.about:10} {result.text}"
-    return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text
+def shown(result: CheckResult, out: TextIO) -> str:
+    """Return the result on one line, and its remedy, if there is one, on a second line; on a terminal, wrapped."""
+    grade = f"{result.grade.value:8}"
+    text = wrapped(f"{grade} {result.about:10} {result.text}", out, _COLUMN)
+    painted = Paint(is_coloured(out))(_STYLES[result.grade.value], grade) + text.removeprefix(grade)
+    return "\n".join((painted, wrapped(f"{'':{_COLUMN}}-> {result.remedy}", out, 3))) if result.remedy else painted
 
 
 def _json(result: CheckResult) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb
 from router.cli.completion import completes, fields, routed
+from router.cli.findings import wrapped
 from router.cli.tool_options import add_for, add_table, good_table, table_path
 from router.errors import UsageError, did_you_mean
 
@@ -92,14 +93,19 @@ def _explain(args: argparse.Namespace) -> int:
             code = listed_route(route, program) if args.code else ()
             given = () if args.given is None else tried_route(route, checked, program, args.given)
             now = live_route(route.route, mistyped)
-            print(*explained_route(route, checked), *now, *code, *given, sep="\n", end="\n\n")
+            _print(*explained_route(route, checked), *now, *code, *given, "")
         if name in gateways:
-            print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
+            _print(*explained_gateway(gateways[name], topics), "")
         if name in ignored:
-            print(*ignored_gateway(ignored[name]), sep="\n", end="\n\n")
+            _print(*ignored_gateway(ignored[name]), "")
     if not args.names:
-        print(*_kept(path), sep="\n")
+        _print(*_kept(path))
     return OK
+
+
+def _print(*lines: str) -> None:
+    for line in lines:
+        print(wrapped(line, sys.stdout))
 
 
 def _kept(table: Path) -> Iterator[str]:
@@ -119,7 +125,7 @@ def _kept(table: Path) -> Iterator[str]:
         elif any(kind == "file" and os.path.realpath(name) == real for kind, name, _ in kept.inputs):
             is_any = True
             command, where, python = kept.identity
-            since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(kept.written))
+            since = time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(kept.written))
             yield f"kept for: {shlex.join(command)}"
             yield f"  in {where}, since {since}"
             if python != sys.executable:

@@ -6,6 +6,8 @@ import functools
 import json
 import os
 import re
+import shutil
+import textwrap
 import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,6 +83,22 @@ def annotation(level: Severity, span: SourceSpan, title: str, text: str) -> str:
 def place(span: SourceSpan) -> dict[str, str | int]:
     """Return a span as JSON. Lines and columns count from 1, `end_column` is exclusive."""
     return {"file": span.file, "line": span.line, "column": span.column, "end_column": span.end_column}
+
+
+def wrapped(text: str, out: TextIO, hanging: int = 4) -> str:
+    """Return the text with its lines wrapped at words to the width of the terminal; unchanged without a terminal.
+
+    What continues a line is indented by `hanging` more than the line. Words such as paths stay whole.
+    """
+    if not out.isatty():
+        return text
+    width = shutil.get_terminal_size().columns
+    return "\n".join(line for given in text.splitlines() for line in _wrapped_line(given, width, hanging))
+
+
+def _wrapped_line(line: str, width: int, hanging: int) -> list[str]:
+    indent = " " * (len(line) - len(line.lstrip()) + hanging)
+    return textwrap.wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False) or [""]
 
 
 class Paint:

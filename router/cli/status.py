@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from router.cli import BAD_TABLE, BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
+from router.cli.findings import wrapped
 from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError, plural
 
@@ -45,5 +47,5 @@ def run(args: argparse.Namespace) -> int:
         details = [problem.text for problem in problems]
         if received is not None:
             details.append(f"{plural(received, 'datagram')} received")
-        print(f"{state}: {'; '.join(details)}")
+        print(wrapped(f"{state}: {'; '.join(details)}", sys.stdout))
     return code

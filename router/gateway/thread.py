@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import boottime_ns, wall_ns
-from router.compiler.metrics import Counters, Report
+from router.compiler.metrics import Report
 from router.compiler.program import GatewayPlan, Program
 from router.errors import StartError
 from router.gateway.clients import ClientQueue
@@ -29,6 +29,7 @@ from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.udp import UdpTransport
 from router.gateway.transport.websocket import WebsocketTransport
 from router.log import logger
+from router.table.addresses import Address
 from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
@@ -127,7 +128,7 @@ class GatewayThread:
                         each for each in change.unused if _exclude_each_other(each.plan.settings, plan.settings)
                     ]:
                         await rival.close()
-                    service = await self._open(plan, program.counters, outputs)
+                    service = await self._open(plan, program, outputs)
                     change.opened.append(service)
                     change.services[service.name] = service
         except BaseException:
@@ -168,12 +169,13 @@ class GatewayThread:
         for service in change.opened:
             service.start()
 
-    async def _open(self, plan: GatewayPlan, counters: Counters, outputs: InboundOutputs) -> GatewayService:
-        settings = plan.settings
+    async def _open(self, plan: GatewayPlan, program: Program, outputs: InboundOutputs) -> GatewayService:
+        settings, counters = plan.settings, program.counters
+        http = program.table.http.value if program.table.http else None  # fixed while the router runs
         gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, wall_ns)
         inbound = InboundPublisher(plan, ENCODINGS[settings.format](settings), counters, self._counts, outputs)
         service = GatewayService(
-            plan, self._context, gateway_counters, inbound, lambda events: self._transport(settings, events)
+            plan, self._context, gateway_counters, inbound, lambda events: self._transport(settings, http, events)
         )
         try:
             await service.open()
@@ -181,8 +183,8 @@ class GatewayThread:
             raise type(error)(f"{settings.transport.span}: cannot open gateway '{settings.name}': {error}") from error
         return service
 
-    def _transport(self, settings: Gateway, events: Events) -> Transport:
-        transport = _new_transport(settings, events)
+    def _transport(self, settings: Gateway, http: Address | None, events: Events) -> Transport:
+        transport = _new_transport(settings, http, events)
         if isinstance(transport, UdpTransport) and settings.receive is not None:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
@@ -229,8 +231,8 @@ async def _close(services: Iterable[GatewayService]) -> None:
             closing.push_async_callback(service.close)
 
 
-def _new_transport(settings: Gateway, events: Events) -> Transport:
-    """Return the transport for a gateway's settings, not open yet."""
+def _new_transport(settings: Gateway, http: Address | None, events: Events) -> Transport:
+    """Return the transport for a gateway's settings, not open yet. `http` has the status page."""
     most = settings.max_inbound if settings.inbound else MOST_REQUEST
     if settings.zenoh is not None:
         from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
@@ -244,12 +246,15 @@ def _new_transport(settings: Gateway, events: Events) -> Transport:
     if settings.transport.value is TransportKind.TCP:
         return TcpTransport(address, events, limits, prefixed=settings.format is GatewayFormat.GATEWAY_V1)
     text = settings.format is GatewayFormat.JSON
-    return WebsocketTransport(address, events, limits, text=text, page=_page(settings.name))
+    return WebsocketTransport(address, events, limits, text=text, page=_page(settings.name, http))
 
 
-def _page(name: str) -> bytes:
-    """Return the page with the gateway's name in its title, which its script reads."""
-    return PAGE.read_bytes().replace(b"<title>Gateway</title>", b"<title>Gateway %b</title>" % escape(name).encode())
+def _page(name: str, http: Address | None) -> bytes:
+    """Return the page with what its script reads: the gateway's name in its title, and the status page's address."""
+    page = PAGE.read_bytes().replace(b"<title>Gateway</title>", b"<title>Gateway %b</title>" % escape(name).encode())
+    if http is None:
+        return page
+    return page.replace(b'<a id="status"', b'<a id="status" data-address="%b"' % str(http).encode())
 
 
 def _exclude_each_other(one: Gateway, other: Gateway) -> bool:

@@ -544,9 +544,7 @@ def _inbound(node: Node, span: SourceSpan) -> Inbound:
     settings = mapping(node)
     entry = settings.entries.get("deadman")
     deadman = _inbound_deadman(entry) if entry else None
-    return structure(
-        Inbound, settings, **_without_ttl(settings), span=span, topic=_topic(node, span), deadman=deadman
-    )
+    return structure(Inbound, settings, **_without_ttl(settings), span=span, topic=_topic(node, span), deadman=deadman)
 
 
 def _inbound_deadman(entry: Entry) -> InboundDeadman:

@@ -23,6 +23,7 @@ from router.tools.doctor_checks import (
     fine,
     listeners,
     open_domain,
+    page,
     ports,
     problem,
     receive_buffers,
@@ -123,7 +124,7 @@ def _reported(program: Program, running: Health) -> Iterator[CheckResult]:
             yield fine("router", each.text)
             continue
         grade = problem if each.kind.level is Level.CRITICAL else warning
-        yield grade("router", each.text, f"{each.remedy} See {each.page}")
+        yield grade("router", each.text, f"{each.remedy} See {page(each.page)}")
     if all(each.kind.level is Level.CALM for each in running.problems):
         yield fine("router", f"it runs and loses nothing; {plural(running.received, 'datagram')} received")
 

@@ -17,9 +17,10 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
+from router.assets import asset
 from router.carrier.library import load
 from router.compiler.program import Program
-from router.errors import Located, StartError, plural
+from router.errors import Located, StartError, plural, shown_path
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable
@@ -151,7 +152,9 @@ def clock(now: datetime | None = None, status: int | None = None) -> Iterator[Ch
     now = now or datetime.now(timezone.utc)
     status = _clock_status() if status is None else status
     if now < _BUILT:
-        yield problem("clock", f"it says {now:%Y-%m-%d %H:%M}", "set it: `timedatectl set-ntp true`, or `date -s`")
+        yield problem(
+            "clock", f"it says {now.astimezone():%Y-%m-%d %H:%M %z}", "set it: `timedatectl set-ntp true`, or `date -s`"
+        )
     elif status is None:
         yield warning("clock", "the kernel does not say whether it is synchronised", "run `timedatectl`")
     elif status & _UNSYNCHRONISED:
@@ -483,6 +486,12 @@ def _priority() -> Iterator[CheckResult]:
         yield fine("carrier", "it may run at a real-time priority")
 
 
+def page(name: str) -> str:
+    """Return the path of a page of the documentation on this computer, and its section: `docs/index.md#tools`."""
+    path, mark, section = name.partition("#")
+    return f"{shown_path(asset(path))}{mark}{section}"
+
+
 def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     """Warn if the ROS domain is open to the networks of this computer."""
     if not (program.publishers or program.subscriptions or program.gateways):
@@ -496,5 +505,5 @@ def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Chec
             "every computer in this computer's networks can join the ROS domain and publish commands: it is domain 0, "
             f"with discovery on {', '.join(networks)}",
             "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST if all nodes are on this computer, as the service does; else "
-            "use a domain of your own, and read docs/guides/security.md",
+            f"use a domain of your own, and read {page('docs/guides/security.md')}",
         )

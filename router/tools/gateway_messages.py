@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Union
 
 from router.gateway.packets import HEAD, Packet, PacketError, decompress, unpack
-from router.values import SHOWN_ELEMENTS, Tree, list_text, one_line, plain_text, words
+from router.values import SHOWN_ELEMENTS, Tree, clock_text, list_text, one_line, plain_text, words
 
 MOST_TEXT = 256 << 20
 """Bytes of the longest message that a gateway can be configured to send."""
@@ -195,9 +195,9 @@ def _remark(document: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _clock(seconds: float) -> str:
-    """Return local time of day; the number if it is outside the calendar's range."""
+    """Return the local time of day; the number if it is outside the calendar's range."""
     try:
-        return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
+        return clock_text(dt.datetime.fromtimestamp(seconds).astimezone())
     except (OverflowError, OSError, ValueError):
         return f"time={seconds}"
 

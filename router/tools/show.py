@@ -15,8 +15,8 @@ from router.datagrams import Decoded, Wire
 from router.errors import DecodeError, UsageError
 from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action
 from router.recording.reader import Recorded, RecordedAction
-from router.tools.tap import Condition, TappedDatagram, clock_text, local_time, tapped_datagram
-from router.values import compact
+from router.tools.tap import Condition, TappedDatagram, local_time, tapped_datagram
+from router.values import clock_text, compact
 
 Entry = Recorded | RecordedAction
 

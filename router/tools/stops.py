@@ -14,8 +14,8 @@ from router.recording.about import RecordedRoute
 from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, first_field
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model import ANY
-from router.tools.tap import clock_text, local_time
-from router.values import compact
+from router.tools.tap import local_time
+from router.values import clock_text, compact
 
 _MS = 1_000_000
 _UNKNOWN = RecordedRoute("", (), False, 0.0, ())

@@ -30,7 +30,7 @@ from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase
-from router.values import compact, one_line, ros_json, ros_tree, words
+from router.values import clock_text, compact, one_line, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.ros.topics import TopicListener
@@ -119,7 +119,7 @@ class TappedDatagram:
     rejected: str = ""
 
     def line(self, with_hex: bool) -> str:
-        """Return one line: `12:00:00.123 sensor_board imu_info accel_x=1.5`."""
+        """Return one line: `12:00:00.123+0200 sensor_board imu_info accel_x=1.5`."""
         start = f"{clock_text(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
@@ -135,7 +135,11 @@ class TappedDatagram:
 
     def json(self, with_hex: bool) -> str:
         """Return one JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
-        document: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
+        document: dict[str, object] = {
+            "time": self.at.astimezone(dt.timezone.utc).isoformat(),
+            "peer": self.peer,
+            "bytes": len(self.data),
+        }
         if self.rejected:
             document["rejected"] = self.rejected
         if self.decoded is None:
@@ -161,24 +165,19 @@ class TappedMessage:
     message: Any
 
     def line(self, with_hex: bool) -> str:
-        """Return one line: `12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
+        """Return one line: `12:00:00.123+0200 comms/msg/BasestationManualDrive forward_backward=5`."""
         line = f"{clock_text(self.at)} {self.type_name} {one_line(words(ros_tree(self.message)))}"
         return f"{line} [{self.cdr.hex()}]" if with_hex else line
 
     def json(self, with_hex: bool) -> str:
         """Return one JSON object."""
         document = {
-            "time": self.at.isoformat(),
+            "time": self.at.astimezone(dt.timezone.utc).isoformat(),
             "type": self.type_name,
             "bytes": len(self.cdr),
             "fields": ros_json(self.message),
         }
         return json.dumps(document | {"hex": self.cdr.hex()} if with_hex else document)
-
-
-def clock_text(at: dt.datetime) -> str:
-    """Return a time of day with milliseconds."""
-    return f"{at:%H:%M:%S.%f}"[:-3]
 
 
 def local_time(at: int) -> dt.datetime:

@@ -12,8 +12,11 @@ from router.compiler.metrics import INTENDED_REASONS
 from router.observe.problems import DROPS, Kind, Level, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
-WINDOW = 3.0
-"""Seconds over which rates are computed: with less, the rate of one message in two seconds flickers."""
+WINDOW = 4.0
+"""Seconds over which rates and latencies are computed, as on the status page.
+
+With less, the rate of one message in two seconds flickers.
+"""
 
 
 class Order(enum.Enum):

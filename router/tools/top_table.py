@@ -131,8 +131,13 @@ def _rate(rate: float) -> Text:
 
 
 def _drops(row: RouteRow) -> Text:
-    """Return the drops: red and with a `!` while messages are lost; yellow if some were lost before."""
+    """Return the drops: red and with a `!` while messages are lost; yellow if some were lost before.
+
+    A route whose deadman sends may drop nothing because it receives nothing.
+    """
     text, style = reasons_text(row.dropped) or "-", "yellow" if row.lost else "dim"
+    if row.is_tripped and not row.rate and not row.dropped:
+        text, style = "none accepted", "red"
     if row.is_losing:
         text, style = f"!{text}", "bold red"
     return Text(text, style=style, no_wrap=True, overflow="ellipsis")

@@ -6,6 +6,7 @@ import os
 import select
 import sys
 import termios
+import textwrap
 import time
 import tty
 from collections import Counter
@@ -96,7 +97,7 @@ class Screen:
         return RouteTable(self.view, self.order, room, self.first)
 
     def _head(self, width: int) -> list[Text]:
-        return _summary(self.view, width, min(_ENDPOINT_LINES, max(self.height // 6, 1)))
+        return _summary(self.view, width, max(self.height // 5, 1), min(_ENDPOINT_LINES, max(self.height // 6, 1)))
 
     def moved(self, key: str, width: int) -> int:
         """Return the number of the first route after a key was pressed."""
@@ -113,7 +114,7 @@ class Page:
     order: Order
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield from _summary(self.view, options.max_width, len(self.view.silence))
+        yield from _summary(self.view, options.max_width, sys.maxsize, len(self.view.silence))
         yield RouteTable(self.view, self.order, len(self.view.routes) + 1)
 
 
@@ -130,17 +131,29 @@ def _foot(table: RouteTable) -> Text:
     return foot.append("  q quit")
 
 
-def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
+def _summary(view: View, width: int, problem_lines: int, endpoint_lines: int) -> list[Text]:
     """Return the whole router in a line or two, what is wrong with it, and when its endpoints were last heard."""
     flow, losses = _summary_parts(view)
     whole = f"{flow}, {losses}"
     totals = [whole] if len(whole) <= width else [flow, losses]
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
-    if view.problems:
-        lines.append(Text("! " + "; ".join(view.problems), style="bold red", no_wrap=True, overflow="ellipsis"))
+    lines += _problems(view, width, problem_lines)
     if view.calm:
         lines.append(Text("; ".join(view.calm), style="dim", no_wrap=True, overflow="ellipsis"))
     return [*lines, *_last_heard(view, width, endpoint_lines)]
+
+
+def _problems(view: View, width: int, most: int) -> list[Text]:
+    """Return the problems below each other, wrapped at words; those that do not fit are counted."""
+    wrapped = [
+        textwrap.wrap(f"! {each}", width, subsequent_indent="  ", break_on_hyphens=False) for each in view.problems
+    ]
+    lines = [line for problem in wrapped for line in problem]
+    if len(lines) > most:
+        lines, hidden = lines[: max(most - 1, 1)], lines[max(most - 1, 1) :]
+        if (more := sum(line.startswith("!") for line in hidden)) and most > 1:
+            lines.append(f"! and {more} more: see `router doctor`")
+    return [Text(line, style="bold red", no_wrap=True, overflow="ellipsis") for line in lines]
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:

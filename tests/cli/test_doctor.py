@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import socket
 from pathlib import Path
 
@@ -34,5 +35,23 @@ def test_before_a_start_that_will_work_it_is_silent(table: Path, capsys: pytest.
     assert capsys.readouterr().out == ""
 
 
-def test_the_grade_is_coloured() -> None:
-    assert shown(warning("clock", "late", "set it"), coloured=True).startswith("\x1b[33mwarning \x1b[0m clock")
+def test_on_a_terminal_the_grade_is_coloured_and_lines_are_wrapped_at_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("COLUMNS", "40")
+    found = warning("clock", "it is three seconds late", "set it with /a/long/path/that/stays/whole")
+    assert shown(found, Terminal()).splitlines() == [
+        "\x1b[33mwarning \x1b[0m clock      it is three seconds",
+        " " * 20 + "late",
+        " " * 20 + "-> set it with",
+        " " * 23 + "/a/long/path/that/stays/whole",
+    ]
+    assert shown(found, io.StringIO()).splitlines() == [
+        "warning  clock      it is three seconds late",
+        " " * 20 + "-> set it with /a/long/path/that/stays/whole",
+    ]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True

@@ -116,7 +116,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> Told:
 
 def without_times(out: str) -> list[str]:
     lines = out.rpartition("\n\n")[2].splitlines()
-    return [re.sub(r"since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d$", "since TIME", line) for line in lines]
+    return [re.sub(r"since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d [+-]\d{4}$", "since TIME", line) for line in lines]
 
 
 def test_what_is_kept_of_a_table_is_told_by_command_line_and_folder(table: Path, told: Told) -> None:

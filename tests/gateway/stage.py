@@ -37,6 +37,7 @@ envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
 node: {{name: router}}
 listen: {{here: {{address: 127.0.0.1:25000}}}}
 endpoints: {{board: {{address: 127.0.0.2:8, kind: board}}}}
+http: {{address: 127.0.0.1:9108}}
 routes: {{}}
 gateways: {{{gateways}}}
 """

@@ -60,7 +60,7 @@ def page(browser: Browser, gateway: FakeGateway) -> Iterator[Page]:
 
 def row(name: str) -> str:
     """JavaScript for the row of a topic; null if there is none."""
-    is_it = f"row => row.querySelector('.name').textContent === {json.dumps(name)}"
+    is_it = f"row => row.querySelector('.name').title === {json.dumps(name)}"
     return f"([...document.querySelectorAll('tbody tr')].find({is_it}) ?? null)"
 
 
@@ -155,6 +155,34 @@ def test_types_and_names_are_not_cut(gateway: FakeGateway, page: Page) -> None:
     for size in ((1366, 768), (1920, 1080)):
         show_at(page, size)
         page.until(f"{cell}?.textContent === '{long}' && {cell}.scrollWidth <= {cell}.clientWidth")
+
+
+def test_long_names_lose_their_middle_and_leave_room_for_values(gateway: FakeGateway, page: Page) -> None:
+    names = [
+        f"/vehicle/{side}_wheel_module/suspension_actuator_temperature/raw_measurement" for side in ("left", "right")
+    ]
+    gateway.list_topics(names)
+    for name in names:
+        gateway.data(name, {"x": 1.25, "y": -2.5})
+    for size in (PHONE, (1366, 768), (1920, 1080)):
+        show_at(page, size)
+        for name in names:
+            page.until(f"{row(name)}?.innerText.includes('x: 1.25, y: -2.5')")
+            cell = f"{row(name)}.querySelector('.name')"
+            page.until(f"{cell}.scrollWidth <= {cell}.clientWidth && {cell}.scrollHeight <= {cell}.clientHeight")
+            assert page.evaluate(f"{cell}.ariaLabel") == name
+        texts = page.evaluate("[...document.querySelectorAll('.name')].map((cell) => cell.textContent)")
+        assert len(set(texts)) == len(names)
+        assert all(text.endswith("measurement") for text in texts)
+
+
+def test_a_stamp_is_also_shown_in_local_time(gateway: FakeGateway, page: Page) -> None:
+    page.call("Emulation.setTimezoneOverride", timezoneId="Asia/Kolkata")
+    gateway.data("/imu", {"stamp": {"sec": 1700000000, "nanosec": 250_000_000}, "delay": {"sec": 5, "nanosec": 0}})
+    choose(page, "/imu")
+    notes = "[...document.querySelectorAll('#tree summary')].map((line) => line.textContent.trim())"
+    expected = ["sensor_msgs/msg/Imu", "stamp 2023-11-15 03:43:20.250 +05:30", "delay"]
+    page.until(f"{notes}.join() === {json.dumps(','.join(expected))}")
 
 
 STAMP = schema("Time", field("sec", "int32"))
@@ -627,7 +655,7 @@ def test_the_page_reconnects_and_keeps_what_was_typed(gateway: FakeGateway, page
     received(gateway)
     gateway.go_down()
     page.until("document.querySelector('#state').textContent.startsWith('no connection')")
-    assert re.fullmatch(r"No answer from the gateway since \d\d:\d\d:\d\d \(.* s\)", page.text("#silence"))
+    assert re.fullmatch(r"No answer from the gateway since \d\d:\d\d:\d\d GMT\S* \(.* s\)", page.text("#silence"))
     assert page.evaluate("getComputedStyle(document.querySelector('main')).filter") == "grayscale(1)"
     assert page.evaluate("document.querySelector('[form=form]').disabled") is True
     assert page.evaluate("repeating") == 0
@@ -669,7 +697,7 @@ def test_what_cannot_be_read_is_counted_and_ends_nothing(gateway: FakeGateway, p
     )
     choose(page, "/x")
     page.until("document.querySelector('#tree').innerText === 'This value cannot be read.'")
-    page.until("document.querySelector('#state').textContent === 'connected, 3 documents unreadable'")
+    page.until("document.querySelector('#state').textContent === 'connected, 3 messages unreadable'")
 
 
 # Safety, looks and hands

@@ -38,6 +38,7 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path,
         try:
             page = browser.open(f"http://127.0.0.1:{port}/?topic=/camera/compressed")
             page.until(f"document.title === {json.dumps(f'Gateway camera · 127.0.0.1:{port}')}")
+            assert page.evaluate("document.querySelector('#status').href") == "http://127.0.0.1:9108/"
             assert publisher.line() == "matched"
             publisher.publish([serialize_message(message)])
             page.until(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import pytest
 from router.clock import wall_ns
 from router.compiler import check_table
 from router.observe import responses
+from router.tools.top import quantile
 from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
 from tests.gateway.browser import Browser, Page
@@ -445,6 +447,32 @@ def test_topics_are_named_as_far_as_there_is_room(page: Page) -> None:
         page.until(f"/{text.replace('/', '.')}/.test({shown})")
     accessibility.show_at(page, DESKTOP)
     assert page.evaluate(f"{box('case:drive_motor')}.innerText.includes('←drive_motor')")
+
+
+LONG = "vehicle/front_left_wheel_module/suspension_actuator_temperature/raw_measurement"
+
+
+def test_a_long_name_of_a_topic_is_shortened_to_the_room(page: Page) -> None:
+    page.evaluate(f"nodes.get('to:gps_data').name = {json.dumps(LONG)}")
+    chip = f"{box('case:gps_info')}.querySelector('.chip')"
+    for size in ((1366, 768), PHONE):
+        accessibility.show_at(page, size)
+        page.until(f"/^·veh[^+]*…[^+]*ent/.test({chip}.innerText)")
+        assert page.evaluate(f"{chip}.scrollWidth <= {chip}.clientWidth")
+
+
+def test_the_legend_says_since_when_rates_are_known(page: Page) -> None:
+    until_compared(page)
+    assert re.fullmatch(r"last \d+(\.\d)? s", page.text("#known"))
+    page.evaluate("answers.unshift({...answers[0], at: now().at - 61}); renderMap()")
+    assert page.text("#known") == "last minute"
+
+
+def test_latencies_are_those_of_router_top(page: Page) -> None:
+    counts = {0.001: 10.0, 0.002: 40.0, 0.004: 99.0, math.inf: 100.0}
+    for part in (0.05, 0.5, 0.99, 1):
+        in_page = page.evaluate(f"quantile([[.001, 10], [.002, 40], [.004, 99], [Infinity, 100]], {part})")
+        assert (math.inf if in_page is None else in_page) == pytest.approx(quantile(counts, part))
 
 
 def test_a_laptops_screen_has_room_for_the_name_of_a_topic_in_each_row(page: Page) -> None:

@@ -31,6 +31,7 @@ from router.tools.doctor_checks import (
     fine,
     listeners,
     open_domain,
+    page,
     ports,
     problem,
     receive_buffers,
@@ -460,13 +461,20 @@ def test_what_is_wrong_with_a_running_router_is_told_with_its_remedy_and_page(ta
     silent = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "sensor_board"}, ": last heard 9 s ago", "Check its cable.")
     with serving(compiled(table), stuck, silent):
         first, second = told(table)
-    page = "docs/troubleshooting/alerts.md"
+    page_path = page("docs/troubleshooting/alerts.md")
     assert first == problem(
-        "router", "the receive thread is stuck: no progress for 7 s", f"Restart it. See {page}#receivestuck"
+        "router", "the receive thread is stuck: no progress for 7 s", f"Restart it. See {page_path}#receivestuck"
     )
     assert second == warning(
-        "router", "sensor_board is silent: last heard 9 s ago", f"Check its cable. See {page}#endpointsilent"
+        "router", "sensor_board is silent: last heard 9 s ago", f"Check its cable. See {page_path}#endpointsilent"
     )
+
+
+def test_pages_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for kind in Kind:
+        path, _, section = page(Problem(kind, dict.fromkeys(kind.labels, "x")).page).partition("#")
+        assert f"## {section}\n" in Path(path).read_text(encoding="utf-8").lower()
 
 
 def test_a_rover_that_nobody_drives_is_fine(table: Path) -> None:

@@ -83,6 +83,7 @@ def test_what_means_nothing_is_refused_with_the_reason(data: bytes, complaint: s
 
 
 NOON = dt.datetime(2026, 5, 1, 12, 0, 0, 123_000).timestamp()  # noqa: DTZ001 - local, as it is shown
+CLOCK = f"12:00:00.123{dt.datetime.fromtimestamp(NOON).astimezone():%z}"
 FIELDS = {
     "x": Shape("float32", False, {}),
     "list": Shape("float64", True, {}),
@@ -119,7 +120,7 @@ def message(data: dict[str, Any], is_wrapped: bool = True, shape: Any = FIELDS) 
     ],
 )
 def test_single_values_stand_without_their_list_and_long_lists_are_cut(data: dict[str, Any], values: str) -> None:
-    assert line(message(data)) == f"12:00:00.123 /imu p/msg/T {values}"
+    assert line(message(data)) == f"{CLOCK} /imu p/msg/T {values}"
 
 
 def test_before_the_schema_and_where_nothing_is_wrapped_values_are_shown_as_received() -> None:
@@ -131,9 +132,9 @@ def test_before_the_schema_and_where_nothing_is_wrapped_values_are_shown_as_rece
 
 def test_a_schema_is_shortened_to_its_fields() -> None:
     assert line(Schema(NOON, "/imu", "p/msg/T", {}, FIELDS)) == (
-        "12:00:00.123 /imu p/msg/T schema x:float32 list:float64[] header:Header points:Point[]"
+        f"{CLOCK} /imu p/msg/T schema x:float32 list:float64[] header:Header points:Point[]"
     )
-    assert line(Schema(NOON, "", "p/msg/T", {}, {})) == "12:00:00.123 p/msg/T schema (empty)"
+    assert line(Schema(NOON, "", "p/msg/T", {}, {})) == f"{CLOCK} p/msg/T schema (empty)"
 
 
 def test_what_else_is_heard_is_shown_too() -> None:

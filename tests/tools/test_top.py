@@ -71,7 +71,8 @@ def printed(shown: object, width: int = 120) -> list[str]:
 def test_a_page_has_all_of_it() -> None:
     assert printed(Page(SEEN, Order.TABLE)) == [
         "in 113 (55/s), delivered 115 (55/s), lost 3 malformed, 3 stale",
-        f"! sensor_board is silent: last heard 1 s ago; {HELD.words}",
+        "! sensor_board is silent: last heard 1 s ago",
+        f"! {HELD.words}",
         "last heard !sensor_board 1.0 s arm_board never",
         "route in/s endpoints topics p50 p99 age drops",
         "!imu_info 50 basestation 50 imu_data 0 15 us 20 us 5.0 s -",
@@ -90,6 +91,26 @@ def test_a_route_that_is_halted_because_nobody_drives_is_no_alarm() -> None:
     assert (seen.problems, seen.calm) == ((), ("imu_info is halted: no commands for 27 min",))
     assert printed(Page(seen, Order.TABLE))[1] == "imu_info is halted: no commands for 27 min"
     assert not any(line.startswith("!") for line in printed(Page(seen, Order.TABLE)))
+
+
+def test_problems_are_below_each_other_and_wrapped() -> None:
+    problems = tuple(f"{name} is silent: last heard 12 s ago, by another address" for name in ("a" * 40, "b", "c", "d"))
+    seen = replace(SEEN, problems=problems, silence={})
+    assert lines_of(Screen(seen, "t", Order.TABLE, 30), 80)[2:7] == [
+        f"! {'a' * 40} is silent: last heard 12 s ago, by",
+        "  another address",
+        "! b is silent: last heard 12 s ago, by another address",
+        "! c is silent: last heard 12 s ago, by another address",
+        "! d is silent: last heard 12 s ago, by another address",
+    ]
+    assert "! and 3 more: see `router doctor`" in lines_of(Screen(seen, "t", Order.TABLE, 12), 80)
+    assert len([line for line in lines_of(Page(seen, Order.TABLE), 80) if line.startswith("! ")]) == 4
+
+
+def test_a_deadman_that_sends_for_want_of_commands_says_so_in_place_of_drops() -> None:
+    (row, *others) = SEEN.routes
+    halted = replace(SEEN, routes=(replace(row, rate=0.0, is_tripped=True), *others))
+    assert printed(Page(halted, Order.TABLE))[5].endswith("none accepted")
 
 
 @pytest.mark.parametrize("height", [7, 8, 24])
@@ -262,7 +283,7 @@ def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
     for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140)):
         window.add(snapshot(at, imu))
         rates.append(view(*window.ends).routes[0].rate)
-    assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
+    assert rates == [0.0, 10.0, 10.0, 20.0, 32.5]
 
 
 def test_a_window_is_of_one_run_of_the_router() -> None:
