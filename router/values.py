@@ -261,9 +261,14 @@ def float_text(value: float, bits: int, digits: int | None = None) -> str:
     return next(text for p in range(6, 10) if struct.pack("<f", float(text := f"{value:.{p}g}")) == packed)
 
 
+def time_text(at: datetime) -> str:
+    """Return a time of day with milliseconds."""
+    return f"{at:%H:%M:%S.%f}"[:-3]
+
+
 def clock_text(at: datetime) -> str:
-    """Format the time of day of a local time, with its offset from UTC: `12:00:00.123+0200`."""
-    return f"{at:%H:%M:%S}.{at.microsecond // 1000:03}{at:%z}"
+    """Return a time of day with milliseconds and its offset from UTC: `10:15:00.123+0530`."""
+    return f"{time_text(at)}{at:%z}"
 
 
 def age_text(seconds: float | None) -> str:

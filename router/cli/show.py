@@ -72,14 +72,15 @@ def run(args: argparse.Namespace) -> int:
 def _say_what(recording: Recording, first: Entry) -> None:
     from router.recording.about import tripped_in
     from router.tools.tap import local_time
-    from router.values import clock_text
+    from router.values import time_text
 
     begin = local_time(first.at)
     tripped = ", ".join(tripped_in(recording.about))
     why = f"saved because of {tripped}, " if tripped else ""
+    offset = f"{begin:%z}"
     say(
         f"{recording.path}: {why}table {recording.about.get('table', 'unknown')}; "
-        f"begins {begin:%Y-%m-%d} {clock_text(begin)}, local time"
+        f"begins {begin:%Y-%m-%d} {time_text(begin)}, local time (UTC{offset[:3]}:{offset[3:]})"
     )
 
 
@@ -93,9 +94,9 @@ def _window(args: argparse.Namespace, first: Entry) -> tuple[int, int] | None:
 
 def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
     from router.tools.tap import local_time
-    from router.values import clock_text
+    from router.values import time_text
 
-    begin, end, last_shown = (clock_text(local_time(each)) for each in (*span, last))
+    begin, end, last_shown = (time_text(local_time(each)) for each in (*span, last))
     say(f"{what} between {begin} and {end}; the recording ends at {last_shown}")
 
 

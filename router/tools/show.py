@@ -15,7 +15,7 @@ from router.datagrams import Decoded, Wire
 from router.errors import DecodeError, UsageError
 from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action
 from router.recording.reader import Recorded, RecordedAction
-from router.tools.tap import Condition, TappedDatagram, local_time, tapped_datagram
+from router.tools.tap import Condition, TappedDatagram, local_time, tapped_datagram, utc_text
 from router.values import clock_text, compact
 
 Entry = Recorded | RecordedAction
@@ -72,7 +72,7 @@ class ShownAction:
     decoded: Decoded | None
 
     def line(self, with_hex: bool = False) -> str:
-        """Return one line: `12:00:00.123 sent to driving_board (manual_drive from topic cmd): drive_motor left=5`."""
+        """Return one line: `12:00:00.123+0200 sent to driving_board (drive from topic cmd): drive left=5`."""
         del with_hex  # nothing is shown in hexadecimal
         return f"{clock_text(self.at)} {self._what()}"
 
@@ -103,7 +103,7 @@ class ShownAction:
         """Return one JSON object."""
         del with_hex
         it = self.action
-        document: dict[str, object] = {"time": self.at.isoformat(), "action": it.what, "route": it.route}
+        document: dict[str, object] = {"time": utc_text(self.at), "action": it.what, "route": it.route}
         texts = {"endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
         document |= {key: text for key, text in texts.items() if text}
         if self.decoded is not None:

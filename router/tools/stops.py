@@ -14,8 +14,8 @@ from router.recording.about import RecordedRoute
 from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, first_field
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model import ANY
-from router.tools.tap import local_time
-from router.values import clock_text, compact
+from router.tools.tap import local_time, utc_text
+from router.values import compact, time_text
 
 _MS = 1_000_000
 _UNKNOWN = RecordedRoute("", (), False, 0.0, ())
@@ -106,14 +106,14 @@ class Stop:
         fed = self.fed
         return json.dumps(
             {
-                "time": local_time(self.at).isoformat(),
+                "time": utc_text(local_time(self.at)),
                 "route": self.route,
                 "stopped": [*self.settings.brakes],
                 "cause": cause,
                 "remedy": remedy,
                 "last_fed": None
                 if fed is None
-                else {"time": local_time(fed.at).isoformat(), "case": fed.case, "sender": fed.sender},
+                else {"time": utc_text(local_time(fed.at)), "case": fed.case, "sender": fed.sender},
                 "lost": [
                     {
                         "decision": each.decision,
@@ -130,7 +130,7 @@ class Stop:
                     for (case, endpoint, problem), count in self.brakes.items()
                 ],
                 "obeyed": self.obeyed,
-                "released": None if self.released is None else local_time(self.released).isoformat(),
+                "released": None if self.released is None else utc_text(local_time(self.released)),
             }
         )
 
@@ -292,7 +292,7 @@ class Stops:
 
 
 def _clock(at: int) -> str:
-    return clock_text(local_time(at))
+    return time_text(local_time(at))
 
 
 def _length(ns: int) -> str:

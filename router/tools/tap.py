@@ -136,7 +136,7 @@ class TappedDatagram:
     def json(self, with_hex: bool) -> str:
         """Return one JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
         document: dict[str, object] = {
-            "time": self.at.astimezone(dt.timezone.utc).isoformat(),
+            "time": utc_text(self.at),
             "peer": self.peer,
             "bytes": len(self.data),
         }
@@ -172,12 +172,17 @@ class TappedMessage:
     def json(self, with_hex: bool) -> str:
         """Return one JSON object."""
         document = {
-            "time": self.at.astimezone(dt.timezone.utc).isoformat(),
+            "time": utc_text(self.at),
             "type": self.type_name,
             "bytes": len(self.cdr),
             "fields": ros_json(self.message),
         }
         return json.dumps(document | {"hex": self.cdr.hex()} if with_hex else document)
+
+
+def utc_text(at: dt.datetime) -> str:
+    """Return a time for programs: UTC in ISO 8601."""
+    return at.astimezone(dt.timezone.utc).isoformat()
 
 
 def local_time(at: int) -> dt.datetime:
