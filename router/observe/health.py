@@ -46,7 +46,10 @@ RETURNED = 300
 """Seconds for which a silence that has ended is shown."""
 
 REMEDIES: Mapping[str, str] = {
-    "send_error": "The network rejects them, or nothing listens there: check that the receiver runs, and its address.",
+    "send_error": (
+        "{target} does not answer or listen, or the network rejects them: check that it runs, cable and address; the "
+        "log has the error."
+    ),
     "send_buffer_full": (
         "{target} does not answer: check power, cable and address. If it answers, the network is too slow: route less."
     ),
