@@ -45,7 +45,7 @@ routes:
     fields: auto
     destinations: [arm_board]
     ttl: {ttl}ms
-    deadman: {{{deadman}, to: [arm_board]}}
+    deadman: {{{deadman}, to: [arm_board], because: the arm board stands for a second driving board here}}
   manual_arm: {{deadman: {{because: the arm board stands for a second driving board here}}}}
 """
 

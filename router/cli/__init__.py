@@ -90,7 +90,7 @@ VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.i
 
 SHELLS = ("bash", "zsh", "fish")
 _OPTIONS = {
-    "--version": "show the version and exit",
+    "--version": "print the version and exit",
     f"--completion {'|'.join(SHELLS)}": "print the completion script, for eval in the shell's start-up file",
 }
 _INDENT = " " * 12

@@ -207,7 +207,7 @@ def test_what_is_dropped_is_crossed_and_said_in_words(running: FakeRunning, page
     assert page.evaluate(f"{line('case:imu_info', 'to:@basestation')}.cross.checkVisibility()")
     assert "✕ dropping" in page.evaluate(f"{box('case:imu_info')}.innerText")
     until_said(page, "Messages for basestation are dropped: send_error, 12 of imu_info in ", "warn")
-    assert page.text("#todo").startswith("The network rejects them, or nothing listens there")
+    assert page.text("#todo").startswith("basestation does not answer or listen, or the network rejects them")
     page.click("#show")
     page.until("document.querySelector('#name').textContent === 'imu_info'")
     page.until("document.querySelector('#facts').textContent.includes('dropped: 12 send_error')")
@@ -457,7 +457,7 @@ def test_a_long_name_of_a_topic_is_shortened_to_the_room(page: Page) -> None:
     chip = f"{box('case:gps_info')}.querySelector('.chip')"
     for size in ((1366, 768), PHONE):
         accessibility.show_at(page, size)
-        page.until(f"/^·veh[^+]*…[^+]*ent/.test({chip}.innerText)")
+        page.until(f"/^◇veh[^+]*…[^+]*ent/.test({chip}.innerText)")
         assert page.evaluate(f"{chip}.scrollWidth <= {chip}.clientWidth")
 
 
