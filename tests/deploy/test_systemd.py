@@ -297,7 +297,7 @@ def test_a_killed_router_comes_back(running: Machine) -> None:
 def test_a_loop_of_crashes_ends(running: Machine) -> None:
     running.shell(
         "mkdir -p /run/systemd/system/rover-router.service.d\n"
-        "printf '[Service]\\nType=exec\\nExecStart=\\nExecStart=/bin/false\\n' "
+        "printf '[Service]\\nType=exec\\nExecStart=\\nExecStart=/usr/bin/env no-such-program\\n' "
         "> /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload"
     )
     running.run("systemctl", "restart", "rover-router", check=False)
