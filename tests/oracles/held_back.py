@@ -32,17 +32,13 @@ class Message:
 
 
 class Pacer:
-    """`slack` is how long it waits for more before it sends what never expires."""
-
-    def __init__(self, bandwidth: int, fate: Fate, slack: int = BURST // 2) -> None:
+    def __init__(self, bandwidth: int, fate: Fate) -> None:
         self._bandwidth = bandwidth
         self._fate = fate
         self._waiting: list[Message] = []
         self._superseded: set[int] = set()
         """Numbers of messages that are lost already, but take room until they are the first."""
         self._paid_at = -BURST
-        self._slack = slack
-        self._has_expiring = False
         self.has_ended = False
         self.next_due: int | None = None
 
@@ -55,7 +51,6 @@ class Pacer:
             return
         self._limit_savings(now)
         self._waiting.append(message)
-        self._has_expiring |= message.expires is not None
         self._send_affordable(now)
         room = min(max(self._bandwidth, LEAST_ROOM), MOST_ROOM)
         while sum(each.size for each in self._waiting) > room or len(self._waiting) > room // BYTES_PER_DATAGRAM:
@@ -106,12 +101,11 @@ class Pacer:
                 is_lost = first.is_stale(now) or first.number in self._superseded
                 if now < may_go_at and not is_lost:
                     ends = [] if first.expires is None else [first.expires + 1]
-                    self.next_due = min([may_go_at + (0 if self._has_expiring else self._slack), *ends])
+                    self.next_due = min([may_go_at, *ends])
                     return
                 self._send(now, first)
                 if is_lost:
                     self._limit_savings(now)
-        self._has_expiring = False
 
     def _send(self, now: int, message: Message) -> None:
         self._waiting.remove(message)

@@ -34,8 +34,7 @@ struct pacer {
     int64_t overdraft;
     int64_t bytes_left, datagrams_left; /* that may still wait; below 0 until the oldest is dropped */
     int64_t paid_at; /* when the budget has paid for everything sent; the time from then to now is accumulated */
-    bool has_expiring; /* one that expires was queued since nothing waited */
-    bool has_ended;    /* datagrams no longer wait */
+    bool has_ended;  /* datagrams no longer wait */
 };
 
 /* ---- lanes ---- */
@@ -134,14 +133,11 @@ static int64_t send_affordable(struct timers *timers, struct pacer *pacer, int64
             int64_t may_go_at = pacer->paid_at + (index == PRIORITY_COMMAND ? -pacer->overdraft : first->cost);
             if (now < may_go_at && now <= first->expires) {
                 /* An expired one no longer raises the limit of the accumulated budget. */
-                if (may_go_at > first->expires) return first->expires + 1;
-                /* If nothing expires meanwhile, later than necessary: one call then sends several. */
-                return pacer->has_expiring ? may_go_at : may_go_at + BURST / 2;
+                return may_go_at > first->expires ? first->expires + 1 : may_go_at;
             }
             if (!send_first(timers, pacer, lane, now)) limit_savings(pacer, now);
         }
     }
-    pacer->has_expiring = false;
     return NEVER;
 }
 
@@ -191,7 +187,6 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target
     }
     limit_savings(pacer, now);
     put(&pacer->lanes[of->target->priority], &waiting, data);
-    pacer->has_expiring |= expires != NEVER;
     pacer->bytes_left -= (int64_t)size;
     pacer->datagrams_left--;
     of->queued++;

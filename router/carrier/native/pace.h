@@ -8,8 +8,7 @@
  * Waiting datagrams are sent by priority, then by age. If there is no room, the oldest one of the lowest priority is dropped
  * as `queue_full`; datagrams that expire are dropped as `stale`. A datagram is charged even if sending it fails.
  *
- * While all waiting datagrams never expire, they leave up to 10 ms late, several at a time. Otherwise each leaves as soon as
- * the budget has paid for it. */
+ * Each leaves as soon as the budget has paid for it. */
 #ifndef PACE_H
 #define PACE_H
 
