@@ -90,14 +90,18 @@ class ClientQueue:
         self._held[topic] = []
         return True
 
-    async def takes_more(self, timeout: float) -> bool:
-        """Wait until frames can be written at once. Return False after `timeout` s, or if the client has left."""
-        until = asyncio.get_running_loop().time() + timeout
-        while not self.keeps_up:
+    async def takes_more(self, patience: float, until: float) -> bool:
+        """Wait until frames can be written at once.
+
+        Return False if the client takes nothing for `patience` s, at the time `until` of the loop, or once it has left.
+        """
+        loop = asyncio.get_running_loop()
+        while not self.keeps_up and not self.has_left:
             if self._drained is None:
-                self._drained = asyncio.get_running_loop().create_future()
-            left = until - asyncio.get_running_loop().time()
-            if not (await asyncio.wait([self._drained], timeout=max(left, 0.0)))[0] or self.has_left:
+                self._drained = loop.create_future()
+            before = self.client.backlog()
+            done, _ = await asyncio.wait([self._drained], timeout=max(0.0, min(patience, until - loop.time())))
+            if not done and (loop.time() >= until or self.client.backlog() >= before):
                 return False
         return not self.has_left
 
@@ -123,7 +127,7 @@ class ClientQueue:
         self._held_bytes -= sum(len(frame.data) for frame in frames)
         return frames
 
-    def held_before(self, topic: str, sent_ns: int) -> list[Frame]:
+    def held_before(self, topic: str, sent_ns: float) -> list[Frame]:
         """Return the held values of the topic that were published before this time; they stay held."""
         return [frame for frame in self._held.get(topic, ()) if frame.sent_ns < sent_ns]
 

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import aclosing, suppress
 from functools import partial
 from itertools import chain, count, repeat
+from math import inf
 
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
@@ -16,7 +17,7 @@ from router.gateway.clients import ClientQueue, Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Sample
-from router.gateway.kept import FRESH_S, Kept
+from router.gateway.kept import Kept
 from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import NotInstalledError, TopicSubscription
@@ -35,9 +36,8 @@ SHORTEST_PAUSE_S = 0.1
 RESEND_S = 0.5
 """The interval of checks for clients that lack messages which publishers still keep."""
 
-DRAIN_S = FRESH_S
-SHOW_S = 5.0
-"""How long kept messages wait for a client to drain: for one, and for all of a topic."""
+DRAIN_S, SHOW_S = 1.0, 10.0
+"""How long kept messages of a topic wait for a client that takes nothing, and for one that takes them slowly."""
 
 SHORTEST_TURN = 10_000_000
 """The minimum time between turns, ns: shorter ones cost more than they gain."""
@@ -262,7 +262,7 @@ class Topics:
         return True, False
 
     async def _write_fetched(self, queue: ClientQueue, served: ServedTopic, kept: Kept) -> bool:
-        """Write fetched messages as the client drains. Return False if it does not within SHOW_S, or DRAIN_S for one.
+        """Write fetched messages as the client drains. Return False if it takes nothing for DRAIN_S, or too long.
 
         Then it gets the others later, from publishers that still keep them.
         """
@@ -289,14 +289,15 @@ class Topics:
                 held = [each for each in queue.held_before(topic, frame.sent_ns) if each.sent_ns not in skipped]
                 skipped.update(each.sent_ns for each in held)
                 waiting += (*held, frame)
-        if waiting and not await self._write_when_drained(queue, waiting, until):
-            return False
-        known.update(each.sent_ns for each in waiting)
+        while waiting := waiting or [each for each in queue.held_before(topic, inf) if each.sent_ns not in known][:1]:
+            if not await self._write_when_drained(queue, waiting, until):
+                return False
+            known.update(each.sent_ns for each in waiting)
+            waiting = []
         return True
 
     async def _write_when_drained(self, queue: ClientQueue, frames: Sequence[Frame], until: float) -> bool:
-        left = until - asyncio.get_running_loop().time()
-        if left < 0 or not await queue.takes_more(min(left, DRAIN_S)):
+        if not await queue.takes_more(DRAIN_S, until):
             return False
         if not self._clients.has_room(sum(len(frame.data) for frame in frames)):
             return False
