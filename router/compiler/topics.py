@@ -177,7 +177,12 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
 
 
 def _loops(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
-    """Yield findings for endpoints that would get their own messages back through a topic."""
+    """Yield findings for endpoints that would get their own messages back through a topic.
+
+    Another payload case is no loop but an answer.
+    """
+    if publisher.case.value != subscriber.case.value:
+        return
     sources = {source.value for source in publisher.sources}
     for destination in subscriber.destinations:
         sender = destination.endpoint

@@ -323,3 +323,9 @@ def test_nobody_gets_back_through_a_topic_what_he_sent(
 ) -> None:
     found = codes(check_text, PUBLISHED % (source, published), TOPIC % (heard, destination))
     assert found == [Code.FORWARDING_LOOP] * is_loop
+
+
+def test_an_answer_of_another_case_through_the_same_topic_is_no_loop(check_text: CheckText) -> None:
+    asked, answered = PUBLISHED % ("one", "a"), (TOPIC % ("a", "one")).replace("ph_value", "pressure_kpa")
+    found = check_text(f"routes: {{ph_info: {asked}, pressure_info: {answered}}}", endpoints=TOOLS).diagnostics
+    assert {finding.code for finding in found} == {Code.UNCOVERED_PAYLOAD_CASE}
