@@ -1,6 +1,7 @@
 """Reads a recording: the datagrams, byte for byte, in the order in which the router received them, and its actions.
 
-If the writer was killed, it reads all complete chunks of the file.
+If the writer was killed, it reads all complete chunks of the file. Other tools may have rewritten the file: they put
+their own name into the header, and may move the metadata behind the messages or leave it out.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import zstandard
 from google.protobuf.message import DecodeError as ProtobufError
 from mcap.exceptions import McapError
-from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from router.datagrams import Peer
@@ -23,11 +24,12 @@ from router.errors import UsageError
 from router.recording.channels import Datagram, Event, Holds
 from router.recording.mirror import Action
 from router.recording.schemas import RecordedCase
-from router.recording.writer import LIBRARY, METADATA
+from router.recording.writer import METADATA
 from router.types.wire import LEN, varint
 
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
 """Errors in files that no recorder wrote; lz4, which `mcap recover` may have used, raises RuntimeError."""
+_OURS = frozenset(each.value for each in Holds)
 
 
 class Recorded(NamedTuple):
@@ -67,7 +69,10 @@ _Decoder = Callable[[int, bytes], "_Decoded | Action | None"]
 
 
 class Recording:
-    """A recording. `about` is its metadata. Raises UsageError if the file is not a recording of a router."""
+    """A recording. `about` is its metadata, empty if a tool left it out.
+
+    Raises UsageError if the file is not a recording of a router: it has neither the metadata nor a channel of one.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,12 +85,13 @@ class Recording:
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from error
         self.size = os.fstat(self._file.fileno()).st_size  # the file may be removed meanwhile
-        self._records = StreamReader(self._file, validate_crcs=True, record_size_limit=self.size).records
         try:
-            self._begin()
+            self._find_metadata()
         except UsageError:
             self.close()
             raise
+        self._file.seek(0)
+        self._records = StreamReader(self._file, validate_crcs=True, record_size_limit=self.size).records
 
     @property
     def position(self) -> int:
@@ -138,18 +144,23 @@ class Recording:
     def _take(self, record: McapRecord) -> None:
         if isinstance(record, Channel):
             self._decoders[record.id] = _decoder(record.metadata)
-        elif isinstance(record, Metadata) and record.name == METADATA:
-            self.about = record.metadata
         elif isinstance(record, Footer):
             self.is_whole = True
 
-    def _begin(self) -> None:
+    def _find_metadata(self) -> None:
+        """Read up to the metadata, which the router writes first. Chunks are skipped."""
+        is_mcap = is_recording = False
         try:
-            header = next(self._records)
+            for record in StreamReader(self._file, emit_chunks=True, record_size_limit=self.size).records:
+                is_mcap = True
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    self.about = record.metadata
+                    return
+                is_recording |= isinstance(record, Channel) and record.metadata.get("holds") in _OURS
         except _DAMAGED:
-            raise UsageError(f"{self.path} is not an MCAP file") from None
-        if not isinstance(header, Header) or not header.library.startswith(LIBRARY):
-            raise UsageError(f"{self.path} is not a recording of a router")
+            pass
+        if not is_recording:
+            raise UsageError(f"{self.path} is not {'a recording of a router' if is_mcap else 'an MCAP file'}")
 
 
 def _decoder(metadata: dict[str, str]) -> _Decoder:

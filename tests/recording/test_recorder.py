@@ -209,7 +209,7 @@ def test_the_last_datagrams_are_saved_when_somebody_asks(tmp_path: Path) -> None
         mirror.show(second := now(imu(2)))
         again_saved = made.save("signal")
         assert [again(each) for each in read(again_saved)] == first + second
-        assert Recording(path).about == {}  # until it is read
+        assert [Recording(each).about["reason"] for each in (path, again_saved)] == ["http", "signal"]
     assert len(files(tmp_path)) == 2
     assert counted(made)["recorded_datagrams"] == 0
 

@@ -11,6 +11,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message_factory import GetMessages
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel, Message, Schema
+from mcap.writer import CompressionType, Writer
 
 from router.errors import UsageError
 from router.recording.channels import DATAGRAMS, Channels
@@ -179,14 +180,63 @@ def test_a_recording_that_is_removed_while_it_is_opened_is_still_read(tmp_path: 
 
 
 def test_mcap_of_somebody_else_is_refused(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
     with (tmp_path / "it.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
+        channel = writer.register_channel("camera", "json", 0, {"holds": "pictures"})
+        writer.add_metadata("camera", {})
+        writer.add_message(channel, 0, b"{}", 0)
         writer.finish()  # type: ignore[no-untyped-call]  # of mcap
     with pytest.raises(UsageError, match="is not a recording of a router"):
         Recording(tmp_path / "it.mcap")
+
+
+def rewritten(path: Path, metadata: str, compression: CompressionType) -> Path:
+    """Write a recording anew as other tools do: schemas and channels move into chunks, the header names the tool.
+
+    `mcap filter`, `compress` and `recover` keep the metadata `before` the messages unless told otherwise; their
+    predecessors put it `after` or left it `out`.
+    """
+    made = path.with_name("rewritten.mcap")
+    with path.open("rb") as source, made.open("wb") as file:
+        reader, writer = make_reader(source), Writer(file, chunk_size=100, compression=compression)
+        writer.start(library="mcap-cli 1.0")
+        notes = [(each.name, each.metadata) for each in reader.iter_metadata()]
+        assert notes
+        if metadata == "before":
+            for note in notes:
+                writer.add_metadata(*note)
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        if metadata == "after":
+            for note in notes:
+                writer.add_metadata(*note)
+        writer.finish()  # type: ignore[no-untyped-call]  # of mcap
+    return made
+
+
+@pytest.mark.parametrize("compression", [*CompressionType])
+@pytest.mark.parametrize("metadata", ["before", "after", "out"])
+def test_a_recording_that_another_tool_rewrote_is_read_like_the_first(
+    metadata: str, compression: CompressionType, tmp_path: Path
+) -> None:
+    path = recorded(tmp_path / "it.mcap", *BATCHES)
+    first, second = Recording(path), Recording(rewritten(path, metadata, compression))
+    assert [*second.datagrams()] == [*first.datagrams()]
+    assert second.cases() == first.cases() != []
+    assert second.about == ({} if metadata == "out" else first.about)
+    assert second.is_whole
 
 
 def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
