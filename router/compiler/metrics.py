@@ -230,6 +230,7 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "not_allowed": "a topic that is not in `inbound`",
     "wrong_type": "not the type that `inbound` declares",
     "invalid": "a field is missing, unknown, of another type or out of range",
+    "premature": "its `time` is further in the future than `max_lead`",
     "rate_limited": "schemas were requested too often",
 }
 """Reasons why a gateway rejected a client's message, with their meaning."""

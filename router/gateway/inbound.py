@@ -54,6 +54,7 @@ class _Topic:
         self.decode = decoder(plan.type, style)
         self.max_rate, ttl = plan.settings.topic.max_rate, plan.settings.ttl
         self.ttl = ttl.value if ttl else None
+        self.max_lead = plan.settings.max_lead
         self.may_pass = RateLimit(library, self.max_rate).may_pass if self.max_rate is not None else None
         self.published = counters.index("messages_published", gateway, plan.label)
         self.dropped = {
@@ -125,8 +126,14 @@ class InboundPublisher:
         wanted = topic.plan.type.name
         if request.type_name not in (None, wanted):
             raise self.refusal("wrong_type", f"{name} has the type {wanted}", name)
-        if topic.ttl is not None and request.time is None:
+        if topic.ttl is None:
+            return topic
+        if request.time is None:
             raise InvalidMessageError(f"{name} requires `time`, the time of sending")
+        lead = request.time - self._outputs.wall_ns() / 1e9
+        if lead * 1e9 > topic.max_lead:
+            detail = f"{lead:.6g} s in the future, and more than {topic.max_lead / 1e9:g} s; are both clocks right?"
+            raise self.refusal("premature", detail, name)
         return topic
 
     def _text(self, request: PublishRequest) -> bytes:

@@ -58,6 +58,7 @@ REMEDIES: Mapping[str, str] = {
         "They waited in this computer for longer than `ttl`: the router was stopped, or is behind (`router top`); or "
         "`bandwidth` is too small."
     ),
+    "premature": "Set the clocks of the clients and of this computer by NTP: the log says how far they differ.",
     "publish_error": "The ROS middleware rejects them: see the log for the reason.",
     "mapping_error": "The mapping fails on these values, for example dividing by zero: see `router explain`.",
     "non_finite": "A value is NaN or infinite: check what the sender measures.",

@@ -492,12 +492,13 @@ class InboundDeadman(DeadmanKeys):
 
 @dataclass(frozen=True, slots=True)
 class Inbound:
-    """A topic that a gateway's clients may publish on. `ttl` and `no_ttl` are as in a route."""
+    """A topic that a gateway's clients may publish on. `ttl` and `no_ttl` are as in a route, `max_lead` is in ns."""
 
     topic: Topic
     span: SourceSpan
     ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
     no_ttl: Annotated[str | None, Words("no ttl: {}")] = None
+    max_lead: Annotated[int, DURATION] = 2_000_000_000
     deadman: InboundDeadman | None = None
 
 
