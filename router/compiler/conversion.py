@@ -150,7 +150,7 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
             both = f"{element.kind} and {target}"
             hint = f"give {both} fields of the same name and type: elements are filled by name"
         else:
-            hint = "write the elements one by one, as in [x[0].y, x[1].y]"
+            hint = "name a field of the elements, as in x.y"
         raise ExpressionError(found.span, found.code, f"list element: {found.message}", hint) from error
 
 

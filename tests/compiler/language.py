@@ -128,10 +128,11 @@ _SHARED: Mapping[str, Sequence[str]] = {
     "b": ("flag", "message.is", "True", "false"),
     "s": ("name", "source", "inner.in", "names[0]", "'ab'", "'é'", "''", "inners[0].in"),
     "t": ("received_at",),
-    "I": ("i32s", "i64s", "u64s", "raw", "inner.many", "inners[0].many"),
-    "F": ("f32s", "f64s"),
+    "I": ("i32s", "i64s", "u64s", "raw", "inner.many", "inners[0].many", "inners.value", "message.inners.value",
+          "[inner, inners[1]].value"),
+    "F": ("f32s", "f64s", "inners.ratio"),
     "B": ("flags",),
-    "S": ("names",),
+    "S": ("names", "inners.in"),
 }  # fmt: skip
 _PROTOBUF: Mapping[str, Sequence[str]] = {
     "i": ("mode", "grade", "Mode.LESS", "Grade.POOR", "left", "opt", "modes[0]", "inner.grade", "third.value",
@@ -143,7 +144,7 @@ _PROTOBUF: Mapping[str, Sequence[str]] = {
           "(mode == Mode.ON)", "(grade in [Grade.FAIR, Grade.GOOD])", "(Mode.LOUD in modes)"),
     "s": ("right", "loose", "str(mode)", "message.with.in"),
     "t": (),
-    "I": ("modes", "grades", "packed", "expanded"),
+    "I": ("modes", "grades", "packed", "expanded", "inners.grade"),
     "F": (),
     "B": (),
     "S": ("str(grades)",),
@@ -170,15 +171,17 @@ ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
 
 FRAME: Mapping[str, Sequence[str]] = {
     "i": ("items[0].i32", "items[1].u64", "items[2].inner.value", "items[0].inners[1].value", "items[1].grade", "count",
-          "len(items)", "items[0].modes[0]", "items[2].left", "len(items[1].names)", "items[1].inner.many[0]"),
+          "len(items)", "items[0].modes[0]", "items[2].left", "len(items[1].names)", "items[1].inner.many[0]",
+          "items.inner[1].value", "len(items.inner)", "items.third[0].many[0]"),
     "f": ("items[0].f32", "items[1].f64", "items[2].third.ratio", "items[1].class"),
     "b": ("items[1].flag", "has(items[0].inner)", "has(items[1].grade)", "has(items[2].opt)", "items[0].is"),
     "s": ("items[0].name", "items[1].inner.in", "items[2].names[0]", "items[0].loose", "items[1].right"),
     "t": (),
-    "I": ("items[0].i32s", "items[1].modes", "items[2].inner.many", "items[0].raw", "items[1].u64s"),
-    "F": ("items[1].f64s", "items[0].f32s"),
-    "B": ("items[1].flags",),
-    "S": ("items[1].names", "str(items[0].grades)"),
+    "I": ("items[0].i32s", "items[1].modes", "items[2].inner.many", "items[0].raw", "items[1].u64s", "items.u64",
+          "items.inner.value", "items.grade", "items[1].inners.value"),
+    "F": ("items[1].f64s", "items[0].f32s", "items.f32", "items.third.ratio"),
+    "B": ("items[1].flags", "items.flag"),
+    "S": ("items[1].names", "str(items[0].grades)", "items.name", "items.inner.in"),
 }  # fmt: skip
 """The names for the payloads of a frame in expressions, in addition to the fields of the first one."""
 
@@ -306,7 +309,7 @@ def _of_frames(target: Type) -> Sequence[str]:
         case List(MessageType() as of) if of == PART:
             return ("items", "items", "[message, items[1]]")
         case List(MessageType() as of) if of == INNER:
-            return (*_filling(target), "items[1].inners", "[items[1].inner, inner]")
+            return (*_filling(target), "items[1].inners", "[items[1].inner, inner]", "items.inner")
         case _:
             return _filling(target)
 

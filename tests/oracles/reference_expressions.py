@@ -210,6 +210,10 @@ def _refuse(refused: Refused) -> None:
     raise refused
 
 
+def _read(message: Computation, name: str) -> Any:
+    return message().read(name)
+
+
 def _computed(compute: Callable[..., Any], kind: Kind, operands: Sequence[Computation]) -> Any:
     return shaped(compute(*all_of(operands)), kind)
 
@@ -358,10 +362,25 @@ class _Reader:
     # names
 
     def _field(self, holder: Meaning, name: str) -> Meaning:
+        if isinstance(holder.kind, Listing):
+            return self._field_of_each(holder, holder.kind, name)
         assert isinstance(holder.kind, Message)
         member = holder.kind.type.field(name)
         assert member is not None, f"{holder.kind.type} has no field '{name}'"
         return Meaning(kind_of(member.type), lambda context: holder.give(context).read(name))
+
+    def _field_of_each(self, holders: Meaning, kind: Listing, name: str) -> Meaning:
+        """The field of each message in a list."""
+        if holders.items is not None:
+            return _literal([self._field(each, name) for each in holders.items])
+        assert isinstance(kind.element, Message)
+        member = kind.element.type.field(name)
+        assert member is not None, f"{kind.element.type} has no field '{name}'"
+
+        def elements(context: Context) -> list[Computation]:
+            return [partial(_read, each, name) for each in _elements(holders, context)]
+
+        return _list_of(Listing(kind_of(member.type), kind.length), elements)
 
     def _message(self) -> Meaning:
         return Meaning(Message(self.context.view.type), lambda context: context.view)

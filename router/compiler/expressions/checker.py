@@ -177,7 +177,7 @@ class _Checker:
                 return constant_at(path, node, self.text, self.scope)
             case ast.Attribute():
                 holder = whole_message(node.value, self.text, self.scope) or self.check(node.value)
-                return member_of(holder, node, self.text)
+                return member_of(holder, node, self.text, self.scope)
             case ast.Subscript():
                 return lists.item_of(self.check(node.value), self.check(node.slice), span, self.scope)
             case ast.UnaryOp():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from router.compiler.expressions.kinds import (
     FloatKind,
@@ -24,6 +25,7 @@ from router.compiler.expressions.tree import (
     Element,
     ListLiteral,
     Node,
+    Read,
     Variable,
     constant_of,
     whole,
@@ -55,7 +57,21 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
         raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} is out of range for {length} elements")
     if isinstance(holder, ListLiteral) and isinstance(element, MessageKind):
         return holder.items[position]
+    if isinstance(holder, Each) and isinstance(element, MessageKind):
+        return _message_in_element(holder, position)
     return Element(element, span, as_value(holder, scope), position)
+
+
+def _message_in_element(messages: Each, position: int) -> Node:
+    """Return `list.name[0]`, a message in each element of a list, as `list[0].name`."""
+    ((_, values),) = messages.lists
+
+    def read(node: Node) -> Node:
+        if isinstance(node, Read):
+            return replace(node, holder=read(node.holder))
+        return Element(node.kind, node.span, values, position)
+
+    return read(messages.element)
 
 
 # element by element

@@ -17,7 +17,9 @@ from router.compiler.expressions.kinds import (
     MessageKind,
     StringKind,
     TimeKind,
+    element_of,
 )
+from router.compiler.expressions.lists import elementwise
 from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope, field_of, require_readable
 from router.compiler.expressions.syntax import Parsed, dotted
@@ -187,19 +189,14 @@ def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, "expressions have no null", hint)
 
 
-_OF_OTHERS = {
-    ListKind: "name an element, as in x[0].y: only messages have fields",
-    TimeKind: "convert a time with seconds(x)",
-}
-
-
-def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
-    """Resolve `holder.name`."""
+def member_of(holder: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
+    """Resolve `holder.name`. For a list of messages, it is a list: this field of each element."""
     span = text.span(node)
+    if isinstance(element_of(holder.kind), MessageKind):
+        return elementwise(lambda parts: _of_element(parts[0], node, text, scope), [holder], span, scope)
     if not isinstance(holder.kind, MessageKind):
-        hint = _of_elements(holder.kind, node) or _OF_OTHERS.get(
-            type(holder.kind), f"remove '.{node.attr}': only messages have fields"
-        )
+        is_time = isinstance(holder.kind, TimeKind)
+        hint = "convert a time with seconds(x)" if is_time else f"remove '.{node.attr}': only messages have fields"
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:
@@ -211,12 +208,14 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed) -> Node:
     return _readable(field_of(holder, member, span))
 
 
-def _of_elements(kind: Kind, node: ast.Attribute) -> str:
-    """Return a hint for `list.name` if the list's elements have a field of that name."""
-    element = kind.element if isinstance(kind, ListKind) else None
-    if not isinstance(element, MessageKind) or element.type.field(node.attr) is None:
-        return ""
-    return f"its elements do: did you mean '{ast.unparse(node.value)}[0].{node.attr}'?"
+def _of_element(element: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
+    """Resolve `list.name` for an element of the list. Raises ExpressionError if it is a list itself."""
+    member = member_of(element, node, text, scope)
+    if isinstance(member.kind, ListKind):
+        message = f"'{ast.unparse(node)}' would be a list of lists"
+        hint = f"name one element, as in {ast.unparse(node.value)}[0].{node.attr}"
+        raise ExpressionError(member.span, Code.TYPE_MISMATCH, message, hint)
+    return member
 
 
 def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str]:

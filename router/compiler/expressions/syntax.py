@@ -163,7 +163,7 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{word} is not part of the language", hint)
 
 
-_WITHOUT_LOOP = "calculate with the whole list, as in x * 2, or write the elements one by one, as in [x[0].y, x[1].y]"
+_WITHOUT_LOOP = "calculate with the whole list, as in x * 2, or with a field of each element, as in x.y * 2"
 _HINTS: dict[type[ast.AST], str] = {
     ast.Constant: f"write a number, a string, True or False; {spellings.LEFT_OUT}",
     ast.BitXor: spellings.SQUARE,

@@ -148,7 +148,10 @@ def _computed(lowering: Lowering, node: tree.Each) -> StoredList:
         return routine(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
 
     filled = routine(_empty_list(made), lower_loop(lowering, node.lists, append, keeps=True), load(made))
-    return StoredList(filled, Scalar.IN_CELLS, node.kind.element)
+    message: Section | None = None
+    if isinstance(node.kind.element, MessageKind):
+        message = Section(node.kind.element.type, None, "[].")  # only ROS messages are values
+    return StoredList(filled, Scalar.IN_CELLS, node.kind.element, message)
 
 
 def _chosen(lowering: Lowering, node: tree.Choice) -> StoredList:
@@ -285,7 +288,11 @@ def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
 
 
 def length(lowering: Lowering, node: tree.Node) -> Routine:
-    """Lower len() of a list. The messages of a literal are not values, but must exist."""
+    """Lower len() of a list. The messages of a literal are not values, but must exist. There are as many messages in
+    the elements of a list as elements.
+    """
+    while isinstance(node, tree.Each) and isinstance(node.kind.element, MessageKind):
+        ((_, node),) = node.lists
     if isinstance(node, tree.ListLiteral) and are_messages(node):
         return routine(*(lowering.message(item)[0] for item in node.items), integer(len(node.items)))
     return routine(checked_list(lowering, node).routine, SIZE)
